@@ -48,6 +48,7 @@ _NAMES = {
     "score": "mitsim.study.session",
     "statement": "mitsim.study.session",
     "triangulate": "mitsim.decoding.own_code",
+    "true_points": "mitsim.scene.ray_casting.true_points",
     "write_capture": "mitsim.decoding.captures",
     "write_cloud": "mitsim.decoding.captures",
 }
@@ -77,6 +78,7 @@ if TYPE_CHECKING:
     from mitsim.maps.campaign.plan import CampaignFile
     from mitsim.maps.use import characterise, performance_map, predict
     from mitsim.scene.load import Scene
+    from mitsim.scene.ray_casting.true_points import true_points
     from mitsim.sensor.poses import look_at
     from mitsim.sensor.preset import Sensor
     from mitsim.sensor.transforms import Transform
@@ -121,6 +123,7 @@ __all__ = [
     "score",
     "statement",
     "triangulate",
+    "true_points",
     "write_capture",
     "write_cloud",
 ]

@@ -42,8 +42,9 @@ def tables(package: str) -> list[tuple[str, list[tuple[str, str]]]]:
 
 
 def members(rows: list[tuple[str, str]]) -> dict[str, list[str]]:
-    """Return the promised members of each type: those that its row names."""
-    return {bare(cell).rpartition(".")[2]: re.findall(r"`([a-z]\w*|[A-Z_]{2,})`", told) for cell, told in rows}
+    """Return the promised members of each type: those that its row names, methods with brackets."""
+    name = r"`([a-z]\w*|[A-Z_]{2,})(?:\([^`]*\))?`"
+    return {bare(cell).rpartition(".")[2]: re.findall(name, told) for cell, told in rows}
 
 
 def directive(path: str, promised: list[str]) -> str:

@@ -23,9 +23,8 @@ from characterisation.files.documents import Document, validate
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from mitsim.sensor.decoder_settings import DecoderSettings, DeviceMapSettings
-from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.imager import WrittenImager
-from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift
+from mitsim.sensor.light_code import LightCode
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.pattern import DotPattern
@@ -84,13 +83,7 @@ class Decoding(Document):
     imager: WrittenImager | None = None
     pattern: (
         Annotated[
-            DotPattern
-            | PhaseShift
-            | GrayCode
-            | GrayCodePhaseShift
-            | ImageSequence
-            | ImagesDescription
-            | AmplitudeModulation,
+            DotPattern | LightCode | ImagesDescription | AmplitudeModulation,
             Field(discriminator="kind"),
         ]
         | None

@@ -116,7 +116,9 @@ def verify(
     ] = 2e-4,
     sensor: Annotated[
         str | None,
-        typer.Option(help="Preset or sensor file whose calibration is stated; default: the sensor of the capture."),
+        typer.Option(
+            help="Preset or sensor file whose calibration is stated; default: the preset that the capture names."
+        ),
     ] = None,
 ) -> None:
     """Verify a calibration by one capture of a board or a plate of dots: use it, or calibrate again.
@@ -132,16 +134,16 @@ def verify(
     from mitsim.decoding.cloud import decoder_settings
     from mitsim.decoding.plate import Plate
     from mitsim.running.progress import say
-    from mitsim.sensor.preset import load_sensor
     from mitsim.study.calibration import verification
     from mitsim.study.calibration.board import parse_board
     from mitsim.study.virtual.study_unknowns import calibration_covariance
+    from mitsim.twin.finish.electrons import sensor_of
 
     if (board is None) == (dots is None):
         raise InputError("--board", "", "neither it nor --dots" if board is None else "--dots too", "one of both")
     numbers = [] if dots is None else _plate_numbers(dots)
     read = read_capture(capture)
-    chosen = load_sensor(sensor or read.sensor)
+    chosen = sensor_of(read, sensor, capture)
     covariance = calibration_covariance(chosen, chosen.unknowns.calibration, Path(sensor or ".").parent)
     cloud = None
     if dots is not None or len(read.images) < 2:

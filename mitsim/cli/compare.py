@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -66,6 +67,8 @@ def compare(
     print(validation.table, end="")
     say(f"page: {page}")
     if not validation.comparison.agrees:
+        if simulated is None:
+            say(f"next: mitsim fit sensor {shlex.quote(str(real))} fits the sensor file to your own camera")
         raise typer.Exit(1)
 
 

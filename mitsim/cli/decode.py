@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -62,3 +63,5 @@ def decode(
     check_file(output)
     write_cloud(decoded.cloud, output, written)
     print_reasons(decoded.cloud)
+    if decoded.cloud.valid.any():
+        say(f"cloud: {output}; next: mitsim measure {shlex.quote(str(output))} --picture look.png")

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+import math
+import shlex
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from characterisation.files.errors import InputError
 from mitsim.cli.folder_lock import remove_partial_beside
 from mitsim.cli.options import Topic, definitions
+
+if TYPE_CHECKING:
+    from mitsim.capture.capture import Capture
 
 #: settings of an imported capture that the user should check
 SETTINGS_TO_CHECK = (
@@ -81,6 +86,13 @@ def import_(
     sample: Annotated[
         str | None, typer.Option(help="For a coupon: the label of its sample in a campaign (aluminium/ground Ra 0.4).")
     ] = None,
+    coupon: Annotated[
+        tuple[int, int, int, int] | None,
+        typer.Option(
+            metavar="COLUMN ROW WIDTH HEIGHT",
+            help="For a coupon: window of the cloud's pixels that shows only it; its plane gives the pose.",
+        ),
+    ] = None,
     projector: Annotated[str | None, typer.Option(help="State of the projector: on or off.")] = None,
     range_mm: Annotated[
         tuple[float, float] | None, typer.Option("--range", help="Nearest and farthest depth to decode [mm].")
@@ -132,11 +144,20 @@ def import_(
     options = ReadOptions(**named | {"topic": tuple(topic) if topic else None, "images": _patterns(images)})
     imported = read_recording(path, options, kind)
     capture = with_warnings(imported.capture)
+    if coupon is not None:
+        if pose is not None:
+            raise InputError("--coupon", "", "--pose too", "one of both")
+        capture = _posed(capture, coupon, str(path))
     folder = output or Path(plain_name(path.resolve().stem) + "_capture")
     say(f"{path}: {NAMES[imported.kind]}, of {capture.sensor}, {capture.technology}, {capture.source}")
     for name in SETTINGS_TO_CHECK:
         if name in capture.settings:
             say(f"  {name}: {capture.settings[name]}")
+    if coupon is not None and capture.world_from_sensor is not None:
+        place = capture.world_from_sensor.translation
+        distance = math.hypot(*place)
+        angle = math.degrees(math.acos(place[2] / distance))
+        say(f"  pose: {distance:.1f} mm from the coupon, {angle:.1f} deg off its normal")
     for warning in capture.settings.get("warnings", []):
         say(f"warning: {warning}")
     remove_partial_beside(folder)
@@ -144,7 +165,18 @@ def import_(
         say(f"capture: {folder}, finished before")
         return
     write_capture(capture, folder, vendor=imported.originals)
-    say(f"capture: {folder}")
+    say(f"capture: {folder}; next: mitsim decode {shlex.quote(str(folder))} -o cloud.ply")
+
+
+def _posed(capture: Capture, window: tuple[int, int, int, int], where: str) -> Capture:
+    """Return a capture of a coupon with the pose that the plane of its points gives."""
+    from characterisation.region_of_interest import Roi
+    from mitsim.decoding.cloud import capture_cloud, decoder_settings
+    from mitsim.twin.finish.coupon_pose import pose_over_coupon
+
+    settings, imager = decoder_settings(capture, None, None)
+    pose = pose_over_coupon(capture_cloud(capture, settings, imager=imager), Roi(*window), where)
+    return replace(capture, world_from_sensor=pose, pose_covariance=None)
 
 
 def _patterns(images: list[str] | None) -> dict[str, str] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -141,7 +142,7 @@ def render(
     if blind:
         say(f"warning: {unseen}")
     say(f"{residual}" + (f"; over {LIMIT}: increase --samples" if residual.worst > LIMIT else ""))
-    say(f"capture: {output}")
+    say(f"capture: {output}; next: mitsim decode {shlex.quote(str(output))} -o cloud.ply")
 
 
 def _render_many(

@@ -45,12 +45,11 @@ from mitsim.decoding.time_of_flight import TimeOfFlightGeometry, decode_time_of_
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis
-from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.imager import Imager
-from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, LightCode, PhaseShift, roles
+from mitsim.sensor.light_code import LightCode, roles
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
-from mitsim.sensor.pattern import DiffractionSpots, DotPattern, RandomDots
+from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.projector_images import ImagesDescription, ProjectorImages
 
 #: range of depths to search if neither a preset nor the recording gives one [mm]
@@ -286,10 +285,10 @@ def _device_technology(name: MapName, prepare: Callable[[Rig], DeviceMapGeometry
 TECHNOLOGIES: dict[str, Technology] = {
     "active_stereo": Technology((), lambda rig, settings, pattern: stereo_geometry(rig), _stereo),
     "reference_stereo": Technology(
-        (RandomDots, DiffractionSpots, ProjectorImages, ImagesDescription), _reference_geometry, _reference
+        (*get_args(DotPattern), ProjectorImages, ImagesDescription), _reference_geometry, _reference
     ),
     "structured_light": Technology(
-        (PhaseShift, GrayCode, GrayCodePhaseShift, ImageSequence),
+        get_args(LightCode),
         _structured_light_geometry,
         _structured_light,
     ),

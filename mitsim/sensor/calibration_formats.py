@@ -143,9 +143,11 @@ def _of_opencv(file: Path, data: bytes) -> dict[str, Any]:
         storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
         fault = "" if storage.isOpened() and storage.root().isMap() else "nothing in it"
     except (cv2.error, SystemError) as error:
-        fault = _last_line(error)
+        fault = _last_line(error) if isinstance(error, cv2.error) else "no YAML, JSON or XML in it"
     if fault:
-        raise InputError(file, "", f"a file that OpenCV cannot read ({fault})", _KINDS)
+        named = {suffix.lower() for suffix in file.suffixes} & set(_SUFFIXES)
+        hint = "" if named else "write its numbers as JSON or YAML under the usual names: cam_K, proj_K, R, T and so on"
+        raise InputError(file, "", f"a file that OpenCV cannot read ({fault})", _KINDS, hint)
     try:
         return {name: _plain(storage.root().getNode(name)) for name in storage.root().keys()}  # noqa: SIM118 not a dict
     except (cv2.error, SystemError, UnicodeDecodeError, RecursionError) as error:

@@ -301,7 +301,7 @@ def _pose(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[s
     file = ", ".join(dict.fromkeys(map(str, values.tree.files)))
     pair = rectified_pair(values.tables[0], values.tables[-1])
     needed = pair is None
-    shapes = ((3, 3), (3,), (3, 1), (1, 3))
+    shapes = ((3, 3), (9,), (3,), (3, 1), (1, 3))
     rotation = values.find(name, place, "rotation", shapes, needed and "rotation_deg" not in own)
     translation = values.find(name, place, "translation", ((3,),), needed and "position_mm" not in own)
     if rotation is not None and translation is not None:
@@ -311,8 +311,7 @@ def _pose(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[s
         (R, T), stated = pair, 1000.0
     else:
         return {}
-    if R.size == 3:
-        R = np.asarray(Rotation.from_rotvec(R.reshape(3)).as_matrix())
+    R = np.asarray(Rotation.from_rotvec(R.reshape(3)).as_matrix()) if R.size == 3 else R.reshape(3, 3)
     if not is_rotation(R, 1e-4):
         raise InputError(file, f"rotation of {name}", np.round(R, 4).tolist(), "a rotation matrix, 3 x 3, by rows")
     given = values.calibration_table.to_mm

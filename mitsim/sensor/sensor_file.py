@@ -23,13 +23,12 @@ from characterisation.files.errors import InputError
 from mitsim.sensor.calibration_qualifiers import check_intrinsics
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.decoder_settings import DecoderSettings
-from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.imager import DESCRIPTION, Imager
-from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift
+from mitsim.sensor.light_code import LightCode
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.opencv_calibration import CalibrationTable
-from mitsim.sensor.pattern import DiffractionSpots, DotPattern, RandomDots
+from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.projector_images import ImageFolder
 from mitsim.sensor.published_lengths import PublishedAccuracy, PublishedLengths
 from mitsim.sensor.published_noise import PublishedNoise
@@ -196,14 +195,7 @@ class SensorFile(Document):
     imager: ImagerTable = ImagerTable()
     pattern: (
         Annotated[
-            RandomDots
-            | DiffractionSpots
-            | PhaseShift
-            | GrayCode
-            | GrayCodePhaseShift
-            | ImageSequence
-            | ImageFolder
-            | AmplitudeModulation,
+            DotPattern | LightCode | ImageFolder | AmplitudeModulation,
             Field(discriminator="kind"),
         ]
         | None

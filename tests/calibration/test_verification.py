@@ -117,6 +117,13 @@ def test_the_command_says_use_or_calibrate_again(good, turned, tmp_path):
     mitsim_here("calibrate", "verify", tmp_path / "bad", code=2)
 
 
+def test_a_recording_of_a_type_names_its_preset(good, tmp_path):
+    """A device calls itself by its maker's name, which is none of a preset."""
+    write_capture(replace(good, sensor="N10-304-18"), tmp_path / "recorded")
+    done = mitsim_here("calibrate", "verify", tmp_path / "recorded", "--board", "9x6x18:glass", code=2)
+    assert "comes from N10-304-18" in done.stderr and "its type may be ensenso-n10" in done.stderr
+
+
 def test_the_makers_curve_is_a_normal_error_of_its_share():
     curve = PublishedLengths(source="maker", share=0.7, distance_mm=[500, 700], error=[2e-3, 1e-3])
     assert curve.one_sigma(600) == pytest.approx(1.5e-3 / 1.0364, rel=1e-3)

@@ -71,6 +71,15 @@ def test_every_parameter_of_every_function_is_listed_with_its_default():
 
 
 @pytest.mark.parametrize("package", [mitsim, characterisation], ids=lambda package: package.__name__)
+def test_methods_and_no_others_are_listed_with_brackets(package):
+    rows = [row for heading, every in tables(package.__name__) if heading == "Types" for row in every]
+    for cell, told in rows:
+        one = getattr(package, re.split(r"[`(: ]", cell.strip("`"))[0].rpartition(".")[2])
+        for name, brackets in re.findall(r"`([a-z]\w*)(\([^`]*\))?`", told):
+            assert callable(getattr(one, name, None)) == bool(brackets), (cell, name)
+
+
+@pytest.mark.parametrize("package", [mitsim, characterisation], ids=lambda package: package.__name__)
 def test_every_member_that_is_listed_is_there(package):
     types = [rows for heading, rows in tables(package.__name__) if heading == "Types"]
     promised = {owner: names for rows in types for owner, names in members(rows).items()}

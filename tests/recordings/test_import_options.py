@@ -68,6 +68,26 @@ def imported(folder, *options):
     )
 
 
+def test_the_plane_of_a_coupon_gives_the_pose(pairs):
+    done = imported(pairs, "--frame", "0", "--sample", "matt_white", "--coupon", 80, 60, 80, 60)
+    height = surface_seen(LEFT, ball=False, tilt=0.0)[..., 2].mean()
+    capture = read_capture(pairs / "capture")
+    assert capture.world_from_sensor is not None and capture.settings["coupon"] == {"sample": "matt_white"}
+    bias = 0.15 / (260 * 40 / height)  # the matcher's toward whole pixels, over the disparity
+    assert capture.world_from_sensor.translation[2] == pytest.approx(height, rel=bias)
+    np.testing.assert_allclose(capture.world_from_sensor.rotation[2], [0, 0, -1], atol=0.02)
+    distance = np.linalg.norm(capture.world_from_sensor.translation)
+    assert f"pose: {distance:.1f} mm from the coupon" in done.stderr and "next: mitsim decode" in done.stderr
+
+
+def test_a_pose_is_given_or_taken_from_the_coupon(pairs):
+    (pairs / "pose.txt").write_text("\n".join(" ".join(map(str, row)) for row in POSE.matrix()))
+    options = ("--frame", "0", "--pose", pairs / "pose.txt", "--coupon", 80, 60, 80, 60)
+    with pytest.raises(AssertionError, match="--coupon: found --pose too"):
+        imported(pairs, *options)
+    assert not (pairs / "capture").exists()
+
+
 def test_a_pair_by_patterns_with_all_that_is_known_of_it(pairs):
     (pairs / "pose.txt").write_text("# world_from_sensor\n" + "\n".join(" ".join(map(str, r)) for r in POSE.matrix()))
     imported(

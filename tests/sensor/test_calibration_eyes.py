@@ -88,6 +88,14 @@ def test_the_size_beside_a_matrix_suffices(tmp_path):
 
 
 PAIRS = {
+    "nine numbers of a rotation": {
+        "K1": K.ravel().tolist(),
+        "D1": D,
+        "K2": K2.ravel().tolist(),
+        "D2": D,
+        "R": R.ravel().tolist(),
+        "T": T.tolist(),
+    },
     "left and right": {
         "right": {"camera_matrix": K2.tolist(), "dist_coeffs": D},
         "left": {"camera_matrix": K.tolist(), "dist_coeffs": D},

@@ -9,8 +9,10 @@ import pytest
 from scipy.ndimage import binary_erosion
 
 import mitsim as ms
+from characterisation.point_cloud import PointCloud, Status
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.capture.simulated.truth import encode_exr, read_exr, true_image
+from mitsim.decoding.matching.stereo import stereo_geometry
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
 from mitsim.scene.ray_casting.raycast import PixelRays, cast
@@ -21,17 +23,21 @@ POSE = look_at([40, -480, 300], [0, 0, 20], [0, 0, 1], 10)
 RADIUS = 40.0
 
 
-@pytest.fixture(scope="module")
-def ball(n10):
-    """A white ball of radius 40 on a white floor, seen by the N10's distorted left camera."""
+def ball_on_a_floor():
+    """A white ball of radius 40 on a white floor."""
     floor = {
         "type": "rectangle",
         "to_world": mi.ScalarTransform4f().scale([150, 150, 1]),
         "bsdf": {"type": "matt_white"},
     }
     sphere = {"type": "sphere", "radius": RADIUS, "center": [0, 0, 40], "bsdf": {"type": "matt_white"}}
-    scene = scene_from_dict({"ball": sphere, "floor": floor}, 850)
-    return true_image(SimulatedSensor(n10), scene, POSE, "left", samples=16)
+    return scene_from_dict({"ball": sphere, "floor": floor}, 850)
+
+
+@pytest.fixture(scope="module")
+def ball(n10):
+    """Seen by the N10's distorted left camera."""
+    return true_image(SimulatedSensor(n10), ball_on_a_floor(), POSE, "left", samples=16)
 
 
 @pytest.fixture(scope="module")
@@ -141,3 +147,20 @@ def test_render_gives_the_truth_of_every_camera_beside_the_same_capture(n10):
         np.testing.assert_array_equal(seen.distance, cast(scene, rays, POSE, np.zeros((1, 3))).distance)
         assert seen.feature_names == ("floor",)
         np.testing.assert_array_equal(seen.feature == 0, np.isfinite(seen.depth))
+
+
+def test_true_points_lie_on_the_surfaces_and_on_the_rays_of_the_rectified_image(n10):
+    grid = stereo_geometry(n10.rig).grid
+    nothing = np.full((grid.height, grid.width), Status.NO_SURFACE, np.uint8)
+    cloud = PointCloud(np.full((*nothing.shape, 3), np.nan, np.float32), nothing, grid, "n10", "simulated")
+    points = ms.true_points(cloud, ball_on_a_floor(), POSE.matrix())
+    seen = np.isfinite(points[..., 2])
+    assert 0.1 < seen.mean() < 1
+    columns, rows = np.meshgrid(np.arange(grid.width), np.arange(grid.height))
+    np.testing.assert_allclose(grid.project(points[seen]), np.stack([columns, rows], -1)[seen], atol=1e-6)
+    x, y, z = POSE.points(points[seen]).T
+    on_floor, on_ball = np.abs(z), np.abs(np.hypot(np.hypot(x, y), z - 40) - RADIUS)
+    np.testing.assert_allclose(np.minimum(on_floor, on_ball), 0, atol=2e-3)
+    assert (on_ball < 2e-3).sum() > 1000 and np.abs(
+        np.concatenate([x[on_floor < 2e-3], y[on_floor < 2e-3]])
+    ).max() < 150.1

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
+from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.simulated.rendering import Rendering
@@ -18,12 +19,13 @@ from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.cli.program import app
 from mitsim.decoding.matching.stereo import stereo_geometry
 from mitsim.scene.test_targets import plate
+from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
 from mitsim.twin.compare import compare_captures as compare_module
 from mitsim.twin.compare.captures_run import validate_captures
 from mitsim.twin.compare.compare_captures import compare_captures
 from mitsim.twin.compare.compared_quantities import QUANTITIES
-from mitsim.twin.compare.rebuild import projector_was_on, rebuild
+from mitsim.twin.compare.rebuild import check_technology, projector_was_on, rebuild
 from mitsim.twin.compare.specimen_patches import PATCH_PX, specimen_patches
 from mitsim.twin.finish.electrons import linearised, pixel_noise
 from mitsim.twin.finish.specimen import image_mask, specimen_place
@@ -349,3 +351,11 @@ def test_a_projector_is_on_or_off(folder, tmp_path):
     found = CliRunner().invoke(app, ["compare", str(folder), "-o", str(tmp_path), "--projector", "dim"])
     assert found.exit_code != 0
     assert isinstance(found.exception, InputError)
+
+
+def test_a_cloud_of_the_device_says_how_to_compare_clouds():
+    """No preset is of the technology of a cloud."""
+    sensor = load_sensor("realsense-d435")
+    cloud = Capture("mine", "point_map", "device", sensor.rig, {})
+    with pytest.raises(InputError, match="measure acceptance CLOUD --plane NAME --simulated realsense-d435"):
+        check_technology(cloud, sensor, "captures/mine")

@@ -114,3 +114,21 @@ def test_the_numbers_of_a_finish_are_in_standard_deviations(unknowns):
     whole = replace(unknowns, table=UnknownsTable())
     for number in (2, 12345):
         assert finish_numbers(half, number, "plate") == pytest.approx(finish_numbers(whole, number, "plate"))
+
+
+@pytest.mark.parametrize("group", ["light", "temperature", "pose"])
+def test_a_group_has_as_many_numbers_as_its_draw_takes(unknowns, monkeypatch, group):
+    """A number that the draw of a group takes and this module does not would be missing from the budget."""
+    streams, plain = [], Unknowns.stream
+
+    def kept(self, name, trial):
+        stream = plain(self, name, trial)
+        if name == group:
+            streams.append(stream)
+        return stream
+
+    monkeypatch.setattr(Unknowns, "stream", kept)
+    unknowns.draw(Trial(3))
+    drawn_numbers(STUDY, unknowns, "render", [Trial(3)], [group])
+    draw, numbers = (stream.bit_generator.state for stream in streams)
+    assert draw == numbers

@@ -171,7 +171,7 @@ def _plain_images(
 ) -> list[str]:
     """Return warnings about white and black images that are exchanged or wrong."""
     kinds = [role.kind for role in image_roles]
-    coded = stack[[kind in ("gray", "gray_inverse", "phase") for kind in kinds]].astype(np.float32)
+    coded = stack[[role.axis is not None for role in image_roles]].astype(np.float32)
     most, least = coded.max(axis=0), coded.min(axis=0)
     lit = most - least > 4 * settings.minimum_modulation_dn * full_scale / 255
     if lit.mean() < 0.02:

@@ -260,7 +260,8 @@ def _found_shot(place: Path, campaign: Campaign) -> Shot:
         hint = "the label of a sample of the campaign"
         raise InputError(place / "settings.json", "coupon.sample", repr(label), ", ".join(labels), hint)
     if world_from_sensor is None:
-        raise InputError(place / "pose.json", "world_from_sensor", "null", "the pose, in the coupon's frame")
+        hint = "mitsim import --coupon COLUMN ROW WIDTH HEIGHT takes it from the plane of a coupon's points"
+        raise InputError(place / "pose.json", "world_from_sensor", "null", "the pose, in the coupon's frame", hint)
     pose = world_from_sensor.inverse()
     distance = float(np.linalg.norm(pose.translation - campaign.sensor.rig.reference.sensor_from_camera.translation))
     nominal = min(campaign.distances, key=lambda planned: abs(np.log(distance / planned)))

@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from characterisation.acceptance.vdi_2634 import flatness_error
 from mitsim.decoding.structured_light.geometry import MINIMUM_CHANGE_PX, axis_across
 from mitsim.sensor.camera import Camera, Rig, stereo_rectification
-from mitsim.sensor.image_sequence import ImageSequence
-from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, axes
+from mitsim.sensor.light_code import LightCode, axes
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import moved, path_error
@@ -252,5 +251,5 @@ def _by_coordinate(
 def _component(sensor: Sensor) -> int:
     """Return the axis of the projector along which the decoder measures: 0 its columns, 1 its rows."""
     pattern, projector = sensor.pattern, sensor.rig.projector
-    assert isinstance(pattern, PhaseShift | GrayCode | GrayCodePhaseShift | ImageSequence) and projector is not None
+    assert isinstance(pattern, LightCode) and projector is not None
     return 0 if axis_across(sensor.rig.reference, projector, axes(pattern)) == "columns" else 1

@@ -25,8 +25,7 @@ from mitsim.decoding.grey_levels import grey_level_variance
 from mitsim.decoding.matching.reference_matching import reference_geometry
 from mitsim.decoding.structured_light.phase_shift import fringe_sigma
 from mitsim.sensor.image_formation import expose, fixed_pattern
-from mitsim.sensor.image_sequence import ImageSequence
-from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, roles
+from mitsim.sensor.light_code import LightCode, roles
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.point_spread import point_spread
@@ -169,7 +168,7 @@ def coordinate_noise(sensor: Sensor, distance_mm: float, square_px: float, seed:
         return float(_matching_noise(sensor, level) / np.sqrt(max(white / _block(sensor) ** 2, 1.0)))
     if isinstance(pattern, ProjectorImages):
         raise unknown_code(f"sensor {sensor.name}", pattern.count)
-    assert isinstance(pattern, PhaseShift | GrayCode | GrayCodePhaseShift | ImageSequence)
+    assert isinstance(pattern, LightCode)
     optics = sensor.projector.optics
     every = roles(pattern, optics.width, optics.height)
     periods = [role.period for role in every if role.kind == "phase"]

@@ -59,8 +59,11 @@ _SCALES, _BISECTIONS = (1e-4, 1e4), 18
 def check_technology(real: Capture, sensor: Sensor, where: str) -> None:
     """Raise an InputError if a sensor is of another technology than a recording."""
     if sensor.technology != real.technology:
-        allowed = f"one of technology {real.technology}, as {where}"
-        raise InputError("--sensor", "technology", f"{sensor.name} of {sensor.technology}", allowed)
+        found = f"{sensor.name} of {sensor.technology}"
+        if not real.images:
+            hint = f"compare its cloud: mitsim measure acceptance CLOUD --plane NAME --simulated {sensor.name}"
+            raise InputError(where, "images", f"none: a {real.technology} of the device", f"those of {found}", hint)
+        raise InputError("--sensor", "technology", found, f"one of technology {real.technology}, as {where}")
 
 
 def rebuild(

@@ -98,7 +98,10 @@ def sensor_of(capture: Capture, name: str | None, where: str | Path) -> Sensor:
     """
     if name is None and capture.sensor not in presets():
         found = f"none, and {where} comes from {capture.sensor}, which is not a preset"
-        raise InputError("--sensor", "", found, f"one of {', '.join(presets())}, or the path of a .toml file")
+        types = {one: one.partition("-")[2] for one in presets()}  # the name without its maker
+        alike = [one for one, of_type in types.items() if of_type and of_type in capture.sensor.casefold()]
+        hint = f"its type may be {' or '.join(alike)}" if alike else ""
+        raise InputError("--sensor", "", found, f"one of {', '.join(presets())}, or the path of a .toml file", hint)
     return load_sensor(capture.sensor if name is None else name)
 
 
