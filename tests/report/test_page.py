@@ -16,8 +16,7 @@ from characterisation.files.errors import InputError
 from mitsim.report.page import write_report
 from mitsim.running.numbers import two_digits
 from tests.plain_pages import without_pictures
-
-from .conftest import CHECKED, FEATURES, HOSTILE, MEASUREMENTS, plain_pictures, write_run
+from tests.report.conftest import CHECKED, FEATURES, HOSTILE, MEASUREMENTS, plain_pictures, write_run
 
 
 class Tags(HTMLParser):

@@ -9,7 +9,6 @@ import pytest
 import trimesh
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.image import imread
-from shell import ROOT, mitsim_here
 
 from characterisation.files.errors import InputError
 from mitsim.report.scene_preview import preview_figure
@@ -20,6 +19,7 @@ from mitsim.scene.first_hits import visible_surfaces
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
 from mitsim.sensor.working_volume import common_view, field_of_view, in_image, in_working_volume, pose_at, usual_place
+from tests.shell import ROOT, mitsim_here
 from tests.smaller_sensors import binned
 
 METAL = """<bsdf type="machined_metal"><string name="metal" value="aluminium"/>
