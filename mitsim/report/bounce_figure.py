@@ -19,9 +19,9 @@ from characterisation.plots.style import FIELD, MUTED, OTHER_SHAPE, SEQUENTIAL, 
 from characterisation.region_of_interest import Roi
 from mitsim.report.style import colour_scale
 from mitsim.running.numbers import percent
-from mitsim.scene.first_hits import VisibleSurfaces
 from mitsim.scene.light_transport.light_from_faces import LightFromFaces, light_from_faces
 from mitsim.scene.load import Scene
+from mitsim.scene.visible_surfaces import VisibleSurfaces
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform
 

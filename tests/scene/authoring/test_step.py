@@ -259,7 +259,7 @@ def test_the_sensor_chooses_how_fine_the_mesh_is(tmp_path):
 def test_nothing_is_wrong_with_a_bracket_and_its_seat(tmp_path, n10):
     from mitsim.scene.authoring.check import findings, read_features
     from mitsim.scene.authoring.part_folder import write_part
-    from mitsim.scene.first_hits import visible_surfaces
+    from mitsim.scene.visible_surfaces import visible_surfaces
     from mitsim.sensor.working_volume import pose_at, usual_place
 
     write_part(write_step([("b", bracket(), None)], tmp_path / "b.step"), tmp_path / "made", None, Finishing())
