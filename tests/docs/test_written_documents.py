@@ -22,7 +22,8 @@ from mitsim.study.exposures.planned import plan_document, write_plan_csv
 from mitsim.study.remedies.change import Change
 from mitsim.study.remedies.confirm import find_remedies, remedies_document
 from mitsim.study.remedies.entries import RemediesEntry
-from mitsim.study.virtual.stated import StatedView, statement_document
+from mitsim.study.statement_document import statement_document
+from mitsim.study.virtual.stated import StatedView
 from tests.docs.test_docs import FORMATS, JSON_MODELS, first_column, table_rows
 
 

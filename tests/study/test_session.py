@@ -14,7 +14,8 @@ from mitsim.study import RaceTable, StatementTable, StudyFile, open_study, sessi
 from mitsim.study.run import run_study, run_within
 from mitsim.study.run_folder import read_run
 from mitsim.study.session import Session
-from mitsim.study.virtual.stated import BATCH, batches, statement_document
+from mitsim.study.statement_document import statement_document
+from mitsim.study.virtual.stated import BATCH, batches
 from tests.smaller_sensors import coarse_sensor
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"

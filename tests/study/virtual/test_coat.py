@@ -9,10 +9,11 @@ import pytest
 
 from mitsim.sensor.unknowns import CoatUnknowns
 from mitsim.study.session import Session
+from mitsim.study.statement_document import statement_document
 from mitsim.study.virtual.coat import Coat, coat_numbers, coated_shapes, drawn_coat
 from mitsim.study.virtual.plan import measurements_of
 from mitsim.study.virtual.race import Job
-from mitsim.study.virtual.stated import budget_groups, statement_document
+from mitsim.study.virtual.stated import budget_groups
 from mitsim.study.virtual.study_unknowns import study_unknowns
 from mitsim.study.virtual.world import Trial
 from tests.smaller_sensors import coarse_sensor

@@ -24,11 +24,12 @@ from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.transforms import Transform, look_at
 from mitsim.study import StudyFile, open_study
 from mitsim.study.session import Session
+from mitsim.study.statement_document import statement_document
 from mitsim.study.virtual.drawn_finish import finish_deviation
 from mitsim.study.virtual.plan import measurements_of, trial_digest
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.rendered import displaced
-from mitsim.study.virtual.stated import budget_groups, statement_document
+from mitsim.study.virtual.stated import budget_groups
 from mitsim.study.virtual.study_unknowns import study_unknowns
 from mitsim.study.virtual.world import Trial
 from tests.smaller_sensors import binned, coarse_sensor, middle_part
