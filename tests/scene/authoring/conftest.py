@@ -11,9 +11,9 @@ from mitsim.scene.authoring import read_step, step_worker
 
 def convert_here(command, path):
     """What :func:`read_step.run_worker` does, in this process."""
-    _, worker, path, out, *numbers = command
-    assert worker == step_worker.__file__
-    step_worker.convert(path, out, *map(float, numbers))
+    *_, worker, path, out = command[:6]
+    assert worker == step_worker.__name__
+    step_worker.convert(path, out, *map(float, command[6:]))
     return subprocess.CompletedProcess(command, 0, "", "")
 
 

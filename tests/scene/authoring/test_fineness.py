@@ -7,7 +7,7 @@ import pytest
 
 from mitsim.scene.authoring import read_step as reading
 from mitsim.scene.authoring.read_step import Fineness, read_step, step_installed
-from mitsim.scene.authoring.step_worker import chords
+from mitsim.scene.authoring.step_mesh import chords
 from mitsim.scene.mesh_facts import mesh_facts
 from tests.scene.authoring.bracket import write_step
 
