@@ -26,7 +26,7 @@ from mitsim.cli.options import (
 if TYPE_CHECKING:
     from mitsim.report.author_page import Authored
     from mitsim.scene.visible_surfaces import VisibleSurfaces
-    from mitsim.sensor.preset import Sensor
+    from mitsim.sensor.sensor import Sensor
     from mitsim.sensor.transforms import Transform
 
 

@@ -25,7 +25,7 @@ from mitsim.maps.prediction.faces_in_sight import faces_in_sight
 from mitsim.running.executor import Executor
 from mitsim.scene.load import Scene
 from mitsim.sensor.poses import as_pose
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 
 

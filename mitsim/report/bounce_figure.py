@@ -22,7 +22,7 @@ from mitsim.running.numbers import percent
 from mitsim.scene.light_transport.light_from_faces import LightFromFaces, light_from_faces
 from mitsim.scene.load import Scene
 from mitsim.scene.visible_surfaces import VisibleSurfaces
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 
 #: width of the figure and of a picture [in]

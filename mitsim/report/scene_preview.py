@@ -27,7 +27,7 @@ from mitsim.scene.first_hits import first_hits
 from mitsim.scene.inspect import SceneFacts, ShapeFacts
 from mitsim.scene.load import Scene
 from mitsim.scene.visible_surfaces import VisibleSurfaces
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.working_volume import common_view, depth, in_working_volume
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from characterisation.coupon.orientations import sphere_directions
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.preset import Sensor
 from mitsim.sensor.rig_parameters import eyes
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform, look_at
 
 

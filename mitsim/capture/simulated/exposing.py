@@ -24,8 +24,8 @@ from mitsim.capture.decoding import Decoding
 from mitsim.sensor.image_formation import FixedPattern, converter, expose, fixed_pattern
 from mitsim.sensor.modulation import AmplitudeModulation, delay_pattern, delayed, expose_taps
 from mitsim.sensor.noise_sources import Noise
-from mitsim.sensor.preset import Sensor
 from mitsim.sensor.projector_images import described
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 
 

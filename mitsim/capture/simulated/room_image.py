@@ -9,7 +9,7 @@ from characterisation.region_of_interest import Roi
 from mitsim.scene.light_transport.room_light import directional_albedos, room_radiance
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.raycast import PixelRays
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 
 

@@ -50,8 +50,8 @@ from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.pattern import DotPattern
-from mitsim.sensor.preset import Sensor
 from mitsim.sensor.roi import roi_around
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.speckle import SpeckleField
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.vignetting import camera_illumination

@@ -32,7 +32,7 @@ from mitsim.decoding.cloud import Geometry, capture_cloud, capture_geometry, sen
 from mitsim.decoding.depth_range import depths_of, range_warning
 from mitsim.maps.campaign.plan import Campaign, Shot, view_axes
 from mitsim.maps.campaign.store import Finished
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 
 Item = TypeVar("Item")

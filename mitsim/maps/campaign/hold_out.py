@@ -32,7 +32,7 @@ from mitsim.maps.campaign.live import LiveCampaign, plan_live
 from mitsim.maps.campaign.orders import Order, PreparedSensor, order_of, prepared_sensor
 from mitsim.maps.campaign.plan import Campaign, CampaignFile, Shot, plan_campaign
 from mitsim.maps.prediction import performance
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 
 #: relative extent in |V| of a patch on either side of its middle
 PATCH_REACH = 0.015

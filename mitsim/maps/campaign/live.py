@@ -30,7 +30,7 @@ from mitsim.capture.devices.stage_connection import StageConnection
 from mitsim.maps.campaign.acquire import DISTANCE_SLACK, CaptureSource, Source
 from mitsim.maps.campaign.plan import Campaign, CampaignFile, Shot, plan_campaign
 from mitsim.maps.campaign.stage_pose import StageCalibration, StageTable, read_stage_calibration
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 
 #: called before another sample or distance, with the sample's label and the distance
 Mount = Callable[[str, float], None]

@@ -41,7 +41,7 @@ from mitsim.maps.campaign.run import run_campaign
 from mitsim.running.version import __version__
 from mitsim.scene.load import flat_coupon
 from mitsim.scene.materials import Finish
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 
 #: increased if the plan below changes, so that cached maps are made again

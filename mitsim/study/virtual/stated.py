@@ -22,7 +22,7 @@ from characterisation.statements.verdict_words import Judged
 from mitsim.running.text_table import aligned
 from mitsim.running.time_limit import TimeLimit
 from mitsim.sensor.exposure import PlannedExposure
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.study import StatementTable, Study
 from mitsim.study.virtual.drawn_decoder import decoder_is_drawn
 from mitsim.study.virtual.drawn_numbers import drawn_numbers, related, seeds, statement_trials

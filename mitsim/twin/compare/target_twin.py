@@ -27,7 +27,7 @@ from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decoding.cloud import capture_cloud, decoder_settings
 from mitsim.scene.load import Scene
 from mitsim.scene.test_targets import ball, plate
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 
 Floats = NDArray[np.float64]

@@ -31,7 +31,7 @@ from mitsim.decoding.cloud import capture_cloud, capture_geometry, decoder_setti
 from mitsim.maps.campaign.acquire import coupon_cloud
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DeviceMapSettings
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 from tests.capture.recordings.cloud_files_of_others import pcd, pinhole_cloud, ply
 

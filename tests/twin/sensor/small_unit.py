@@ -12,7 +12,8 @@ from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.preset import Sensor, load_sensor
+from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.sensor_file import RoomTable
 from mitsim.sensor.transforms import Transform, look_at
 from mitsim.twin.finish.place import Place, known_place
