@@ -97,6 +97,10 @@ def load_scene(
         If the file is missing, cannot be parsed, names something unknown to Mitsuba, or has a size that is implausible
         in mm.
 
+    See Also
+    --------
+    load_sensor : the sensor
+
     Examples
     --------
     >>> import mitsim as ms

@@ -166,6 +166,10 @@ def predict(
     InputError
         If the map belongs to another sensor, or lacks a finish; or the pose is not a rigid motion.
 
+    See Also
+    --------
+    characterise : makes a map
+
     Notes
     -----
     A point is its true position plus a normal deviate times sigma along the view ray, kept with probability F

@@ -53,6 +53,10 @@ def bounced_light(
         Surfaces that the reference camera sees from there.
     seed
         Of the light paths.
+
+    See Also
+    --------
+    bounce_figure : draws it
     """
     rows, columns = np.nonzero(visible.shape >= 0)
     camera = sensor.rig.reference

@@ -144,6 +144,10 @@ def candidate_views(
     ------
     InputError
         If no view is possible.
+
+    See Also
+    --------
+    directions_above : the directions
     """
     target = np.asarray(table.target_mm if table.target_mm is not None else centre, float)
     near, far = range_mm or sensor.working_range_mm

@@ -117,10 +117,19 @@ def brightest_images(sensor: Sensor, radiance: dict[str, NDArray[np.float32]]) -
 def check_finite(sensor: Sensor, values: NDArray[np.floating], where: str, quantity: str) -> None:
     """Reject light that is not finite, before it becomes an image of zeros.
 
+    Parameters
+    ----------
+    sensor
+        Sensor, for the message.
+    values
+        Light, of any shape.
+    where, quantity
+        Part of the sensor and name of the values, for the message.
+
     Raises
     ------
     InputError
-        It names the sensor, ``where`` in it, and the quantity.
+        If a value is infinite or NaN.
     """
     if not np.isfinite(values.sum(dtype=np.float64)):
         raise InputError(
@@ -151,6 +160,11 @@ def expose_camera(
         Fixed patterns of the camera's imager.
     stream
         Seed of the noise.
+
+    See Also
+    --------
+    brightest_images : decide the exposures
+    capture_of : the capture of all cameras
     """
     imager, scale, noise, inside = sensor.imager, sensor.electrons(), light.noise, light.rois[camera].slices
     radiance, exposures = light.radiance[camera], light.exposures
@@ -192,6 +206,10 @@ def capture_of(
         Images of each camera, from :func:`expose_camera`.
     seed
         Seed of the noise, for the record.
+
+    See Also
+    --------
+    expose_camera : the images of one camera
     """
     adc, exposures = converter(sensor.imager, light.noise), light.exposures
     whole = {name: Roi.whole(camera.width, camera.height) for name, camera in sensor.rig.cameras.items()}

@@ -66,6 +66,10 @@ def plan_live(
     ------
     InputError
         For anything that would stop the campaign later.
+
+    See Also
+    --------
+    live_source : takes the captures
     """
     path, device, stage = Path(path), file.device, file.stage
     if device is None:

@@ -37,6 +37,10 @@ def mesh_together(faces: list[Any], chord: float, bend: float, delabella: bool =
     delabella
         Which of OpenCASCADE's two ways connects the same points. Delabella takes a seventeenth of the time for 146,000
         triangles of a torus.
+
+    See Also
+    --------
+    mesh : all faces, each with its chord
     """
     from OCP.BRep import BRep_Builder
     from OCP.BRepMesh import BRepMesh_IncrementalMesh
@@ -80,6 +84,10 @@ def chords(
         Of faces that a task can measure, and of other faces.
     most
         Triangles of all faces.
+
+    See Also
+    --------
+    mesh : meshes with them
     """
     straight = np.array([kind in ("plane", "cylinder") for kind in kinds])
     measured = np.array([kind in MEASURED for kind in kinds])

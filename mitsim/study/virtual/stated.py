@@ -114,6 +114,13 @@ def compared(study: Study, trials: TrialFolder, view: int, other: int) -> float 
 
     With tolerances for all measurements, it is the ratio of the largest errors relative to the tolerance. It is None if
     a view lacks trials of a statement, or a value.
+
+    Parameters
+    ----------
+    study, trials
+        The study, and its finished trials.
+    view, other
+        Numbers of the two views.
     """
     figures, task = [], study.task
     for number in (view, other):
