@@ -40,6 +40,10 @@ class Roi:
             First column and row, whole numbers.
         right, bottom
             First column and row after the region.
+
+        See Also
+        --------
+        whole : all pixels of an image
         """
         return cls(int(left), int(top), int(right) - int(left), int(bottom) - int(top))
 

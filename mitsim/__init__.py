@@ -23,7 +23,7 @@ _NAMES = {
     "PointCloud": "characterisation.point_cloud",
     "Result": "characterisation.tasks.result",
     "Scene": "mitsim.scene.load",
-    "Sensor": "mitsim.sensor.preset",
+    "Sensor": "mitsim.sensor.sensor",
     "Statement": "characterisation.statements.statement",
     "Study": "mitsim.study",
     "StudyFile": "mitsim.study",
@@ -80,7 +80,7 @@ if TYPE_CHECKING:
     from mitsim.scene.load import Scene
     from mitsim.scene.ray_casting.true_points import true_points
     from mitsim.sensor.poses import look_at
-    from mitsim.sensor.preset import Sensor
+    from mitsim.sensor.sensor import Sensor
     from mitsim.sensor.transforms import Transform
     from mitsim.study import Study, StudyFile
     from mitsim.study.reading import open_study

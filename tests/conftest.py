@@ -15,7 +15,8 @@ import typer.testing
 from hypothesis import HealthCheck, settings
 
 from characterisation.files.threads import usable_cores
-from mitsim.sensor.preset import Sensor, load_sensor
+from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.sensor import Sensor
 
 # The same examples at every run, so that a run tells of a change; HYPOTHESIS_PROFILE=explore looks for new ones.
 # No deadlines: these machines are shared, and a slow moment is no fault of the code.

@@ -18,14 +18,11 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-HERE = Path(__file__).resolve().parent
-
-#: folders that the scripts of tests import from
-FOLDERS = [HERE.parent, HERE, HERE / "campaign", HERE / "hardware"]
+ROOT = Path(__file__).resolve().parents[1]
 
 #: what most commands and scripts import; Dr.Jit is not started, since a fork would lack its threads
 PRELOADED = [
-    "known_clouds",
+    "tests.maps.campaign.known_clouds",
     "mitsim.cli",
     "mitsim.study.many_captures",
     "mitsim.report.figures",
@@ -86,7 +83,7 @@ def _start_server() -> None:
     assert _CONTEXT is not None
     _CONTEXT.set_forkserver_preload(PRELOADED)
     # the server gets its modules by the environment: Python 3.11 does not hand it sys.path
-    path = [*map(str, FOLDERS), *filter(None, [os.environ.get("PYTHONPATH")])]
+    path = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
     with mock.patch.dict(os.environ, {"PYTHONPATH": os.pathsep.join(path)}):
         forkserver.ensure_running()
 
@@ -98,7 +95,7 @@ def _run(command: list[str], said: str, environment: dict[str, str], limits: Any
             os.dup2(file.fileno(), stream.fileno())
     os.environ.clear()
     os.environ.update(environment)
-    os.chdir(HERE.parent)
+    os.chdir(ROOT)
     if limits is not None:
         limits()
     if command[0] == "-m":

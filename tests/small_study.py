@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from shell import ROOT
+from tests.shell import ROOT
 
 #: measurements of :func:`few_measurements`: one of all three features, and the radii
 MEASUREMENTS = ("point1_point2_distance", "pillar1_radius", "pillar2_radius")

@@ -12,9 +12,10 @@ import numpy as np
 
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.drift import Drift
-from mitsim.sensor.preset import Sensor, load_sensor
+from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_covariance import write_rig_covariance
+from mitsim.sensor.sensor import Sensor
 
 
 def narrow_search(sensor: Sensor, near_mm: float, far_mm: float) -> Sensor:

@@ -117,6 +117,11 @@ def plane_quality(
     ------
     InputError
         If the region has another shape than the grid or is empty, or an argument is out of range.
+
+    See Also
+    --------
+    mean_depth_error : of the distance
+    temporal_noise : noise over frames
     """
     where = "plane_quality"
     region = _region(where, cloud, region)

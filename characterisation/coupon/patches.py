@@ -78,6 +78,10 @@ def patch_centres(
         Radius of the discs, and their least distance from the edge of the coupon.
     step_px
         Distance between neighbouring centres.
+
+    See Also
+    --------
+    measure_patches : measures the patches about these pixels
     """
     corners = grid.project(coupon.corners())
     middle = grid.project(coupon.centre)

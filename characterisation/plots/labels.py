@@ -37,6 +37,10 @@ def label_columns(
         Largest number of names on a side; the least important others are left out.
     longest
         Largest number of characters of a name; longer ones are cut.
+
+    See Also
+    --------
+    scale_bar : the length of a bar in the picture
     """
     span = high - low
     step = float(max(span[1], 0.62 * span[0])) / _ROWS
@@ -91,6 +95,10 @@ def scale_bar(axes: Axes, place: tuple[float, float], length: float, label: str,
         Text above the bar.
     rise
         Distance of the label above the bar, in data units.
+
+    See Also
+    --------
+    round_length : a length for it
     """
     x, y = place
     axes.plot([x, x + length], [y, y], color=INK, lw=2.2, solid_capstyle="butt", zorder=6)

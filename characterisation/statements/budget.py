@@ -139,6 +139,10 @@ def budget(
     undrawn
         Variances that are added to that of the trials.
 
+    See Also
+    --------
+    largest_line : the largest contribution
+
     Notes
     -----
     Intervals are those of twice the standard error. That of the noise is at least as wide as by chi-square with the

@@ -154,6 +154,10 @@ def posterior(
         (v,) the map's u, and its probability that the measurement is possible.
     prior_own
         Standard uncertainty of the logarithm of the map's u, of each view.
+
+    See Also
+    --------
+    sampled : samples of that distribution
     """
     every = np.asarray(errors, float)
     tried, valued = ~np.isinf(every), np.isfinite(every)

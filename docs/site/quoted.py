@@ -4,7 +4,7 @@ A comment directly before a fenced output, a table of figures or a picture says 
 
     <!-- made by: mitsim decode captures/first -o first.ply; takes 3 s -->
     <!-- made by: as above -->                        by the command of the figure before
-    <!-- held by: tests/surface/test_metals.py -->    a test computes it again and compares
+    <!-- held by: tests/scene/surface/test_metals.py -->    a test computes it again and compares
     <!-- not run: needs the recording stereo.zip -->  a recording, a device, numbers that are settings
     <!-- file: look.py -->                            the fence below is a file that later commands need; it equals
                                                       the file of this name in the repository, if there is one

@@ -141,6 +141,15 @@ class Capture:
         >>> left.figure.savefig("images.png")
         """
         # imported here because a capture alone does not need matplotlib
-        from mitsim.capture.picture import draw_capture
+        from mitsim.capture.picture import draw_images, draw_maps
 
-        return draw_capture(self, ax, camera, image)
+        caption = f"{self.sensor}, {self.source}"
+        if not self.images:
+            if not self.derived:
+                raise InputError(f"capture of {self.sensor}", "images", "none", "at least one image or map to draw")
+            depth = {name: values[..., 2] if name == "points" else values for name, values in self.derived.items()}
+            return draw_maps(depth, DERIVED_UNITS, caption, ax)
+        if camera is not None and camera not in self.images:
+            raise InputError("plot", "camera", repr(camera), ", ".join(self.images))
+        stacks = self.images if camera is None else {camera: self.images[camera]}
+        return draw_images(stacks, 2**self.bits - 1, caption, ax, image)

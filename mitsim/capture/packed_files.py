@@ -57,6 +57,10 @@ def packed(
     ------
     InputError
         If something in the capture cannot be written to a file, or the file could not be read back.
+
+    See Also
+    --------
+    check_image : checks each image before it is packed
     """
     folder = Path(folder)
     extra = {("vendor", name): data for name, data in (vendor or {}).items()}

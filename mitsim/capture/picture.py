@@ -1,8 +1,8 @@
-"""Draw the images of a capture: grey levels of every camera, with saturated pixels marked; or the maps of a device."""
+"""Draw images of cameras in grey, with saturated pixels marked, or maps that a device computed."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from characterisation.files.errors import InputError
 from characterisation.plots.clouds import depth_limits
 from characterisation.plots.style import SEQUENTIAL, VERMILION, axes_for, side_bar
-from mitsim.capture.capture import DERIVED_UNITS, Capture
 
 #: percentiles of the grey values shown as black and white, and the display exponent, since metal is dark but for its
 #: highlights
@@ -31,36 +30,38 @@ def grey_limits(frames: Sequence[NDArray[np.number[Any]]]) -> tuple[float, float
     return black, float(max(ends[:, 1].max(), black + 1))
 
 
-def draw_capture(capture: Capture, ax: Any, camera: str | None, image: int) -> NDArray[np.object_]:
-    """Draw one image of every camera, or of one; of a capture without images, the maps that the device computed.
+def draw_images(
+    stacks: Mapping[str, NDArray[np.unsignedinteger[Any]]], full_scale: int, caption: str, ax: Any, image: int
+) -> NDArray[np.object_]:
+    """Draw one image of every camera, all of one scale; return their axes.
 
     Parameters
     ----------
-    capture
-        Capture to draw.
+    stacks
+        By camera name, (frames, H, W) [DN].
+    full_scale
+        Value of a saturated pixel [DN].
+    caption
+        Sensor and source, for the titles.
     ax
         Axes to draw into, one for each camera; None for those of a new figure.
-    camera
-        Draw this camera alone; None for all.
     image
         Number of the image, from 0; negative numbers count from the last.
 
     Raises
     ------
     InputError
-        If there is no such camera or image, nothing to draw, or another number of axes.
+        If there is no such image, or another number of axes.
+
+    See Also
+    --------
+    draw_maps : maps that a device computed
     """
-    if not capture.images:
-        return _draw_derived(capture, ax)
-    if camera is not None and camera not in capture.images:
-        raise InputError("plot", "camera", repr(camera), ", ".join(capture.images))
-    chosen = {name: stack for name, stack in capture.images.items() if camera in (None, name)}
-    count = min(len(stack) for stack in chosen.values())
+    count = min(len(stack) for stack in stacks.values())
     if not -count <= image < count:
         raise InputError("plot", "image", image, f"0 to {count - 1}")
-    frames = {name: stack[image] for name, stack in chosen.items()}
+    frames = {name: stack[image] for name, stack in stacks.items()}
     black, white = grey_limits(list(frames.values()))
-    full_scale = 2**capture.bits - 1
     rows, columns = next(iter(frames.values())).shape
     size = (_WIDTH_IN * len(frames) + _SCALE_IN, _WIDTH_IN * rows / columns + _LABELS_IN)
     with axes_for(ax, (1, len(frames)), size) as grid:
@@ -75,16 +76,34 @@ def draw_capture(capture: Capture, ax: Any, camera: str | None, image: int) -> N
                 place = {"loc": "upper left", "bbox_to_anchor": (0.0, -0.02), "borderaxespad": 0.0, "handlelength": 1.1}
                 axes.legend(handles=[Patch(facecolor=VERMILION, label=label)], **place)
             number = f", image {image % count + 1} of {count}" if count > 1 else ""
-            _title(axes, f"{name}{number}: {capture.sensor}, {capture.source}")
+            _title(axes, f"{name}{number}: {caption}")
         side_bar(grid[0, -1], shown, f"grey level [DN], exponent {STRETCH_EXPONENT}")
     return np.asarray(grid[0])
 
 
-def _draw_derived(capture: Capture, ax: Any) -> NDArray[np.object_]:
-    """Draw the maps of a device, of points their depth."""
-    if not capture.derived:
-        raise InputError(f"capture of {capture.sensor}", "images", "none", "at least one image or map to draw")
-    maps = {name: values[..., 2] if name == "points" else values for name, values in capture.derived.items()}
+def draw_maps(
+    maps: Mapping[str, NDArray[np.float32]], units: Mapping[str, str], caption: str, ax: Any
+) -> NDArray[np.object_]:
+    """Draw maps in colours; return their axes.
+
+    Parameters
+    ----------
+    maps, units
+        By name, (H, W), NaN where a value is missing, and their units.
+    caption
+        Sensor and source, for the titles.
+    ax
+        Axes to draw into, one for each map; None for those of a new figure.
+
+    Raises
+    ------
+    InputError
+        If the number of axes is another.
+
+    See Also
+    --------
+    draw_images : images of cameras
+    """
     rows, columns = next(iter(maps.values())).shape
     size = ((_WIDTH_IN + _SCALE_IN) * len(maps), _WIDTH_IN * rows / columns + _LABELS_IN)
     with axes_for(ax, (1, len(maps)), size) as grid:
@@ -93,8 +112,8 @@ def _draw_derived(capture: Capture, ax: Any) -> NDArray[np.object_]:
             shown = axes.imshow(
                 np.ma.masked_invalid(values), cmap=SEQUENTIAL, vmin=low, vmax=high, interpolation="nearest"
             )
-            side_bar(axes, shown, f"{name} [{DERIVED_UNITS[name]}]")
-            _title(axes, f"{name} by the device: {capture.sensor}, {capture.source}")
+            side_bar(axes, shown, f"{name} [{units[name]}]")
+            _title(axes, f"{name} by the device: {caption}")
     return np.asarray(grid[0])
 
 

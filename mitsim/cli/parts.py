@@ -25,8 +25,8 @@ from mitsim.cli.options import (
 
 if TYPE_CHECKING:
     from mitsim.report.author_page import Authored
-    from mitsim.scene.first_hits import VisibleSurfaces
-    from mitsim.sensor.preset import Sensor
+    from mitsim.scene.visible_surfaces import VisibleSurfaces
+    from mitsim.sensor.sensor import Sensor
     from mitsim.sensor.transforms import Transform
 
 
@@ -113,9 +113,9 @@ def _inspected(
     """Load a scene and look for mistakes; return also what the sensor sees, and its pose: the usual one if None."""
     from mitsim.report.author_page import Authored
     from mitsim.scene.authoring.check import findings, read_features
-    from mitsim.scene.first_hits import visible_surfaces
     from mitsim.scene.inspect import inspect
     from mitsim.scene.load import load_scene
+    from mitsim.scene.visible_surfaces import visible_surfaces
     from mitsim.sensor.working_volume import pose_at, usual_place
 
     wanted = read_features(task) if task else None

@@ -105,8 +105,8 @@ def render(
     from mitsim.capture.simulated.truth import encode_exr, true_images
     from mitsim.decoding import captures as interface
     from mitsim.running.progress import say
-    from mitsim.scene.first_hits import sees_nothing
     from mitsim.scene.surface.scatter import Deviation
+    from mitsim.scene.visible_surfaces import sees_nothing
 
     chosen, moved = interface.load_sensor(sensor), Deviation.parse(deviation)
     loaded = interface.load_scene(scene, chosen, defined, deviation=moved)

@@ -209,7 +209,7 @@ def state(
     from characterisation.files.atomic_io import write_json
     from mitsim.study import open_study, with_plan
     from mitsim.study.session import Session
-    from mitsim.study.virtual.stated import statement_document
+    from mitsim.study.statement_document import statement_document
 
     check_folder(output)
     chosen = with_plan(open_study(study, ask=asking(yes)), plan)

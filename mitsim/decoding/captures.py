@@ -26,7 +26,7 @@ from mitsim.scene.surface.scatter import NOMINAL, Deviation
 from mitsim.sensor import preset
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.poses import as_pose
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.sensor_file import Purpose
 from mitsim.sensor.transforms import Transform
 
@@ -96,6 +96,10 @@ def load_scene(
     InputError
         If the file is missing, cannot be parsed, names something unknown to Mitsuba, or has a size that is implausible
         in mm.
+
+    See Also
+    --------
+    load_sensor : the sensor
 
     Examples
     --------

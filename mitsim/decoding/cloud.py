@@ -37,8 +37,9 @@ from mitsim.decoding.grid_cloud import empty_cloud
 from mitsim.sensor.decoder_settings import DecoderSettings, DeviceMapSettings
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.matcher import MatcherSettings
-from mitsim.sensor.preset import Sensor, load_sensor, presets
+from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.projector_images import ImagesDescription, ProjectorImages
+from mitsim.sensor.sensor import Sensor
 
 __all__ = [
     "Geometry",

@@ -108,6 +108,10 @@ def range_warning(
         Sensor whose file holds these settings; None if they are the capture's own.
     reason
         How the depth is known.
+
+    See Also
+    --------
+    surface_beyond : finds that surface
     """
     near, far = (f"{depth:.0f}" for depth in depths)
     extent = f"{near} mm" if near == far else f"{near} to {far} mm"

@@ -95,6 +95,10 @@ def read_cloud(
     ------
     InputError
         If the path does not exist, or its content cannot be read or decoded.
+
+    See Also
+    --------
+    cloud_paths : the files that a user names
     """
     if path.is_file() and _is_mitsim_ply(path):
         return InputCloud(path, cloud_files.read_cloud(path), None)

@@ -37,6 +37,10 @@ def was_read_out(positions: NDArray[np.float32], read_out: Roi, width: int, heig
         Region of the image that was read out.
     width, height
         Size of the image [px].
+
+    See Also
+    --------
+    needed_region : the pixels that the interpolation needs
     """
     column, row = positions
     inside = column >= (read_out.left if read_out.left > 0 else -0.5)

@@ -110,6 +110,10 @@ def time_of_flight_geometry(rig: Rig, camera_name: str, near_mm: float, far_mm: 
     ------
     InputError
         If the rig has no such camera, or no light source.
+
+    See Also
+    --------
+    decode_time_of_flight : decodes with it
     """
     if camera_name not in rig.cameras:
         raise InputError("rig", "cameras", repr(camera_name), ", ".join(rig.cameras))
@@ -188,6 +192,10 @@ def decode_time_of_flight(
     InputError
         If the stack does not fit the code, the range exceeds the unambiguous path, or the region of interest does not
         lie in the images.
+
+    See Also
+    --------
+    time_of_flight_geometry : prepares the camera
     """
     camera, full_scale = geometry.camera, context.full_scale
     imager = context.imager if isinstance(context.imager, Imager) else None
@@ -251,6 +259,10 @@ def joint_path(
         (H, W) optical path L [mm], 0 to the unambiguous one, and its standard deviation by noise [mm].
     chi_square
         (H, W) J of the most likely number of turns.
+
+    See Also
+    --------
+    unambiguous_path : the range of the path
     """
     candidate_count = _candidate_count(code)
     ratio = (code.frequencies_hz / code.frequencies_hz[-1]).astype(np.float32)

@@ -39,7 +39,7 @@ from mitsim.running.progress import track
 from mitsim.scene.load import Scene
 from mitsim.scene.test_targets import FINISHES, ball, ball_on_plate, plate
 from mitsim.sensor.noise_sources import Noise
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform, look_at
 
 Floats = NDArray[np.float64]

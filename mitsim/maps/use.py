@@ -24,7 +24,7 @@ from mitsim.maps.prediction import CharacterisedScene, Predictor
 from mitsim.running.executor import Executor
 from mitsim.scene.load import Scene
 from mitsim.sensor.poses import as_pose
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 
 
@@ -164,6 +164,10 @@ def predict(
     ------
     InputError
         If the map belongs to another sensor, or lacks a finish; or the pose is not a rigid motion.
+
+    See Also
+    --------
+    characterise : makes a map
 
     Notes
     -----

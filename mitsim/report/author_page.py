@@ -31,7 +31,7 @@ from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.triangles import triangles_by_shape
 from mitsim.scene.surface.metals import CONSTANTS
 from mitsim.scene.surface.processes import PROCESSES
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 
 #: in the order in which they are joined to one script
 SCRIPTS = ("view_scene.js", "author_files.js", "author_geometry.js", "author_page.js")

@@ -19,10 +19,10 @@ from characterisation.plots.style import FIELD, MUTED, OTHER_SHAPE, SEQUENTIAL, 
 from characterisation.region_of_interest import Roi
 from mitsim.report.style import colour_scale
 from mitsim.running.numbers import percent
-from mitsim.scene.first_hits import VisibleSurfaces
 from mitsim.scene.light_transport.light_from_faces import LightFromFaces, light_from_faces
 from mitsim.scene.load import Scene
-from mitsim.sensor.preset import Sensor
+from mitsim.scene.visible_surfaces import VisibleSurfaces
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 
 #: width of the figure and of a picture [in]
@@ -53,6 +53,10 @@ def bounced_light(
         Surfaces that the reference camera sees from there.
     seed
         Of the light paths.
+
+    See Also
+    --------
+    bounce_figure : draws it
     """
     rows, columns = np.nonzero(visible.shape >= 0)
     camera = sensor.rig.reference

@@ -23,10 +23,11 @@ from characterisation.plots.labels import round_length, scale_bar
 from characterisation.plots.part_pictures import EDGE_SHADE, shape_edges
 from characterisation.plots.style import FIELD, INK, MUTED, OTHER_SHAPE, SHAPES, bare, drawing
 from mitsim.running.numbers import finish_name
-from mitsim.scene.first_hits import VisibleSurfaces, trace
+from mitsim.scene.first_hits import first_hits
 from mitsim.scene.inspect import SceneFacts, ShapeFacts
 from mitsim.scene.load import Scene
-from mitsim.sensor.preset import Sensor
+from mitsim.scene.visible_surfaces import VisibleSurfaces
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.working_volume import common_view, depth, in_working_volume
 
@@ -143,7 +144,7 @@ def _from_sensor(
     camera, size = sensor.rig.reference, columns.shape
     rays = camera.rays(np.stack([columns, rows], axis=-1).reshape(-1, 2))
     world = pose.directions(camera.sensor_from_camera.directions(rays))
-    hits = trace(scene, np.broadcast_to(pose.points(camera.centre), world.shape), world)
+    hits = first_hits(scene.mitsuba, np.broadcast_to(pose.points(camera.centre), world.shape), world)
     light = np.array([-0.35, -0.45, -0.82])  # from behind the sensor's left shoulder
     lit = np.clip(pose.inverse().directions(hits.normal) @ (light / np.linalg.norm(light)), 0, 1).reshape(size)
     nearest = tuple(np.clip(np.rint(one).astype(int), 0, end - 1) for one, end in ((rows, height), (columns, width)))
@@ -223,7 +224,7 @@ def _from_above(
     size = places.shape[:2]
     above = float(facts.bounds[1, 2] + 1 + 0.1 * (right - left))
     origins = np.concatenate([places, np.full((*size, 1), above)], axis=-1).reshape(-1, 3)
-    hits = trace(scene, origins, np.broadcast_to([0.0, 0.0, -1.0], origins.shape))
+    hits = first_hits(scene.mitsuba, origins, np.broadcast_to([0.0, 0.0, -1.0], origins.shape))
     light = np.array([-0.4, 0.35, 0.85])
     lit = np.clip(hits.normal @ (light / np.linalg.norm(light)), 0, 1).reshape(size)
     shape, front = hits.shape.reshape(size), hits.front.reshape(size)

@@ -58,6 +58,10 @@ def wrapped(text: str, size: float, across: float, weight: str = "normal") -> li
         Size [pt] and weight of the font.
     across
         Largest width of a line [in].
+
+    See Also
+    --------
+    text_width : of one line
     """
     lines, line = list[str](), ""
     for word in text.split(" "):
@@ -105,6 +109,10 @@ class Page:
             The line.
         size, colour, weight
             Of the font; the size in pt.
+
+        See Also
+        --------
+        write : several lines
         """
         x, y = (MARGIN + left) / WIDTH, self.place / HEIGHT
         self.figure.text(x, y, text, fontsize=size, color=colour, fontweight=weight, va="top")
@@ -128,6 +136,10 @@ class Page:
             Of the font; the size in pt.
         left, across
             Distance from the margin, and largest width of a line [in].
+
+        See Also
+        --------
+        put : one line at a place
         """
         for line in wrapped(text, size, across, weight):
             self.put(left, line, size, colour, weight)

@@ -103,6 +103,10 @@ def shown_cloud(cloud: PointCloud, part_from_sensor: Floats, features: Sequence[
         Names of the features of the task.
     most
         Largest number of points.
+
+    See Also
+    --------
+    packed_cloud : its bytes in the page
     """
     valid, stride = cloud.valid, 1.0
     rows, columns = np.nonzero(valid)

@@ -1,42 +1,17 @@
-"""Find the first surfaces that rays meet, on either side, and those that a sensor's reference camera sees.
-
-Signal chain: rays -> nearest surface, its shape and side -> shadow rays to the other cameras and the projector ->
-surfaces that all of them see.
-"""
+"""Find the first surface on each ray in a Mitsuba scene, whichever side it shows, and Mitsuba's numbers of shapes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import known_to_device, vectors_to_device, vectors_to_host
-from mitsim.scene.load import Scene
-from mitsim.scene.ray_casting.raycast import PixelRays, cast, shape_indices, shapes_met
-from mitsim.sensor.camera import Rig
-from mitsim.sensor.rig_parameters import eyes
-from mitsim.sensor.transforms import Transform
 
 Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class VisibleSurfaces:
-    """Surfaces that the pixels of the reference camera see.
-
-    - ``shape`` (H, W): index of the first shape on the ray, whichever side it shows; -1 for none.
-    - ``front`` (H, W): whether the reflecting side of the shape is seen.
-    - ``normal`` (H, W, 3) toward the camera and ``point`` (H, W, 3) [mm], sensor frame; NaN without a shape.
-    - ``seen_by_all`` (H, W): whether the front is seen and every other camera and the projector has a free line to it.
-    """
-
-    shape: NDArray[np.int16]
-    front: NDArray[np.bool_]
-    normal: Floats
-    point: Floats
-    seen_by_all: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -54,15 +29,15 @@ class Hits:
     distance: Floats
 
 
-def trace(scene: Scene, origins: NDArray[np.floating], directions: NDArray[np.floating]) -> Hits:
-    """Trace n rays to the first surface, whichever side it shows.
+def first_hits(scene: Any, origins: NDArray[np.floating], directions: NDArray[np.floating]) -> Hits:
+    """Return the first surfaces on n rays in an ``mi.Scene``.
 
     ``origins`` (n, 3) [mm] and unit ``directions`` (n, 3), world frame. A direction of NaN meets nothing.
     """
     start = vectors_to_device(np.asarray(origins).reshape(-1, 3))
     along, active = known_to_device(np.asarray(directions).reshape(-1, 3))
     ray = mi.Ray3f(mi.Point3f(start), along)
-    surface = scene.mitsuba.ray_intersect(ray, active)
+    surface = scene.ray_intersect(ray, active)
     behind = dr.dot(surface.n, ray.d) > 0
     two_sided = (surface.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.BackSide))) != 0
     front = ~behind | two_sided
@@ -76,23 +51,18 @@ def trace(scene: Scene, origins: NDArray[np.floating], directions: NDArray[np.fl
     return Hits(shape, np.array(front, bool) & (shape >= 0), vectors, np.array(distance, float))
 
 
-def sees_nothing(scene: Scene, rig: Rig, world_from_sensor: Transform) -> list[str]:
-    """Return the names of the cameras, and ``projector``, in whose images no pixel shows the scene."""
-    seen = {name: shapes_met(scene, PixelRays.of_camera(eye), world_from_sensor) for name, eye in eyes(rig).items()}
-    return [name for name, shape in seen.items() if not (shape >= 0).any()]
+def shape_indices(scene: Any, numbers: Any) -> NDArray[np.int16]:
+    """Return the indices (n,) into the shapes of an ``mi.Scene`` of Mitsuba's shape numbers; -1 for none."""
+    ids = np.array(numbers)
+    lookup = np.full(int(ids.max(initial=0)) + 1, -1, np.int16)
+    for index, shape in enumerate(scene.shapes()):
+        id_of_shape = shape_number(shape)
+        if id_of_shape < len(lookup):
+            lookup[id_of_shape] = index
+    lookup[0] = -1
+    return np.asarray(lookup[ids])
 
 
-def visible_surfaces(scene: Scene, rig: Rig, world_from_sensor: Transform) -> VisibleSurfaces:
-    """Return the surfaces that the pixels of a rig's reference camera see from one pose."""
-    camera = rig.reference
-    directions = camera.pixel_directions()
-    shape = directions.shape[:2]
-    origin = world_from_sensor.points(camera.centre)
-    world = world_from_sensor.directions(directions.reshape(-1, 3))
-    hits = trace(scene, np.broadcast_to(origin, world.shape), world)
-    rays = PixelRays(camera.centre, directions)  # PixelRays.of_camera would undistort all pixels again
-    seen = cast(scene, rays, world_from_sensor, np.array([eye.centre for eye in list(eyes(rig).values())[1:]])).seen
-    normal = world_from_sensor.inverse().directions(hits.normal).reshape(*shape, 3)
-    point = camera.centre + directions * hits.distance.reshape(*shape, 1)
-    seen_by_all = np.asarray(hits.front.reshape(shape) & seen.all(axis=0))
-    return VisibleSurfaces(hits.shape.reshape(shape), hits.front.reshape(shape), normal, point, seen_by_all)
+def shape_number(shape: Any) -> int:
+    """Return Mitsuba's number of a shape, which is 1 or more."""
+    return int(np.ravel(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))))[0])

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from characterisation.coupon.orientations import sphere_directions
 from mitsim.scene.backend import mi
-from mitsim.scene.first_hits import trace
+from mitsim.scene.first_hits import first_hits
 from mitsim.scene.load import Scene, bounds_of
 from mitsim.scene.materials import Finish
 from mitsim.scene.mesh_facts import MeshFacts, mesh_facts
@@ -219,7 +219,7 @@ def _count_first_hits(scene: Scene) -> tuple[NDArray[np.int64], NDArray[np.int64
         offsets = grid @ np.stack([first, np.cross(direction, first)])
         origins.append(scene.centre + 2 * radius * direction + offsets)
         directions.append(np.broadcast_to(-direction, offsets.shape))
-    hits = trace(scene, np.concatenate(origins), np.concatenate(directions))
+    hits = first_hits(scene.mitsuba, np.concatenate(origins), np.concatenate(directions))
     count = len(scene.names)
     front_hits = np.bincount(hits.shape[hits.front], minlength=count)
     back_hits = np.bincount(hits.shape[(hits.shape >= 0) & ~hits.front], minlength=count)
@@ -239,7 +239,8 @@ def _count_escaping_rays(scene: Scene, shape: ShapeFacts, size: float) -> ShapeF
     )
     side = np.sign(normals @ directions.T)
     origins = points[:, None] + 1e-5 * size * side[..., None] * normals[:, None]
-    escaped = trace(scene, origins, np.broadcast_to(directions, origins.shape)).shape.reshape(side.shape) < 0
+    met = first_hits(scene.mitsuba, origins, np.broadcast_to(directions, origins.shape)).shape
+    escaped = met.reshape(side.shape) < 0
     return replace(shape, front_hits=int((escaped & (side > 0)).sum()), back_hits=int((escaped & (side < 0)).sum()))
 
 

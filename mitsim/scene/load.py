@@ -101,7 +101,8 @@ class Scene:
         # imported here because a scene alone needs neither matplotlib nor rays
         from mitsim.scene.picture import draw_scene
 
-        return draw_scene(self, ax, None if pose is None else as_pose(pose, "plot"))
+        seen_from = None if pose is None else as_pose(pose, "plot")
+        return draw_scene(self.mitsuba, self.names, self.bounds, ax, seen_from)
 
     def deviated(self, deviation: Callable[[str], Deviation]) -> Scene:
         """Return the scene with finishes that deviate from their best estimates, by the ids of their BSDFs.

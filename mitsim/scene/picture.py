@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from characterisation.plots.labels import label_columns, round_length, scale_bar
 from characterisation.plots.part_pictures import EDGE_SHADE, innermost_pixel, shape_edges, viewer_frame
 from characterisation.plots.style import INK, OTHER_SHAPE, SHAPES, axes_for, figure_of
-from mitsim.scene.first_hits import Hits, trace
-from mitsim.scene.load import Scene
+from mitsim.scene.first_hits import Hits, first_hits
 from mitsim.sensor.transforms import Transform
 
 Floats = NDArray[np.float64]
@@ -35,8 +34,17 @@ _WIDTH_IN = 7.4
 _AZIMUTH, _ELEVATION = np.radians(-60.0), np.radians(35.0)
 
 
-def draw_scene(scene: Scene, ax: Any, pose: Transform | None) -> Axes:
+def draw_scene(scene: Any, names: tuple[str, ...], bounds: Floats, ax: Any, pose: Transform | None) -> Axes:
     """Draw the shapes of a scene with their names, from the default viewpoint or as a sensor at ``pose`` sees them.
+
+    Parameters
+    ----------
+    scene, names, bounds
+        The ``mi.Scene``, the names of its shapes, and the corners (2, 3) of the bounding box [mm].
+    ax
+        Axes to draw into; None for those of a new figure.
+    pose
+        ``world_from_sensor`` [mm]; None for the default viewpoint.
 
     Raises
     ------
@@ -46,13 +54,13 @@ def draw_scene(scene: Scene, ax: Any, pose: Transform | None) -> Axes:
     frame = (
         viewer_frame(_AZIMUTH, _ELEVATION) if pose is None else np.array([1.0, -1.0, -1.0])[:, None] * pose.rotation.T
     )
-    corners = np.stack(np.meshgrid(*scene.bounds.T, indexing="ij"), axis=-1).reshape(-1, 3)
+    corners = np.stack(np.meshgrid(*bounds.T, indexing="ij"), axis=-1).reshape(-1, 3)
     seen = corners @ frame.T
     low, high = seen.min(axis=0), seen.max(axis=0)
     step = float((high - low)[:2].max()) / _RAYS
     x, y = (np.arange(low[k] - 2 * step, high[k] + 2 * step, step) for k in (0, 1))
     places = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), high[2] + 1.0)], axis=-1)
-    hits = trace(scene, places.reshape(-1, 3) @ frame, np.broadcast_to(-frame[2], (places[..., 0].size, 3)))
+    hits = first_hits(scene, places.reshape(-1, 3) @ frame, np.broadcast_to(-frame[2], (places[..., 0].size, 3)))
     shape = hits.shape.reshape(places.shape[:2])
     extent = (x[0] - step / 2, x[-1] + step / 2, y[0] - step / 2, y[-1] + step / 2)
     with axes_for(ax, (1, 1), (_WIDTH_IN, _WIDTH_IN)) as grid:
@@ -61,18 +69,18 @@ def draw_scene(scene: Scene, ax: Any, pose: Transform | None) -> Axes:
         axes.set_aspect("equal")
         axes.set_axis_off()
         low_corner, high_corner = np.array(extent).reshape(2, 2).T
-        label_columns(axes, _label_places(scene, shape, x, y), low_corner, high_corner, longest=24)
+        label_columns(axes, _label_places(names, shape, x, y), low_corner, high_corner, longest=24)
         length = round_length(0.3 * (extent[1] - extent[0]))
         bottom = min(axes.get_ylim()[0], extent[2] - 0.15 * (extent[1] - extent[0]))
         axes.set_ylim(bottom, None)
         scale_bar(axes, (extent[0], bottom), length, f"{length:g} mm", 0.015 * (extent[1] - extent[0]))
         _directions(axes, frame, (extent[1], bottom), 0.09 * (extent[1] - extent[0]))
-        hidden = len(scene.names) - len(np.unique(shape[shape >= 0]))
+        hidden = len(names) - len(np.unique(shape[shape >= 0]))
         view = "from the front and above" if pose is None else "as the sensor sees it, to scale"
         if ax is None:
             across, tall = np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())
             figure_of(axes).set_figheight(min(_WIDTH_IN * tall / across, 9.0) + 0.4)
-        axes.set_title(f"{len(scene.names)} shapes, {view}" + (f"; {hidden} hidden" if hidden else ""))
+        axes.set_title(f"{len(names)} shapes, {view}" + (f"; {hidden} hidden" if hidden else ""))
     return axes
 
 
@@ -86,13 +94,13 @@ def _shaded(hits: Hits, shape: NDArray[np.int16], frame: Floats) -> Floats:
     return np.asarray(image)
 
 
-def _label_places(scene: Scene, shape: NDArray[np.int16], x: Floats, y: Floats) -> dict[str, Floats]:
+def _label_places(names: tuple[str, ...], shape: NDArray[np.int16], x: Floats, y: Floats) -> dict[str, Floats]:
     """Return the point of each visible shape that is farthest from its edges, largest shapes first."""
     numbers, counts = np.unique(shape[shape >= 0], return_counts=True)
     places = {}
     for number in numbers[np.argsort(-counts, kind="stable")]:
         row, column = innermost_pixel(shape == number)
-        places[scene.names[number]] = np.array([x[column], y[row]])
+        places[names[number]] = np.array([x[column], y[row]])
     return places
 
 

@@ -199,6 +199,10 @@ def of_images(
         Part of the imager that is read out, and its binning.
     images
         (width, height) [px] of the images, if known.
+
+    See Also
+    --------
+    read_out_of : the read-out that a table states
     """
     corner, binning = np.array(read_out.corner), np.array(read_out.binning)
     full = None if stated is None else np.array(stated, float)

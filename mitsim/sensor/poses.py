@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from characterisation.files.errors import InputError
 from mitsim.sensor import transforms
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform, is_rotation
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from characterisation.files.errors import InputError
 from mitsim.sensor.drift import Drift, with_drift
-from mitsim.sensor.preset import Sensor
 from mitsim.sensor.rig_covariance import RigCovariance, read_rig_covariance
+from mitsim.sensor.sensor import Sensor
 
 
 def preset_covariance(sensor: Sensor, drift: Drift | None = None) -> RigCovariance:

@@ -103,6 +103,11 @@ def checked_images(images: ArrayLike, width: int, height: int, where: str) -> Pr
     ------
     InputError
         If they have another size or type, are too many, or a value is not between 0 and 1.
+
+    See Also
+    --------
+    read_images : from a folder
+    allowed_images : what a sensor can decode
     """
     values = np.asarray(images)
     if values.ndim == 2:
@@ -143,6 +148,10 @@ def allowed_images(
     ------
     InputError
         If the technology has a pattern of its own, or the matcher takes one image only.
+
+    See Also
+    --------
+    checked_images : checks size and values
     """
     if technology == "time_of_flight":
         raise InputError(where, "pattern", f"images, for {technology}", "images for sensors that project a pattern")

@@ -197,6 +197,10 @@ def speckle_field(
     ------
     InputError
         For speckle larger than a quarter of the image.
+
+    See Also
+    --------
+    contrast : the contrast of it
     """
     if size_px > max(0.25 * min(shape), 1):
         raise InputError("speckle", "size_px", size_px, "up to a quarter of the image", "a smaller f-number")

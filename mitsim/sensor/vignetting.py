@@ -69,6 +69,10 @@ def relative_illumination(
     ------
     InputError
         For a corner outside 0 (excluded) to 1.
+
+    See Also
+    --------
+    camera_illumination : of all pixels of a camera
     """
     if not 0 < corner <= 1:
         raise InputError("lens", "corner_illumination", corner, "over 0, up to 1")

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from characterisation.coupon.orientations import sphere_directions
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.preset import Sensor
 from mitsim.sensor.rig_parameters import eyes
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform, look_at
 
 
@@ -107,6 +107,10 @@ def pose_at(
         The sensor, and its rotation about the axis [deg].
     position, target
         Ends of the line (3,) [mm].
+
+    See Also
+    --------
+    usual_place : a default place of the sensor
     """
     camera = sensor.rig.reference.sensor_from_camera
     return look_at(position, target, (0.0, 0.0, 1.0), roll_deg) @ camera.inverse()

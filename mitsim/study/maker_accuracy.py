@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 from characterisation.tasks.task_file import Measurement
 from mitsim.running.numbers import listed, two_digits
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 
 #: share of the maker's figure below which a statement says why
 SHARE = 0.1

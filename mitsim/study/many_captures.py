@@ -35,7 +35,7 @@ from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.scene.surface.scatter import Deviation
 from mitsim.scene.xml_check import named_digests
 from mitsim.sensor.noise_sources import Noise
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.views import ViewsTable, candidate_views
 from mitsim.views.standoffs import chosen_standoffs

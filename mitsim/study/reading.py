@@ -34,7 +34,8 @@ from mitsim.scene.load import Scene, load_scene
 from mitsim.scene.materials import Finish
 from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.scene.surface.lay import lays_in_words
-from mitsim.sensor.preset import Sensor, load_sensor
+from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
 from mitsim.study.screened_errors import screened_errors
 from mitsim.study.tables import ExposureTable, StudyFile

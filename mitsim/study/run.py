@@ -43,6 +43,7 @@ from mitsim.study.remedies.confirm import all_changes, find_remedies, remedies_d
 from mitsim.study.run_record import draw_clouds, write_record
 from mitsim.study.scoring import score_study, write_raced
 from mitsim.study.session import Session
+from mitsim.study.statement_document import statement_document
 from mitsim.study.time_plan import time_plan
 from mitsim.study.view_sets.confirmed_set import (
     Search,
@@ -56,7 +57,7 @@ from mitsim.study.view_sets.confirmed_set import (
 )
 from mitsim.study.virtual.race import ALL, Raced, in_words
 from mitsim.study.virtual.rendered import RenderedMeasurements
-from mitsim.study.virtual.stated import StatedView, statement_document
+from mitsim.study.virtual.stated import StatedView
 
 #: number of best views per measurement whose predicted clouds are written to the run folder
 SHOWN = 3

@@ -57,7 +57,7 @@ def _runners_up(session: Session, raced: Raced) -> list[dict[str, Any]]:
     out = []
     for v in order:
         number = int(raced.views[v])
-        stated = compared(session, number, raced.leader(ALL))
+        stated = compared(session.study, session.trials, number, raced.leader(ALL))
         out.append(
             {
                 "view": number,

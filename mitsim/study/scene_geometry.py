@@ -19,8 +19,8 @@ from characterisation.files.checked_files import LARGEST_FILE, read_bounded
 from characterisation.files.errors import InputError
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.triangles import triangles_by_shape
-from mitsim.sensor.preset import Sensor
 from mitsim.sensor.rig_parameters import eyes as eyes_of
+from mitsim.sensor.sensor import Sensor
 
 Floats = NDArray[np.float64]
 

@@ -25,7 +25,10 @@ from mitsim.maps.prediction import Predictor
 from mitsim.running.executor import Executor
 from mitsim.running.progress import say
 from mitsim.running.time_limit import TimeLimit
+from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import StatementTable, Study
+from mitsim.study.exposures.exposure_plan import PlanRules
+from mitsim.study.exposures.planned import kept_plan, rendered, stated_exposures, with_exposure
 from mitsim.study.run_files import claim_folder
 from mitsim.study.virtual.mapped import MappedMeasurements
 from mitsim.study.virtual.plan import measured_by, measurements_of, race_rules, study_digest, trial_digest
@@ -33,7 +36,7 @@ from mitsim.study.virtual.race import Raced, RaceRules, run_race
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.screening import screen
 from mitsim.study.virtual.spread_out import SpreadMeasurements
-from mitsim.study.virtual.stated import StatedView, state_view
+from mitsim.study.virtual.stated import StatedView, TrialsOfView, state_view
 from mitsim.study.virtual.study_unknowns import study_unknowns
 from mitsim.study.virtual.trials import TrialFolder
 from mitsim.study.virtual.world import Unknowns
@@ -159,6 +162,34 @@ class Session:
         limit = TimeLimit() if limit is None else limit
         return run_race(self.study.views, scores, self.runner, self.trials, rules, limit.over, after_round)
 
+    def exposures(self, view: View) -> PlannedExposure | None:
+        """Return the exposures of a view: those of the study, or planned ones; None for the sensor's own rule.
+
+        Raises
+        ------
+        InputError
+            If the sensor cannot take or merge the exposures, or measurements are drawn from a map, which holds only for
+            the exposure that it was made with.
+        """
+        table = self.study.file.exposure
+        if table is None:
+            return None
+        renderer = rendered(self.measurements)
+        if table.exposures_s is not None:
+            return stated_exposures(self.study, table.exposures_s, table.power)
+        rules = PlanRules(table.most, table.within)
+        return kept_plan(renderer, view, rules, self.folder / "exposures", self.digest)
+
+    def trials_of(self, view: View) -> TrialsOfView:
+        """Return what makes the trials of a statement of a view at its exposures, and where they are kept."""
+        planned = self.exposures(view)
+        if planned is None:
+            return TrialsOfView(self.runner, self.trials, None)
+        runner = self.runner
+        assert not isinstance(runner, MappedMeasurements)  # exposures() rejects a map
+        folder = TrialFolder.of(self.folder / "planned_trials", with_exposure(self.digest, planned), self.study.task)
+        return TrialsOfView(runner.exposed_as(planned), folder, planned)
+
     def state(
         self,
         view: View,
@@ -175,7 +206,7 @@ class Session:
         table, limit, after_batch
             As of :func:`mitsim.study.virtual.stated.state_view`.
         """
-        return state_view(self, view, table, limit, after_batch)
+        return state_view(self.study, self.unknowns, self.trials_of(view), view, table, limit, after_batch)
 
     def release(self) -> None:
         """Free the memory of the measurements, which are prepared again when they are needed."""

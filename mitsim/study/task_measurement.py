@@ -31,7 +31,7 @@ from mitsim.maps.prediction.predictor import EDGE_MARGIN_PX, Predictor
 from mitsim.scene.load import Scene
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.poses import as_pose
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform, is_rotation
 from mitsim.study.statement_file import PartialDocument
 

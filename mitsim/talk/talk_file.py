@@ -13,7 +13,8 @@ from characterisation.files.documents import Document, checked_name, read_toml
 from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
-from mitsim.sensor.preset import Sensor, load_sensor
+from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.study import CharacterisationTable, Study, StudyFile, open_study
 from mitsim.study.tables import MeasureTable, ScoreTable
 from mitsim.views import View, ViewsTable

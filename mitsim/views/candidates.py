@@ -23,7 +23,7 @@ from characterisation.coupon.orientations import sphere_directions
 from characterisation.features.surfaces import unit
 from characterisation.files.errors import InputError
 from mitsim.running.progress import track_if_long
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform, look_at
 from mitsim.sensor.working_volume import in_image
 from mitsim.views.collision import BodyBox, Obstacle, is_inside, is_near, obstacle, sensor_box
@@ -144,6 +144,10 @@ def candidate_views(
     ------
     InputError
         If no view is possible.
+
+    See Also
+    --------
+    directions_above : the directions
     """
     target = np.asarray(table.target_mm if table.target_mm is not None else centre, float)
     near, far = range_mm or sensor.working_range_mm

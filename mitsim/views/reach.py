@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 from characterisation.coupon.view_frame import view_frame
 from characterisation.stage.angles import Reach, about_one, about_two, least_motion, turned
 from characterisation.stage.turning_axes import rotation_about
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.views.table import PartStage
 

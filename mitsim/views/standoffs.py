@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from characterisation.files.errors import InputError
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.working_volume import nearest_standoff
 from mitsim.views.table import ViewsTable
 

@@ -129,6 +129,10 @@ def score_candidates(
         feature); the poses; and ``nominal``, ``tolerance`` and ``unit`` of the measurements.
     list of dict
         For every view, the input quantities of its measurements, from which sets of views are chosen.
+
+    See Also
+    --------
+    screening_risk : the risk that orders them
     """
     looking = predictor.thinned_to(RAYS)
     names = list(task.shapes)

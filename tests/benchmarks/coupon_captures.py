@@ -39,7 +39,8 @@ from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.campaign.acquire import coupon_cloud, one_ahead
 from mitsim.maps.campaign.plan import coupon_pose
 from mitsim.scene.load import load_scene
-from mitsim.sensor.preset import Sensor, load_sensor, presets
+from mitsim.sensor.preset import load_sensor, presets
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 
 COUPON = Path(__file__).parents[2] / "scenes/coupon/coupon.xml"

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "twin"))
+sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from small_unit import standard_errors
+from tests.twin.sensor.small_unit import standard_errors
 
 
 def main(first: int, last: int, draws: int) -> None:

@@ -2,7 +2,7 @@
 
     python tests/benchmarks/kills.py [kills]
 
-The campaign uses a known sensor (tests/campaign/known_clouds.py). Every second run is slowed down, so that some kills
+The campaign uses a known sensor (maps/campaign/known_clouds.py). Every second run is slowed down, so that some kills
 fall between captures; the others write nearly all the time. Each run is killed by SIGKILL. One in five is killed at a
 random moment of its start, while it reads what is kept. The others are killed a random number of captures later or,
 once all captures are kept, at a random moment until the map is made. Only a run that was still alive counts as killed.
@@ -66,7 +66,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         whole, killed = folder / "whole", folder / "killed"
-        command: list[str | Path] = [sys.executable, ROOT / "tests/campaign/known_clouds.py", campaign_file(folder)]
+        command: list[str | Path] = [
+            sys.executable,
+            ROOT / "tests/maps/campaign/known_clouds.py",
+            campaign_file(folder),
+        ]
         began = time.monotonic()
         first = subprocess.Popen([*command, whole], stderr=subprocess.DEVNULL)
         while not kept_in(whole) and first.poll() is None:

@@ -28,7 +28,8 @@ from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decoding.cloud import capture_cloud
 from mitsim.scene import backend
 from mitsim.scene.load import scene_from_dict
-from mitsim.sensor.preset import Sensor, load_sensor
+from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import look_at
 
 Floats = NDArray[np.float64]

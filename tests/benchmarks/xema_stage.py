@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.capture.folder import read_capture
 from mitsim.decoding.cloud import capture_cloud
-from mitsim.sensor.preset import Sensor, load_sensor
+from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.sensor import Sensor
 
 Floats = NDArray[np.float64]
 CELL, PATCH = 240, 40

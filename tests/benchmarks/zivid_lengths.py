@@ -18,10 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.sensor.drift import Drift, with_drift
-from mitsim.sensor.preset import Sensor, load_sensor
+from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import moved
+from mitsim.sensor.sensor import Sensor
 from mitsim.study.calibration.accuracy import measured_points
 
 Floats = NDArray[np.float64]

@@ -5,7 +5,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from test_docs import PAGES, ROOT, by_page, check_call
+
+from tests.docs.test_docs import PAGES, ROOT, by_page, check_call
 
 sys.path.insert(0, str(ROOT / "docs" / "site"))
 

@@ -3,7 +3,8 @@
 import sys
 
 import pytest
-from test_docs import ROOT
+
+from tests.docs.test_docs import ROOT
 
 sys.path.insert(0, str(ROOT / "docs" / "site"))
 

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_docs import FORMATS, JSON_MODELS, first_column, table_rows
 
 from characterisation.statements.budget import BudgetLine
 from characterisation.statements.decision import plus_minus
@@ -23,7 +22,9 @@ from mitsim.study.exposures.planned import plan_document, write_plan_csv
 from mitsim.study.remedies.change import Change
 from mitsim.study.remedies.confirm import find_remedies, remedies_document
 from mitsim.study.remedies.entries import RemediesEntry
-from mitsim.study.virtual.stated import StatedView, statement_document
+from mitsim.study.statement_document import statement_document
+from mitsim.study.virtual.stated import StatedView
+from tests.docs.test_docs import FORMATS, JSON_MODELS, first_column, table_rows
 
 
 @pytest.fixture(scope="module")

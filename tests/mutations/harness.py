@@ -2,7 +2,7 @@
 
 The children are forked from a process that has imported most of what readers need, so that each begins at once.
 
-``python -m mutations.harness --count 20000 --seed 1`` from ``tests``. Everything is written below a folder of its own,
+``python -m tests.mutations.harness --count 20000 --seed 1``. Everything is written below a folder of its own,
 which is removed; a child that is told to stop is one that was started here. No link is made, and none is followed.
 """
 
@@ -28,8 +28,8 @@ GOOD = ("refused", "accepted")
 
 #: what the children have in common; none of it starts Mitsuba, whose threads a fork would lose
 IMPORTED = [
-    "mutations.readers",
-    "report.conftest",
+    "tests.mutations.readers",
+    "tests.report.conftest",
     "mitsim.scene.authoring.read_mesh",
     "mitsim.maps.campaign.plan",
     "mitsim.capture.recordings.any_recording",
@@ -74,8 +74,7 @@ def _forks():
     """The context of processes that are forked from one that has imported :data:`IMPORTED`."""
     forks = multiprocessing.get_context("forkserver")
     forks.set_forkserver_preload(IMPORTED)
-    tests = Path(__file__).resolve().parents[1]
-    paths = [str(tests), str(tests.parent), os.environ.get("PYTHONPATH", "")]
+    paths = [str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")]
     with mock.patch.dict(os.environ, {"PYTHONPATH": os.pathsep.join(paths)}):
         forkserver.ensure_running()
     first = forks.Process(target=time.sleep, args=(0,))
@@ -146,8 +145,8 @@ def child(name, folder, start, count, telling) -> None:
 
     from characterisation.files.atomic_io import write_netcdf
     from characterisation.files.errors import InputError, MissingEnvironmentError
-    from mutations.mutate import mutated_bytes, mutated_dataset
-    from mutations.readers import READERS
+    from tests.mutations.mutate import mutated_bytes, mutated_dataset
+    from tests.mutations.readers import READERS
 
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     faulthandler.disable()
@@ -188,7 +187,7 @@ def child(name, folder, start, count, telling) -> None:
 
 
 def main() -> int:
-    from mutations.readers import READERS
+    from tests.mutations.readers import READERS
 
     asked = argparse.ArgumentParser(description=__doc__)
     asked.add_argument("--count", type=int, default=2000)

@@ -111,8 +111,7 @@ def _map(path):
 
 def _run_folder(name):
     def make(folder):
-        sys.path.insert(0, str(ROOT / "tests"))
-        from report.conftest import write_run
+        from tests.report.conftest import write_run
 
         return write_run(folder / "run") / name
 
@@ -136,10 +135,8 @@ def _report(path):
 
 
 def _cloud(folder):
-    sys.path.insert(0, str(ROOT / "tests"))
-    from report.conftest import cloud
-
     from characterisation.cloud_files import write_cloud
+    from tests.report.conftest import cloud
 
     write_cloud(cloud("simulated", 1), folder / "cloud.ply")
     return folder / "cloud.ply"
@@ -362,12 +359,10 @@ def _capture(path):
 
 
 def _patches(folder):
-    sys.path.insert(0, str(ROOT / "tests" / "campaign"))
-    from known_clouds import known_source, smooth
-
     from mitsim.maps.campaign.plan import CampaignFile, plan_campaign
     from mitsim.maps.campaign.run import run_campaign
     from mitsim.sensor.preset import load_sensor
+    from tests.maps.campaign.known_clouds import known_source, smooth
 
     table = {
         "distances_mm": [500],
@@ -417,8 +412,7 @@ def _read_kept_task(path):
 
 
 def _choice(folder):
-    sys.path.insert(0, str(ROOT / "tests"))
-    from report.choice_run import write_choice
+    from tests.report.choice_run import write_choice
 
     return write_choice(folder / "choice") / "choice.json"
 
@@ -522,15 +516,14 @@ def _read_step(path):
 
 def _recording(name):
     def make(folder):
-        sys.path.insert(0, str(ROOT / "tests" / "recordings"))
-        from cloud_files_of_others import pcd, pinhole_cloud
+        from tests.capture.recordings.cloud_files_of_others import pcd, pinhole_cloud
 
         if name == "recording.zip":
-            from test_ensenso_files import files, node, pack
+            from tests.capture.recordings.test_ensenso_files import files, node, pack
 
             return pack(folder / name, files(node()))
         if name == "calib.json":
-            from test_ensenso_files import files, node, unpack
+            from tests.capture.recordings.test_ensenso_files import files, node, unpack
 
             return next(unpack(folder / "recording", files(node())).rglob("*.json"))
         (folder / name).write_bytes(pcd(pinhole_cloud(), "ascii" if "ascii" in name else "binary_compressed"))
@@ -541,8 +534,7 @@ def _recording(name):
 
 def _bag(form, compression=None):
     def make(folder):
-        sys.path.insert(0, str(ROOT / "tests" / "recordings"))
-        from ros_bags import ROS1, ROS2, cloud, depth_messages, points_m, write_bag
+        from tests.capture.recordings.ros_bags import ROS1, ROS2, cloud, depth_messages, points_m, write_bag
 
         store = ROS1 if form == "bag" else ROS2
         messages = [*depth_messages(store), ("/points", cloud(store, points_m()))]
@@ -553,16 +545,14 @@ def _bag(form, compression=None):
 
 
 def _zdf(folder):
-    sys.path.insert(0, str(ROOT / "tests" / "recordings"))
-    from test_grids_and_lenses import CAMERA, LENS, bent_cloud, zdf
+    from tests.capture.recordings.test_grids_and_lenses import CAMERA, LENS, bent_cloud, zdf
 
     return zdf(folder / "a.zdf", bent_cloud(), camera_matrix=CAMERA.matrix, distortion=LENS)
 
 
 def _gridless(folder):
-    sys.path.insert(0, str(ROOT / "tests" / "recordings"))
-    from cloud_files_of_others import ply
-    from test_grids_and_lenses import bent_cloud
+    from tests.capture.recordings.cloud_files_of_others import ply
+    from tests.capture.recordings.test_grids_and_lenses import bent_cloud
 
     path = folder / "gridless.ply"
     path.write_bytes(ply(bent_cloud(), grid="none"))
@@ -571,8 +561,7 @@ def _gridless(folder):
 
 def _array(channels):
     def make(folder):
-        sys.path.insert(0, str(ROOT / "tests" / "recordings"))
-        from cloud_files_of_others import pinhole_cloud
+        from tests.capture.recordings.cloud_files_of_others import pinhole_cloud
 
         cloud = pinhole_cloud()
         np.save(folder / "array.npy", cloud if channels else cloud[..., 2])
@@ -582,8 +571,7 @@ def _array(channels):
 
 
 def _archive(folder):
-    sys.path.insert(0, str(ROOT / "tests" / "recordings"))
-    from cloud_files_of_others import pinhole_cloud
+    from tests.capture.recordings.cloud_files_of_others import pinhole_cloud
 
     np.savez_compressed(folder / "array.npz", points=pinhole_cloud(), image=np.zeros((48, 64, 3), np.uint8))
     return folder / "array.npz"
@@ -593,8 +581,7 @@ def _points(name):
     """A cloud in a text, of names, decimal commas and empty fields; or in a structure of MATLAB."""
 
     def make(folder):
-        sys.path.insert(0, str(ROOT / "tests" / "recordings"))
-        from cloud_files_of_others import pinhole_cloud
+        from tests.capture.recordings.cloud_files_of_others import pinhole_cloud
 
         rows = pinhole_cloud().reshape(-1, 3)[::9].astype(float)
         if name.endswith(".mat"):

@@ -9,8 +9,8 @@ import os
 
 import pytest
 
-from .harness import GOOD, run
-from .readers import READERS
+from tests.mutations.harness import GOOD, run
+from tests.mutations.readers import READERS
 
 pytestmark = [pytest.mark.timeout(7200)]
 

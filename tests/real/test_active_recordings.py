@@ -8,7 +8,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from figures_of_surfaces import mean_run_length
 
 from characterisation.coupon.metrics import ray_noise_std
 from characterisation.region_of_interest import Roi
@@ -23,6 +22,7 @@ from mitsim.decoding.matching.stereo import decode_stereo, stereo_geometry
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.transforms import Transform
+from tests.figures_of_surfaces import mean_run_length
 
 pytestmark = pytest.mark.real
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -21,10 +20,7 @@ from mitsim.decoding.checks.sanity import pair_row_error
 from mitsim.decoding.cloud import capture_cloud, decoder_settings
 from mitsim.decoding.image_context import ImageContext
 from mitsim.decoding.matching.stereo import decode_stereo
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "recordings"))
-
-from test_depthai_files import against_the_package
+from tests.capture.recordings.test_depthai_files import against_the_package
 
 pytestmark = pytest.mark.real
 

@@ -6,7 +6,8 @@ import csv
 
 import numpy as np
 import pytest
-from figures_of_surfaces import alpha_of_half_width, half_width
+
+from tests.figures_of_surfaces import alpha_of_half_width, half_width
 
 pytestmark = pytest.mark.real
 

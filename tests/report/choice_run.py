@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .conftest import FEATURES, statement_of, write_scene_geometry
+from tests.report.conftest import FEATURES, statement_of, write_scene_geometry
 
 HOSTILE_NAME = "radius <i>& co"
 NAMES = ("distance_of_the_pillars", HOSTILE_NAME, "angle_of_pillar_to_plane")

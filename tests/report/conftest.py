@@ -316,7 +316,7 @@ def report(run_folder) -> Path:
 @pytest.fixture(scope="session")
 def expecting(tmp_path_factory) -> Path:
     """The run of :mod:`.view_sphere_run`; made once, tests that change something copy it."""
-    from .view_sphere_run import write_expecting_run  # it builds on this module
+    from tests.report.view_sphere_run import write_expecting_run  # it builds on this module
 
     return write_expecting_run(tmp_path_factory.mktemp("sphere") / "run")
 

@@ -7,8 +7,7 @@ import xarray as xr
 from mitsim.report.best_views import best_views
 from mitsim.study.run_folder import read_run
 from mitsim.views.no_view import why_no_view
-
-from .conftest import FEATURES, MEASUREMENTS
+from tests.report.conftest import FEATURES, MEASUREMENTS
 
 
 def test_views_are_listed_by_u_and_those_that_can_hardly_make_the_measurement_are_not(expecting):

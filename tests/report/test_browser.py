@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from mitsim.sensor.png import decode_png
-
-from .chromium import BROWSER
-from .conftest import CHECKED
+from tests.report.chromium import BROWSER
+from tests.report.conftest import CHECKED
 
 pytestmark = [pytest.mark.browser, pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")]
 

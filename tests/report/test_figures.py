@@ -15,8 +15,7 @@ from mitsim.report.style import as_svg
 from mitsim.report.view_figures import agreement_figure, uncertainty_figure, uncertainty_limits, view_places
 from mitsim.sensor.png import decode_png
 from mitsim.study.run_folder import read_run
-
-from .conftest import MEASUREMENTS, cloud
+from tests.report.conftest import MEASUREMENTS, cloud
 
 
 @pytest.fixture(scope="module")

@@ -17,9 +17,8 @@ from mitsim.study.choice_document import read_choice
 from mitsim.study.run_folder import read_run
 from mitsim.study.scene_geometry import read_scene_geometry
 from tests.plain_pages import without_pictures
-
-from .choice_run import write_choice
-from .conftest import MEASUREMENTS, write_run
+from tests.report.choice_run import write_choice
+from tests.report.conftest import MEASUREMENTS, write_run
 
 
 def judged(verdict: str, without_value: float = 0.0) -> Judged:

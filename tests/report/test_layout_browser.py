@@ -8,12 +8,11 @@ import pytest
 from mitsim.report.choice_page import write_choice_page
 from mitsim.report.page import write_report
 from mitsim.running.numbers import percent
-
-from .choice_run import write_choice
-from .chromium import BROWSER
-from .conftest import plain_pictures
-from .test_sheet import with_rows
-from .view_sphere_run import write_expecting_run
+from tests.report.choice_run import write_choice
+from tests.report.chromium import BROWSER
+from tests.report.conftest import plain_pictures
+from tests.report.test_sheet import with_rows
+from tests.report.view_sphere_run import write_expecting_run
 
 pytestmark = [pytest.mark.browser, pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")]
 

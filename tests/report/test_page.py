@@ -17,8 +17,7 @@ from mitsim.report.page import write_report
 from mitsim.running.numbers import two_digits
 from mitsim.study.run_folder import read_run
 from tests.plain_pages import without_pictures
-
-from .conftest import CHECKED, FEATURES, HOSTILE, MEASUREMENTS, plain_pictures, write_run
+from tests.report.conftest import CHECKED, FEATURES, HOSTILE, MEASUREMENTS, plain_pictures, write_run
 
 
 class Tags(HTMLParser):

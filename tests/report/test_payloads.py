@@ -14,8 +14,7 @@ import xarray as xr
 
 from characterisation.files.atomic_io import write_netcdf
 from mitsim.report.page import write_report
-
-from .conftest import plain_pictures
+from tests.report.conftest import plain_pictures
 
 PAYLOADS = {
     "elements and attributes": (

@@ -9,8 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from characterisation.plots.labels import spread
 from mitsim.report.placement_figure import depth_buffer, face_verdicts, placement_figure
 from mitsim.study.scene_geometry import read_scene_geometry
-
-from .conftest import write_scene_geometry
+from tests.report.conftest import write_scene_geometry
 
 
 def test_the_nearer_triangle_hides_the_farther():

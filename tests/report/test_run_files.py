@@ -10,8 +10,7 @@ from mitsim.report.page import write_report
 from mitsim.study.run_files import claim_folder, digests_of
 from mitsim.study.run_folder import read_run
 from tests.plain_pages import without_pictures
-
-from .conftest import CHECKED
+from tests.report.conftest import CHECKED
 
 NAMES = (
     "map.nc",

@@ -12,8 +12,7 @@ from characterisation.files.atomic_io import write_netcdf
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, ViewGrid
 from mitsim.study.run_folder import read_run
-
-from .conftest import CHECKED, MEASUREMENTS
+from tests.report.conftest import CHECKED, MEASUREMENTS
 
 
 @pytest.fixture

@@ -7,8 +7,7 @@ import pytest
 from mitsim.report.first_screen import of_run
 from mitsim.report.set_words import set_result, with_sets
 from mitsim.study.run_folder import ConfirmedEntry, ViewSetEntry, read_run
-
-from .conftest import MEASUREMENTS, write_run
+from tests.report.conftest import MEASUREMENTS, write_run
 
 LIMITS = {"apart": 0.1, "radius": 0.2}
 

@@ -15,8 +15,7 @@ from mitsim.report.sheet_layout import text_width, wrapped
 from mitsim.study.choice_document import PoseEntry
 from mitsim.study.scene_geometry import read_scene_geometry
 from mitsim.study.statement_file import read_statement
-
-from .choice_run import write_choice
+from tests.report.choice_run import write_choice
 
 
 def figures_of(folder):

@@ -35,10 +35,9 @@ from mitsim.report.view_data import sites, target
 from mitsim.report.view_figures import uncertainty_figure
 from mitsim.report.view_sphere import LEAST_CHANCE, page_script, view_sphere
 from mitsim.study.run_folder import read_run
-
-from .conftest import CHECKED, FEATURES, MEASUREMENTS
-from .test_page import Tags
-from .view_sphere_run import IMPOSSIBLE, VIEWS, WITH_CLOUD
+from tests.report.conftest import CHECKED, FEATURES, MEASUREMENTS
+from tests.report.test_page import Tags
+from tests.report.view_sphere_run import IMPOSSIBLE, VIEWS, WITH_CLOUD
 
 
 @pytest.fixture(scope="module")

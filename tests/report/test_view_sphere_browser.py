@@ -15,10 +15,9 @@ from characterisation.files.atomic_io import write_netcdf
 from mitsim.report.view_sphere import view_sphere
 from mitsim.running import numbers
 from mitsim.study.run_folder import read_run
-
-from .chromium import BROWSER
-from .conftest import FEATURES, MEASUREMENTS
-from .view_sphere_run import IMPOSSIBLE, SET, WITH_CLOUD
+from tests.report.chromium import BROWSER
+from tests.report.conftest import FEATURES, MEASUREMENTS
+from tests.report.view_sphere_run import IMPOSSIBLE, SET, WITH_CLOUD
 
 pytestmark = [pytest.mark.browser, pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")]
 

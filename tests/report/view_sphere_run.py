@@ -17,8 +17,7 @@ from characterisation.cloud_files import write_cloud
 from characterisation.files.atomic_io import write_netcdf
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.sensor.transforms import look_at
-
-from .conftest import CHECKED, FEATURES, MEASUREMENTS, expect, write_run
+from tests.report.conftest import CHECKED, FEATURES, MEASUREMENTS, expect, write_run
 
 VIEWS, IMPOSSIBLE = 12, (5, 9)
 WITH_CLOUD = sorted({*CHECKED, 2})

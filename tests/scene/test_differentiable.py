@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from figures_of_surfaces import lobe_factor
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -21,6 +20,7 @@ from mitsim.sensor.transforms import look_at
 from mitsim.twin.finish.finish import metal_finish
 from mitsim.twin.finish.place import known_place
 from mitsim.twin.finish.white_coupon import WhiteCouponRenderer, coupon_roi
+from tests.figures_of_surfaces import lobe_factor
 
 INDEX = refractive_index("aluminium", 850.0)
 

@@ -11,10 +11,11 @@ from mitsim.report.author_page import Authored, page_data
 from mitsim.report.scene_preview import preview_figure
 from mitsim.report.scene_table import as_data, as_text
 from mitsim.scene.authoring.check import findings
-from mitsim.scene.first_hits import trace, visible_surfaces
+from mitsim.scene.first_hits import first_hits
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
 from mitsim.scene.mesh_facts import mesh_facts
+from mitsim.scene.visible_surfaces import visible_surfaces
 from mitsim.sensor.transforms import look_at
 
 WHITE = '<bsdf type="matt_white"/>'
@@ -66,7 +67,7 @@ def test_an_instance_is_seen_and_its_area_is_not_known(tmp_path, n10):
         assert np.isnan(shapes[name].area)
         assert shapes[name].front_hits > 100
         assert shapes[name].back_hits == 0
-    down = trace(scene, np.array([[0.0, 0, 50], [30, 0, 50], [-30, 0, 50]]), np.tile([0.0, 0, -1], (3, 1)))
+    down = first_hits(scene.mitsuba, np.array([[0.0, 0, 50], [30, 0, 50], [-30, 0, 50]]), np.tile([0.0, 0, -1], (3, 1)))
     assert [scene.names[number] for number in down.shape] == ["one", "two", "plate"]
     assert np.allclose(down.distance, [40, 40, 50], atol=1e-3)
 
@@ -129,7 +130,7 @@ def test_rays_tell_front_from_back(tmp_path):
         f'<translate x="30"/></transform><bsdf type="twosided">{WHITE}</bsdf></shape>',
     )
     origins = np.array([[0, 0, 5], [0, 0, -5], [30, 0, -7], [60, 0, 5]], float)
-    hits = trace(scene, origins, -np.sign(origins[:, 2:]) * [0, 0, 1.0])
+    hits = first_hits(scene.mitsuba, origins, -np.sign(origins[:, 2:]) * [0, 0, 1.0])
     assert hits.shape.tolist() == [0, 0, 1, -1]
     assert hits.front.tolist() == [True, False, True, False]
     assert np.allclose(hits.distance[:3], [5, 5, 7])

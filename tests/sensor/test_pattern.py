@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from figures_of_surfaces import mean_run_length
 
 from mitsim.sensor.pattern import random_blobs
+from tests.figures_of_surfaces import mean_run_length
 
 
 @pytest.mark.parametrize("run_length", [5.0, 7.0, 12.0])

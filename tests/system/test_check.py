@@ -9,17 +9,17 @@ import pytest
 import trimesh
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.image import imread
-from shell import ROOT, mitsim_here
 
 from characterisation.files.errors import InputError
 from mitsim.report.scene_preview import preview_figure
 from mitsim.report.scene_table import as_data, as_text
 from mitsim.report.style import write_png
 from mitsim.scene.authoring.check import findings, read_features
-from mitsim.scene.first_hits import visible_surfaces
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
+from mitsim.scene.visible_surfaces import visible_surfaces
 from mitsim.sensor.working_volume import common_view, field_of_view, in_image, in_working_volume, pose_at, usual_place
+from tests.shell import ROOT, mitsim_here
 from tests.smaller_sensors import binned
 
 METAL = """<bsdf type="machined_metal"><string name="metal" value="aluminium"/>

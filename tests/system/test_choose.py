@@ -7,12 +7,12 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-import shell
 import trimesh
-from small_study import MEASUREMENTS, few_measurements
 
 from mitsim.running.time_limit import TimeLimit
 from mitsim.study.choose import choose_sensor, read_candidates
+from tests import shell
+from tests.small_study import MEASUREMENTS, few_measurements
 from tests.smaller_sensors import coarse_sensor
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"

@@ -9,13 +9,13 @@ import sys
 
 import numpy as np
 import pytest
-from shell import ROOT, mitsim, mitsim_here
 
 from characterisation.cloud_files import read_cloud
 from characterisation.files.atomic_io import HOST
 from mitsim.capture.folder import read_capture
 from mitsim.capture.simulated.truth import read_exr
 from mitsim.running.progress import be_quiet, say, say_progress, track
+from tests.shell import ROOT, mitsim, mitsim_here
 from tests.smaller_sensors import coarse_sensor
 
 

@@ -3,7 +3,6 @@
 import contextlib
 import os
 import struct
-import sys
 import zipfile
 import zlib
 from pathlib import Path
@@ -27,10 +26,7 @@ from mitsim.sensor.projector_images import counted
 from mitsim.study.scene_geometry import read_scene_geometry
 from mitsim.study.virtual.trials import Outcome, TrialFolder
 from mitsim.study.virtual.world import Trial
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
-from report.choice_run import write_choice
+from tests.report.choice_run import write_choice
 
 SCENE = "<scene version='3.0.0'>{}</scene>"
 

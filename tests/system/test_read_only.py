@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "tests"))
+from tests.report.conftest import write_run
 
-from report.conftest import write_run  # noqa: E402
+ROOT = Path(__file__).parents[2]
 
 MOUNT = 'mount --bind "$0" "$0" && mount -o remount,ro,bind "$0" && exec "$@"'
 
@@ -27,8 +26,8 @@ COMMANDS = {
 #: one process for all commands, as only processes that are started there see the mount, and each imports for seconds
 CALL_ALL = """
 import json, sys
-from plain_pages import without_pictures
-from shell import mitsim_here
+from tests.plain_pages import without_pictures
+from tests.shell import mitsim_here
 calls = json.loads(sys.argv[1])
 with without_pictures():
     ended = {name: mitsim_here(*call, code=None) for name, call in calls.items()}
@@ -52,7 +51,7 @@ def ended(tmp_path_factory):
         pytest.skip("no mounts here")
     calls = {name: [word.format(folder) for word in call] for name, (call, _) in COMMANDS.items()}
     call = [*unshared, sys.executable, "-c", CALL_ALL, json.dumps(calls)]
-    paths = {"PYTHONPATH": os.pathsep.join([str(ROOT / "tests"), str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    paths = {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     done = subprocess.run(call, capture_output=True, text=True, cwd=ROOT, env=os.environ | paths, check=False)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

@@ -7,12 +7,12 @@ import json
 
 import numpy as np
 import pytest
-from plain_pages import without_pictures
-from shell import ROOT, mitsim_here
-from small_study import MEASUREMENTS, few_measurements
 
 from characterisation.cloud_files import read_cloud
 from characterisation.maps.performance_map import PerformanceMap
+from tests.plain_pages import without_pictures
+from tests.shell import ROOT, mitsim_here
+from tests.small_study import MEASUREMENTS, few_measurements
 from tests.smaller_sensors import coarse_sensor
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from figures_of_surfaces import mean_run_length
 
 from characterisation.coupon.metrics import ray_noise_std
 from characterisation.coupon.patches import measure_patches
@@ -31,6 +30,7 @@ from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
 from mitsim.study import open_study
+from tests.figures_of_surfaces import mean_run_length
 from tests.smaller_sensors import narrow_search
 
 AXIS = np.array([0.0, 0.0, 1.0])

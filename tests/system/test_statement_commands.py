@@ -6,9 +6,9 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-import shell
-from small_study import MEASUREMENTS, few_measurements
 
+from tests import shell
+from tests.small_study import MEASUREMENTS, few_measurements
 from tests.smaller_sensors import coarse_sensor
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"

@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from shell import ROOT, mitsim_here
-from smaller_sensors import coarse_sensor
 
 from characterisation.files.errors import InputError
 from mitsim.capture.folder import write_capture
@@ -18,6 +16,8 @@ from mitsim.talk.measured import measured_errors
 from mitsim.talk.page import write_talk
 from mitsim.talk.results import Results
 from mitsim.talk.talk_file import read_talk
+from tests.shell import ROOT, mitsim_here
+from tests.smaller_sensors import coarse_sensor
 
 SCENES = ROOT / "scenes"
 

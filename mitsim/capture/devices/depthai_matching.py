@@ -51,6 +51,10 @@ def match_on_device(
     ------
     DeviceError
         If there is no such device, or it returns nothing in time.
+
+    See Also
+    --------
+    grey_frame : makes the images that it sends
     """
     dai, where = package or depthai(), f"camera depthai{':' + identifier if identifier else ''}"
     device = pipeline = None

@@ -63,6 +63,10 @@ def read_depth_image(
     ------
     InputError
         If the image or the calibration cannot be read, the image has 8 bits, or its size differs from the camera's.
+
+    See Also
+    --------
+    depth_capture : the capture of a depth image
     """
     path = Path(path)
     image = _levels(path, frame)

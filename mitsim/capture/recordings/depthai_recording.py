@@ -113,6 +113,10 @@ def read_depthai_recording(
         If a file is missing, damaged or lossily compressed, or does not fit the calibration.
     MissingEnvironmentError
         Without the packages of the extra ``recordings``.
+
+    See Also
+    --------
+    recorded_streams : the files of its streams
     """
     path = Path(path)
     streams = recorded_streams(path)

@@ -24,8 +24,8 @@ from mitsim.capture.grey_image import CHANNELS, SUFFIXES, Image, channel_name, i
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.light_code import LightCode, roles
-from mitsim.sensor.preset import Sensor
 from mitsim.sensor.projector_images import ProjectorImages, counted, described
+from mitsim.sensor.sensor import Sensor
 
 
 def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNELS["green"]) -> Capture:

@@ -176,6 +176,10 @@ def read_organised_cloud(
     ------
     InputError
         If the file is damaged or has no grid, or no camera at the origin sees its points on the pixels of the grid.
+
+    See Also
+    --------
+    read_stored_cloud : any file of a cloud, by its bytes
     """
     stored = path if isinstance(path, StoredCloud) else read_stored_cloud(Path(path))
     path = stored.path

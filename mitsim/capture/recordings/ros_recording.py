@@ -169,6 +169,11 @@ def read_ros_depth(
     ------
     InputError
         If the message or the calibration cannot be read, or they do not belong together.
+
+    See Also
+    --------
+    read_ros_cloud : a cloud
+    read_ros_pair : a stereo pair
     """
     bag, topic = chosen.bag, chosen.topics[0]
     where = label_of(topic, bag.path)
@@ -214,6 +219,10 @@ def read_ros_pair(
     ------
     InputError
         If a message or the calibration cannot be read, or they do not belong together.
+
+    See Also
+    --------
+    read_ros_depth : a depth image
     """
     bag, (left, right) = chosen.bag, chosen.topics
     number = chosen_frame(frame, left.count, bag.path, f"messages of {left.name}")

@@ -52,6 +52,10 @@ def read_stereo_pair(
     ------
     InputError
         If an image is missing or does not fit the calibration, or there are several pairs and none was chosen.
+
+    See Also
+    --------
+    pair_files : the images of one camera
     """
     folder = Path(folder)
     names = list(read_calibration(calibration, size_of_images(folder)).rig.cameras)[:2]

@@ -1,4 +1,4 @@
-"""Expose the imagers of a sensor: from radiance to the grey levels of all images.
+"""Expose the imagers of a sensor: from radiance to the grey levels of all images, and their capture.
 
 Signal chain: radiance -> electrons per second -> exposure -> fixed pattern of the unit, noise of each image -> grey
 levels.
@@ -10,18 +10,22 @@ image has its own random stream of noise.
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.errors import InputError
 from characterisation.files.threads import in_threads
 from characterisation.region_of_interest import Roi
+from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import Decoding
 from mitsim.sensor.image_formation import FixedPattern, converter, expose, fixed_pattern
 from mitsim.sensor.modulation import AmplitudeModulation, delay_pattern, delayed, expose_taps
 from mitsim.sensor.noise_sources import Noise
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.projector_images import described
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 
 
@@ -89,6 +93,12 @@ class UnitPatterns:
         return UnitPatterns(rolled, None if self.delays is None else np.roll(self.delays, step, (0, 1)))
 
 
+def shifted_units(units: dict[str, UnitPatterns], seed: int) -> dict[str, UnitPatterns]:
+    """Return the patterns of each camera, shifted by random rows and columns."""
+    shifts = np.random.default_rng(seed).integers(1, 10_000, (len(units), 2))
+    return {name: one.shifted(*step) for (name, one), step in zip(units.items(), shifts, strict=True)}
+
+
 def brightest_images(sensor: Sensor, radiance: dict[str, NDArray[np.float32]]) -> NDArray[np.float32] | None:
     """Return the electrons per second of the brightest image of each camera, as one flat array.
 
@@ -102,6 +112,32 @@ def brightest_images(sensor: Sensor, radiance: dict[str, NDArray[np.float32]]) -
         # the exposure rule refers to the whole image: pixels that are not read out count as dark
         flat += [image.ravel(), np.zeros(camera.width * camera.height - image.size, np.float32)]
     return np.concatenate(flat) * np.float32(sensor.electrons())
+
+
+def check_finite(sensor: Sensor, values: NDArray[np.floating], where: str, quantity: str) -> None:
+    """Reject light that is not finite, before it becomes an image of zeros.
+
+    Parameters
+    ----------
+    sensor
+        Sensor, for the message.
+    values
+        Light, of any shape.
+    where, quantity
+        Part of the sensor and name of the values, for the message.
+
+    Raises
+    ------
+    InputError
+        If a value is infinite or NaN.
+    """
+    if not np.isfinite(values.sum(dtype=np.float64)):
+        raise InputError(
+            f"sensor {sensor.name}",
+            where,
+            f"{quantity} that is infinite or not a number",
+            "finite light: check the optics, flux_w and the scene's own emitters",
+        )
 
 
 def expose_camera(
@@ -124,6 +160,11 @@ def expose_camera(
         Fixed patterns of the camera's imager.
     stream
         Seed of the noise.
+
+    See Also
+    --------
+    brightest_images : decide the exposures
+    capture_of : the capture of all cameras
     """
     imager, scale, noise, inside = sensor.imager, sensor.electrons(), light.noise, light.rois[camera].slices
     radiance, exposures = light.radiance[camera], light.exposures
@@ -150,3 +191,47 @@ def expose_camera(
 
     in_threads(expose_image, enumerate(stream.spawn(count)))  # each image has its own stream
     return out
+
+
+def capture_of(
+    sensor: Sensor, light: LightOnImagers, images: dict[str, NDArray[np.unsignedinteger[Any]]], seed: int
+) -> Capture:
+    """Return the capture of exposed images, with all that decoding needs and the settings of the simulation.
+
+    Parameters
+    ----------
+    sensor, light
+        As for :func:`expose_camera`.
+    images
+        Images of each camera, from :func:`expose_camera`.
+    seed
+        Seed of the noise, for the record.
+
+    See Also
+    --------
+    expose_camera : the images of one camera
+    """
+    adc, exposures = converter(sensor.imager, light.noise), light.exposures
+    whole = {name: Roi.whole(camera.width, camera.height) for name, camera in sensor.rig.cameras.items()}
+    decoding = Decoding(
+        decoder=sensor.settings,
+        imager=sensor.imager,
+        pattern=described(sensor.pattern),
+        exposure_s=exposures[0] if len(exposures) == 1 else tuple(exposures),
+        black_level_dn=adc.black_level,
+        gamma=adc.gamma,
+        ambient_image=sensor.ambient_image,
+        read_out={name: roi for name, roi in light.rois.items() if roi != whole[name]},
+    )
+    records = {"exposure_rule": sensor.exposure.rule, **light.rendered, "seed": seed, "noise": asdict(light.noise)}
+    return Capture(
+        sensor=sensor.name,
+        technology=sensor.technology,
+        source="simulated",
+        rig=sensor.rig,
+        images=images,
+        bits=adc.bits,
+        decoding=decoding,
+        settings=records,
+        world_from_sensor=light.world_from_sensor,
+    )

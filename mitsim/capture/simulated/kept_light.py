@@ -89,6 +89,10 @@ def keep_light(
         :func:`~mitsim.scene.light_transport.plain_scene.distinct_bsdfs`. Paths are kept by their light in these.
     seed
         Of all random numbers.
+
+    See Also
+    --------
+    can_be_kept : whether it makes sense for a scene
     """
     bsdfs, settings = distinct_bsdfs(scene), rendering.kept
     assert settings is not None

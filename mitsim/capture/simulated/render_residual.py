@@ -91,6 +91,10 @@ def render_residual(
         Seed of the first rendering.
     around
         (n, 3) points in the sensor frame [mm]; only the part of the images around them is rendered. All if None.
+
+    See Also
+    --------
+    warn_above_limit : prints a warning of large errors
     """
     sensor = simulated.sensor
     roi = None if around is None else roi_around(sensor.rig.cameras[camera], around, 0)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,3 +71,9 @@ class Rendering:
     def indirect_settings(self) -> IndirectLight | None:
         """Settings for interreflections that are rendered separately; None if they are not."""
         return self.indirect.settings if isinstance(self.indirect, IndirectImages) else self.indirect
+
+    def records(self, scene: str) -> dict[str, Any]:
+        """Return what a capture's settings say of the rendering of a scene, as JSON values."""
+        out: dict[str, Any] = {"scene": scene, "samples_per_pixel": self.samples, "light_path_depth": self.surfaces}
+        indirect = self.indirect_settings
+        return out if indirect is None else out | {"indirect_light": asdict(indirect)}

@@ -16,39 +16,42 @@ has grey level 0.
 from __future__ import annotations
 
 import copy
-from dataclasses import asdict, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.files.errors import InputError
 from characterisation.files.threads import in_threads
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
-from mitsim.capture.decoding import Decoding
-from mitsim.capture.simulated.exposing import LightOnImagers, UnitPatterns, brightest_images, expose_camera
+from mitsim.capture.simulated.exposing import (
+    LightOnImagers,
+    UnitPatterns,
+    brightest_images,
+    capture_of,
+    check_finite,
+    expose_camera,
+    shifted_units,
+)
 from mitsim.capture.simulated.indirect_light import IndirectLight, smoothed
 from mitsim.capture.simulated.lens_blur import blur_by_lens
 from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.room_image import room_image
 from mitsim.capture.simulated.surface_speckle import draw_speckle
 from mitsim.scene.light_transport.ambient import has_emitters
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.plain_scene import single_plane
 from mitsim.scene.light_transport.projector_light import ModulatedLight, ProjectedLight, ProjectedPatterns
-from mitsim.scene.light_transport.room_light import directional_albedos, room_radiance
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.scene.ray_casting.raycast import PixelRays, shapes_met
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.image_formation import converter
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.pattern import DotPattern
-from mitsim.sensor.preset import Sensor
-from mitsim.sensor.projector_images import described
 from mitsim.sensor.roi import roi_around
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.speckle import SpeckleField
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.vignetting import camera_illumination
@@ -121,9 +124,7 @@ class SimulatedSensor:
             other.patterns = copy.copy(self.patterns)
         other.patterns.projector = projector
         if unit is not None:
-            shifts = np.random.default_rng(unit).integers(1, 10_000, (len(rig.cameras), 2))
-            shift_of = dict(zip(rig.cameras, shifts, strict=True))
-            other.units = {name: patterns.shifted(*shift_of[name]) for name, patterns in self.units.items()}
+            other.units = shifted_units(self.units, unit)
         return other
 
     def indirect_radiance(
@@ -212,28 +213,22 @@ class SimulatedSensor:
         rays, ambient_image = self.rays[camera], self.sensor.ambient_image
         roi = roi or rays.whole
         separate_ambient = ambient_image or (speckle is not None and has_emitters(scene))
-        indirect, depth = rendering.indirect_settings, rendering.surfaces
-        separate_indirect = indirect is not None and depth > 1
-        paths = LightPaths(rendering.samples, seed, 1 if separate_indirect else depth, with_ambient=separate_ambient)
+        depth = rendering.surfaces
+        indirect = rendering.indirect_settings if depth > 1 else None
+        paths = LightPaths(rendering.samples, seed, depth if indirect is None else 1, with_ambient=separate_ambient)
         shift = None if speckle is None else speckle.shift
         images = trace(scene, rays, self.patterns, world_from_sensor, paths, roi, shift)
-        if separate_indirect:
-            assert indirect is not None
-            if rendering.prerendered is not None:
-                indirect_images = rendering.prerendered.images[camera]
-            else:
-                indirect_images = self.indirect_radiance(
-                    scene, world_from_sensor, camera, indirect, seed=seed, depth=depth, roi=roi
-                )
-            images += indirect_images[: len(images)]
+        if indirect is not None:
+            images += (
+                rendering.prerendered.images[camera]
+                if rendering.prerendered is not None
+                else self.indirect_radiance(scene, world_from_sensor, camera, indirect, seed=seed, depth=depth, roi=roi)
+            )[: len(images)]
         projected, ambient_images = images[: self.patterns.count], images[self.patterns.count :]
 
         # in place, because two copies of a large stack need too much memory
-        def apply_lens(image: NDArray[np.float32]) -> None:
-            image[:] = self.apply_lens(image, camera, roi)
-
         def finish_projected(image: NDArray[np.float32]) -> None:
-            apply_lens(image)
+            image[:] = self.apply_lens(image, camera, roi)
             if speckle is not None:  # affects the projector's light alone
                 if separate_ambient:
                     image -= ambient_images[0]
@@ -242,36 +237,12 @@ class SimulatedSensor:
                     image += ambient_images[0]
 
         for image in ambient_images:
-            apply_lens(image)
+            image[:] = self.apply_lens(image, camera, roi)
         in_threads(finish_projected, projected)
         if self.sensor.room is not None:
-            images += self.room_light(scene, world_from_sensor, camera, roi)
+            room = room_image(self.sensor, scene, world_from_sensor, camera, self.pixel_rays(camera), roi)
+            images += self.apply_lens(room, camera, roi)
         return images[: self.patterns.count + ambient_image]
-
-    def room_light(self, scene: Scene, world_from_sensor: Transform, camera: str, roi: Roi) -> NDArray[np.float32]:
-        """Return the radiance (h, w) of the sensor file's ``[room]``, after the lens [W / (mm^2 sr)].
-
-        Its gradient is along the axes of the sensor frame at the middle of the working range, the same for all cameras.
-
-        Parameters
-        ----------
-        scene
-            Scene to light.
-        world_from_sensor
-            Pose of the sensor.
-        camera
-            Name of the camera.
-        roi
-            Region of the image.
-        """
-        relative = room_radiance(scene, directional_albedos(scene), self.pixel_rays(camera), world_from_sensor)[
-            roi.slices
-        ]
-        eye, depth = self.sensor.rig.cameras[camera], float(np.mean(self.sensor.working_range_mm))
-        pixels = np.stack(roi.pixels(), axis=-1).astype(float)
-        rays = eye.sensor_from_camera.directions(eye.rays_to_fold(pixels))
-        points = eye.centre + rays * ((depth - eye.centre[2]) / rays[..., 2:])
-        return self.apply_lens(np.asarray(relative * self.sensor.room_irradiance(points), np.float32), camera, roi)
 
     def apply_lens(self, image: NDArray[np.float32], camera: str, roi: Roi) -> NDArray[np.float32]:
         """Return the image (h, w) of a region, blurred by a camera's lens and darkened toward the corners."""
@@ -328,59 +299,21 @@ class SimulatedSensor:
                 speckle=speckle,
             )
         for name, stack in light.items():
-            self._check_finite(stack, f"camera {name}", "radiance")
+            check_finite(sensor, stack, f"camera {name}", "radiance")
         exposures = sensor.exposure.exposures(brightest_images(sensor, light), sensor.imager.full_well)
-        self._check_finite(np.array(exposures) * sensor.electrons(), "imager", "electrons per radiance")
-        rendered: dict[str, Any] = {"scene": scene.where, "samples_per_pixel": rendering.samples}
-        rendered["light_path_depth"] = rendering.surfaces
-        if rendering.indirect_settings is not None:
-            rendered["indirect_light"] = asdict(rendering.indirect_settings)
-        return LightOnImagers(light, rois, exposures, noise, world_from_sensor, rendered)
-
-    def _check_finite(self, values: NDArray[np.floating], where: str, quantity: str) -> None:
-        """Reject light that is not finite, before it becomes an image of zeros."""
-        if not np.isfinite(values.sum(dtype=np.float64)):
-            raise InputError(
-                f"sensor {self.sensor.name}",
-                where,
-                f"{quantity} that is infinite or not a number",
-                "finite light: check the optics, flux_w and the scene's own emitters",
-            )
+        check_finite(sensor, np.array(exposures) * sensor.electrons(), "imager", "electrons per radiance")
+        return LightOnImagers(light, rois, exposures, noise, world_from_sensor, rendering.records(scene.where))
 
     def expose(self, light: LightOnImagers, seed: int) -> Capture:
         """Expose the imagers to light and return the capture.
 
         Each seed gives another capture from the same pose, with the same speckle.
         """
-        noise, sensor, exposures = light.noise, self.sensor, light.exposures
         images = {}
         for index, name in enumerate(light.rois):
             _, noise_stream, _ = np.random.SeedSequence([seed, index]).spawn(3)
-            images[name] = expose_camera(sensor, light, name, self.units[name], noise_stream)
-        adc = converter(sensor.imager, noise)
-        whole = {name: rays.whole for name, rays in self.rays.items()}
-        decoding = Decoding(
-            decoder=sensor.settings,
-            imager=sensor.imager,
-            pattern=described(sensor.pattern),
-            exposure_s=exposures[0] if len(exposures) == 1 else tuple(exposures),
-            black_level_dn=adc.black_level,
-            gamma=adc.gamma,
-            ambient_image=sensor.ambient_image,
-            read_out={name: roi for name, roi in light.rois.items() if roi != whole[name]},
-        )
-        records = {"exposure_rule": sensor.exposure.rule, **light.rendered, "seed": seed, "noise": asdict(noise)}
-        return Capture(
-            sensor=sensor.name,
-            technology=sensor.technology,
-            source="simulated",
-            rig=sensor.rig,
-            images=images,
-            bits=adc.bits,
-            decoding=decoding,
-            settings=records,
-            world_from_sensor=light.world_from_sensor,
-        )
+            images[name] = expose_camera(self.sensor, light, name, self.units[name], noise_stream)
+        return capture_of(self.sensor, light, images, seed)
 
     def capture(
         self,
@@ -406,9 +339,8 @@ class SimulatedSensor:
 
 
 def _camera_rays(sensor: Sensor, camera: Camera) -> CameraRays:
-    if sensor.focus_mm is None:
-        return CameraRays(camera)
-    return CameraRays(camera, sensor.pupil_mm(camera), sensor.focus_mm)
+    focus = sensor.focus_mm
+    return CameraRays(camera) if focus is None else CameraRays(camera, sensor.pupil_mm(camera), focus)
 
 
 def _light(sensor: Sensor) -> ProjectedLight:

@@ -21,7 +21,7 @@ from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
 from mitsim.scene.ray_casting.raycast import PixelRays, cast
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.speckle import (
     SpeckleField,
     SpeckleOptics,

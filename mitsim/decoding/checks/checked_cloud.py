@@ -27,7 +27,8 @@ from mitsim.decoding.noise import sigma_source
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.matcher import MatcherSettings
-from mitsim.sensor.preset import Sensor, presets
+from mitsim.sensor.preset import presets
+from mitsim.sensor.sensor import Sensor
 
 
 @dataclass(frozen=True)

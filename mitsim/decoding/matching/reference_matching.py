@@ -124,6 +124,10 @@ def reference_geometry(rig: Rig, pattern: Mask, reference_mm: float, blur_px: fl
     InputError
         If the rig has no projector, it is not to the right of the camera, or it lights nothing that the camera sees of
         the reference plane.
+
+    See Also
+    --------
+    decode_reference : decodes with it
     """
     if rig.projector is None:
         raise InputError("rig", "projector", "none", "a calibrated projector, for one camera and a reference")

@@ -85,6 +85,10 @@ def decode_coordinates(  # noqa: PLR0913 - options, all by name
     ------
     InputError
         If the stack does not fit the code, or the code is ambiguous over the projector.
+
+    See Also
+    --------
+    triangulate_coordinate : the points of the coordinates
     """
     image_roles = roles(code, *size)
     check_stack(stack, image_roles)

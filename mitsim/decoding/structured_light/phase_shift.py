@@ -220,6 +220,10 @@ def gamma_corrected(
     ------
     InputError
         If both are missing, or the steps of a period are not equidistant.
+
+    See Also
+    --------
+    fit_phases : the phases
     """
     mean, contrast, steps = fringes.mean, fringes.contrast, fringes.steps
     orders = [equidistant_order(shifts) for shifts in fringes.shifts]
@@ -258,6 +262,10 @@ def fringe_sigma(
         (...) of the finest fringe [DN].
     imager
         Imager or measured noise; the value is NaN if it is None.
+
+    See Also
+    --------
+    rejection_status : which pixels the decoder rejects
     """
     if imager is None:
         return np.full(modulation.shape, np.nan, np.float32)

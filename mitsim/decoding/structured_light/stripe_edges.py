@@ -51,6 +51,10 @@ def interpolate_between_edges(
         (H, W) [projector px].
     located
         (H, W) whether the coordinate is a number.
+
+    See Also
+    --------
+    status_without_edges : pixels with an unknown position in their stripe
     """
     height, width = number.shape
     is_edge, edge_column, edge_coordinate = _stripe_edges(number.astype(np.int64), valid, signed, stripe)

@@ -145,6 +145,10 @@ def unwrap(
         (...) whether the phases contradict each other, or the coordinate is outside the projector by more than a pixel.
         If the longest period extends at most 2 px beyond the projector, pixels within a pixel of its two ends are
         inconsistent too.
+
+    See Also
+    --------
+    unwrapping_path : the most robust order of the periods
     """
     flat = phase.reshape(len(phase), -1)
     variance = relative_variance.reshape(-1)

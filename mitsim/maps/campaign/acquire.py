@@ -32,7 +32,7 @@ from mitsim.decoding.cloud import Geometry, capture_cloud, capture_geometry, sen
 from mitsim.decoding.depth_range import depths_of, range_warning
 from mitsim.maps.campaign.plan import Campaign, Shot, view_axes
 from mitsim.maps.campaign.store import Finished
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 
 Item = TypeVar("Item")
@@ -125,6 +125,10 @@ def measured(capture: Capture, shot: Shot, geometry: Geometry, sensor: Sensor, k
         Sensor of the campaign; pose and calibration are those of the capture, if it has them.
     keep_images
         Whether the result contains the capture.
+
+    See Also
+    --------
+    coupon_cloud : the cloud that it measures
     """
     coupon = shot.series.sample.at(coupon_place(capture, shot))
     if own_sensor(capture, sensor) is not sensor:
@@ -167,6 +171,10 @@ def coupon_cloud(capture: Capture, coupon: Coupon, geometry: Geometry, sensor: S
         That of the capture.
     sensor
         Gives decoder and imager.
+
+    See Also
+    --------
+    measured : decodes and measures the patches
     """
     grid = geometry.grid
     corners = grid.project(coupon.corners())

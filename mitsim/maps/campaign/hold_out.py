@@ -32,7 +32,7 @@ from mitsim.maps.campaign.live import LiveCampaign, plan_live
 from mitsim.maps.campaign.orders import Order, PreparedSensor, order_of, prepared_sensor
 from mitsim.maps.campaign.plan import Campaign, CampaignFile, Shot, plan_campaign
 from mitsim.maps.prediction import performance
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 
 #: relative extent in |V| of a patch on either side of its middle
 PATCH_REACH = 0.015
@@ -117,6 +117,10 @@ def held_out_live(
     InputError
         If the campaign is not possible, the map belongs to another sensor or lacks a sample, or no position is within
         its distances.
+
+    See Also
+    --------
+    held_out_campaign : simulated coupons in place of a device
     """
     known = performance_map.data["distance"].values.astype(float)
     live = plan_live(path, file, sensor, (known.min() * (1 + LIVE_MARGIN), known.max() * (1 - LIVE_MARGIN)))
@@ -177,6 +181,10 @@ def compare(
         Takes a shot.
     repeats
         Captures of each shot, as in :func:`compared`.
+
+    See Also
+    --------
+    held_out_orders : the same on workers
     """
     prepared = PreparedSensor(campaign.sensor)
     for shot in shots:
@@ -204,6 +212,10 @@ def compared(
         Takes a shot.
     repeats
         Number of captures with fresh noise.
+
+    See Also
+    --------
+    compare : all shots
     """
     sensor = prepared.sensor
     seeds = (shot.series.seed + 2**32 * number for number in range(MOST_REPEATS * repeats))
@@ -270,6 +282,10 @@ def held_out_orders(campaign: Campaign, shots: list[Shot], map_path: Path, repea
         Path of the map, the same on every machine.
     repeats
         Captures of each shot.
+
+    See Also
+    --------
+    compare : in this process
     """
     path = str(map_path.absolute())
     return [HeldOutOrder(order_of(shot, campaign), path, _digest(path), repeats) for shot in shots]

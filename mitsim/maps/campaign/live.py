@@ -30,7 +30,7 @@ from mitsim.capture.devices.stage_connection import StageConnection
 from mitsim.maps.campaign.acquire import DISTANCE_SLACK, CaptureSource, Source
 from mitsim.maps.campaign.plan import Campaign, CampaignFile, Shot, plan_campaign
 from mitsim.maps.campaign.stage_pose import StageCalibration, StageTable, read_stage_calibration
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 
 #: called before another sample or distance, with the sample's label and the distance
 Mount = Callable[[str, float], None]
@@ -66,6 +66,10 @@ def plan_live(
     ------
     InputError
         For anything that would stop the campaign later.
+
+    See Also
+    --------
+    live_source : takes the captures
     """
     path, device, stage = Path(path), file.device, file.stage
     if device is None:

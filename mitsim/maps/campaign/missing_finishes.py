@@ -31,7 +31,7 @@ from mitsim.running.numbers import time_in_words
 from mitsim.running.progress import say
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 
 #: answers a question with yes or no
 Ask = Callable[[str], bool]

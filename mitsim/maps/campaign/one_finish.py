@@ -41,7 +41,7 @@ from mitsim.maps.campaign.run import run_campaign
 from mitsim.running.version import __version__
 from mitsim.scene.load import flat_coupon
 from mitsim.scene.materials import Finish
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 
 #: increased if the plan below changes, so that cached maps are made again
@@ -166,6 +166,10 @@ def one_finish_campaign(one: OneFinish, distance: float, file: CampaignFile, lay
         The plan, from :func:`plan_of`.
     lay_deg
         Angle of u [deg], if the finish has a lay.
+
+    See Also
+    --------
+    characterise_finish : runs it
     """
     half = half_size(one.sensor, distance, COUPON_PX if file.coupon_px is None else file.coupon_px)
     recipe = CouponRecipe(one.finish.name, (), one.sensor.wavelength_nm)
@@ -195,6 +199,10 @@ def characterise_finish(one: OneFinish, simulated: SimulatedSensor, distance: fl
     ------
     MissingEnvironmentError
         If the disk is full.
+
+    See Also
+    --------
+    one_finish_campaign : the campaign alone
     """
     file, made = plan_of(one.largest_deg, one.seed), []
     for turn in one.turns:

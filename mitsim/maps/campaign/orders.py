@@ -22,7 +22,7 @@ from mitsim.maps.campaign.store import Finished
 from mitsim.maps.prediction import Predictor
 from mitsim.running.executor import Executor
 from mitsim.scene import backend
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 
 _sample = lru_cache(maxsize=32)(load_sample)

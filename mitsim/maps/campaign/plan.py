@@ -33,7 +33,7 @@ from mitsim.capture.devices.maker_captures import DeviceTable
 from mitsim.maps.campaign.coupons import VARIANTS, CouponRecipe, Sample, load_sample
 from mitsim.maps.campaign.stage_pose import StageTable
 from mitsim.running.version import __version__
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.sensor_file import MisalignmentTable
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.working_volume import field_of_view

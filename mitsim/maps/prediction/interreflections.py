@@ -48,7 +48,7 @@ from mitsim.scene.ray_casting.raycast import PixelRays, shapes_met
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.vignetting import camera_illumination
 

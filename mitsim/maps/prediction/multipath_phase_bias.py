@@ -43,7 +43,7 @@ from numpy.typing import NDArray
 from mitsim.capture.simulated.indirect_light import smoothed
 from mitsim.maps.prediction.predictor import Ideal
 from mitsim.sensor.light_code import GrayCodePhaseShift, PhaseShift, patterns
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]

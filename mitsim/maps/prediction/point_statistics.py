@@ -37,6 +37,11 @@ def performance(
         Map of the sensor.
     finish
         Replaces the finishes of the scene: matt white, to normalise the view score.
+
+    See Also
+    --------
+    expected_points : the points themselves
+    feature_statistics : of whole features
     """
     fraction = np.full(len(ideal.pixel), np.nan)
     sigma = np.full(len(ideal.pixel), np.nan)

@@ -30,7 +30,7 @@ from mitsim.scene.ray_casting.mapped_scene import MappedView, ViewRays
 from mitsim.scene.ray_casting.raycast import PixelRays, Surfaces, cast, shapes_met
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.matcher import MatcherSettings
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 
 #: smallest margin at the edge of a feature whose pixels belong to no feature: a matching block there covers two

@@ -68,6 +68,10 @@ def write_dcc(found: RunResults, declared: Declaration, issuer: Issuer, path: st
         Who issues the certificate.
     path
         File to write.
+
+    See Also
+    --------
+    dcc_document : the document alone
     """
     register_namespace("dcc", DCC)
     register_namespace("si", SI)

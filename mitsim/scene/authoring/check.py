@@ -28,13 +28,13 @@ from characterisation.tasks.decision_table import Decision
 from characterisation.tasks.task_file import Feature, Measurement
 from characterisation.tasks.task_reading import read_task
 from mitsim.scene.authoring.face import surface_distance
-from mitsim.scene.first_hits import VisibleSurfaces
 from mitsim.scene.inspect import SceneFacts, ShapeFacts
 from mitsim.scene.mesh_facts import MeshFacts
 from mitsim.scene.surface.processes import PROCESSES
+from mitsim.scene.visible_surfaces import VisibleSurfaces
 from mitsim.sensor.calibration_qualifiers import UNITS_MM
-from mitsim.sensor.preset import Sensor
 from mitsim.sensor.rig_parameters import eyes
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.working_volume import depth, field_of_view, in_image, in_working_volume
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
+import os
 import subprocess
 import sys
 import tempfile
@@ -26,7 +27,7 @@ import numpy as np
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
 from characterisation.files.errors import InputError
 from mitsim.running.progress import say_progress
-from mitsim.scene.authoring import step_worker
+from mitsim.scene.authoring import step_mesh, step_worker
 from mitsim.scene.authoring.face import (
     Face,
     Floats,
@@ -110,8 +111,7 @@ def read_step(path: str | Path, fineness: Fineness = _DEFAULT, units: str | None
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "faces.npz"
         command = [
-            sys.executable,
-            step_worker.__file__,
+            *(sys.executable, "-P", "-m", step_worker.__name__),
             str(path),
             str(out),
             repr(_requested(fineness.chord_mm)),
@@ -173,7 +173,9 @@ def run_worker(command: list[str], path: Path) -> subprocess.CompletedProcess[st
     """
     with (
         tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors,
-        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True, errors="replace") as process,
+        subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=errors, text=True, errors="replace", env=_environment()
+        ) as process,
     ):
         over = threading.Event()
 
@@ -196,14 +198,21 @@ def run_worker(command: list[str], path: Path) -> subprocess.CompletedProcess[st
         return subprocess.CompletedProcess(command, code, "", errors.read())
 
 
+def _environment() -> dict[str, str]:
+    """Return the environment of a process that finds this package wherever it is started."""
+    package = str(Path(step_worker.__file__).parents[3])
+    paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
+    return os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
+
+
 def _report(lines: Iterable[str], path: Path) -> None:
     """Report how many triangles are made, and the time that the others will take."""
     start = last = time.monotonic()
     say_progress(f"{path.name}: reading and meshing its faces")
     for line in lines:
-        if not line.startswith(step_worker.TOLD):
+        if not line.startswith(step_mesh.TOLD):
             continue
-        made, total = map(float, line.removeprefix(step_worker.TOLD).split())
+        made, total = map(float, line.removeprefix(step_mesh.TOLD).split())
         now = time.monotonic()
         if now - last >= _LINE_EVERY_S and made < total:
             left = (now - start) / made * (total - made)

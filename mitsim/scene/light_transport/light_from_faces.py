@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
+from mitsim.scene.first_hits import shape_indices
 from mitsim.scene.light_transport.plain_scene import SceneBsdfs
 from mitsim.scene.light_transport.projector_light import ProjectedPatterns, ProjectorLight
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays, bilinear
 from mitsim.scene.ray_casting.eye import Eye
-from mitsim.scene.ray_casting.raycast import shape_indices
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.projector import Projector
 from mitsim.sensor.transforms import Transform
@@ -141,7 +141,7 @@ def _traced(
     two = dr.select(second.is_valid(), weight[0] * lit(second, next_ray.d, second.is_valid()), 0.0)
     numbers = [_number(one_) for one_ in (surface, second)]
     dr.eval(one, two, numbers)
-    first_shape, second_shape = (shape_indices(scene, number) for number in numbers)
+    first_shape, second_shape = (shape_indices(scene.mitsuba, number) for number in numbers)
     return first_shape, second_shape, np.array(one, float), np.array(two, float)
 
 

@@ -22,11 +22,12 @@ from characterisation.point_cloud import Status, ViewGrid
 from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import opaque_index, opaque_point, vectors_to_host
+from mitsim.scene.first_hits import shape_number
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.distortion import Distortion
 from mitsim.scene.ray_casting.eye import Eye, shadow_ray
 from mitsim.scene.ray_casting.map_tables import MapTables
-from mitsim.scene.ray_casting.raycast import PixelRays, shape_number
+from mitsim.scene.ray_casting.raycast import PixelRays
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.transforms import Transform
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from characterisation.point_cloud import ViewGrid
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import known_to_device, opaque_point, vectors_to_host
+from mitsim.scene.first_hits import shape_indices
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.eye import Eye, shadow_ray
 from mitsim.sensor.camera import Camera
@@ -108,7 +108,7 @@ def cast(scene: Scene, rays: PixelRays, world_from_sensor: Transform, eyes: NDAr
     return Surfaces(
         distance=np.array(distance, np.float32).reshape(size),
         normal=vectors_to_host(normal).reshape(*size, 3),
-        shape=shape_indices(scene, shape).reshape(size),
+        shape=shape_indices(scene.mitsuba, shape).reshape(size),
         seen=np.array([np.array(mask, bool) for mask in seen], bool).reshape(len(seen), *size),
         along=None if along is None else vectors_to_host(along).reshape(*size, 3),
     )
@@ -122,24 +122,7 @@ def shapes_met(scene: Scene, rays: PixelRays, world_from_sensor: Transform) -> N
     frame = rays.frame(world_from_sensor)
     ray = mi.Ray3f(frame.position, frame.to_world(rays.directions))
     met = scene.mitsuba.ray_intersect_preliminary(ray, active=rays.active)
-    return shape_indices(scene, dr.reinterpret_array(mi.UInt32, met.shape)).reshape(rays.size)
-
-
-def shape_indices(scene: Scene, numbers: Any) -> NDArray[np.int16]:
-    """Return the indices (n,) into the names of the scene of Mitsuba's shape numbers."""
-    ids = np.array(numbers)
-    lookup = np.full(int(ids.max(initial=0)) + 1, -1, np.int16)
-    for index, shape in enumerate(scene.shapes):
-        id_of_shape = shape_number(shape)
-        if id_of_shape < len(lookup):
-            lookup[id_of_shape] = index
-    lookup[0] = -1
-    return np.asarray(lookup[ids])
-
-
-def shape_number(shape: Any) -> int:
-    """Return Mitsuba's number of a shape, which is 1 or more."""
-    return int(np.ravel(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))))[0])
+    return shape_indices(scene.mitsuba, dr.reinterpret_array(mi.UInt32, met.shape)).reshape(rays.size)
 
 
 def cloud_points(surfaces: Surfaces, grid: ViewGrid) -> NDArray[np.float64]:

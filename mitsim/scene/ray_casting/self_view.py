@@ -69,6 +69,10 @@ def seen_faces(
         The part.
     points, normals, rays
         (n, 3) in the part frame: points [mm], unit normals toward the sensor, and unit view rays toward the points.
+
+    See Also
+    --------
+    sees_itself : whether a part lights itself at all
     """
     out = np.full((len(points), 2), np.nan)
     chosen = np.arange(0, len(points), 1 + len(points) // _POINTS)

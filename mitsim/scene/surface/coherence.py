@@ -56,6 +56,10 @@ def lobe_numbers(
     ----------
     phase_variance, alpha_u, alpha_v, beckmann, energy_factor
         Of the lobe, as in :class:`~mitsim.scene.surface.scatter.Scatter`.
+
+    See Also
+    --------
+    coherent_weight : the weight A of pairs of directions
     """
     returned, missing = [], []
     lobes: tuple[tuple[float, float, Distribution], ...] = (

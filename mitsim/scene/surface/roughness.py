@@ -66,6 +66,10 @@ def band_limited_slope(sigma_um: float, correlation_um: float, nu: float, cutoff
     cutoff_um
         Shortest wavelength that counts [um].
 
+    See Also
+    --------
+    stylus_slope : the slope as a stylus sees it
+
     Notes
     -----
     The two-dimensional spectrum is S(f) = sigma^2 nu B^2 / pi (1 + B^2 f^2)^-(nu + 1), B = 2 pi l. The slope is the

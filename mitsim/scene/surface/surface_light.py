@@ -68,6 +68,11 @@ def surface_light(
         As for :func:`light_of_scatter`.
     finish, roughness_um, wavelength_nm
         As for :func:`nominal_light`.
+
+    See Also
+    --------
+    light_of_scatter : of a kind of surface
+    nominal_light : of finish and Ra alone
     """
     light, usual = light_of_scatter(kind, reflectance, scatter), nominal_light(finish, roughness_um, wavelength_nm)
     return replace(light, as_made=usual is not None and same_light(light, usual))

@@ -26,9 +26,9 @@ from characterisation.acceptance.vdi_2634 import flatness_error
 from mitsim.decoding.structured_light.geometry import MINIMUM_CHANGE_PX, axis_across
 from mitsim.sensor.camera import Camera, Rig, stereo_rectification
 from mitsim.sensor.light_code import LightCode, axes
-from mitsim.sensor.preset import Sensor
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import moved, path_error
+from mitsim.sensor.sensor import Sensor
 from mitsim.study.calibration.board import seen_by_all
 
 Floats = NDArray[np.float64]

@@ -29,8 +29,8 @@ from mitsim.sensor.light_code import LightCode, roles
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.point_spread import point_spread
-from mitsim.sensor.preset import Sensor
 from mitsim.sensor.projector_images import ProjectorImages
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.sensor_file import AutomaticExposure
 
 Floats = NDArray[np.float64]

@@ -24,10 +24,10 @@ from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.decoding.plate import Plate, image_on_grid, plate_dots, plate_scale
 from mitsim.sensor.camera import Camera, Rig, stereo_rectification
-from mitsim.sensor.preset import Sensor
 from mitsim.sensor.published_lengths import PublishedLengths
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import moved, parameter_names, path_error
+from mitsim.sensor.sensor import Sensor
 from mitsim.study.calibration.accuracy import measured_points
 from mitsim.study.calibration.board import Board
 from mitsim.study.calibration.corner_files import found_corners, turned_alike

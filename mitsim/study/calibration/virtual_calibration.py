@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.drift import Drift, with_drift
-from mitsim.sensor.preset import Sensor
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import PATH_NAMES
+from mitsim.sensor.sensor import Sensor
 from mitsim.study.calibration.accuracy import Accuracy, accuracy
 from mitsim.study.calibration.board import Board, board_poses, default_board
 from mitsim.study.calibration.bundle import BoardView, Linearised, linearise

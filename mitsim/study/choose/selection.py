@@ -48,9 +48,10 @@ from mitsim.study.choose.ranking import rank_keys, unpromising
 from mitsim.study.run_record import complete_winner
 from mitsim.study.screened_errors import screened_errors, stated_shares
 from mitsim.study.session import Session
+from mitsim.study.statement_document import statement_document
 from mitsim.study.virtual.plan import map_digest, trial_digest
 from mitsim.study.virtual.race import ALL, Raced, RaceRules
-from mitsim.study.virtual.stated import StatedView, statement_document
+from mitsim.study.virtual.stated import StatedView
 from mitsim.views.view_scores import screening_risk
 
 Floats = NDArray[np.float64]

@@ -19,7 +19,7 @@ from characterisation.statements.verdict_words import result_in_words
 from mitsim.running.text_table import aligned
 from mitsim.running.version import __version__
 from mitsim.sensor.exposure import PlannedExposure
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.study import Study
 from mitsim.study.choice_document import (
     CaptureEntry,

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic import Field
 
@@ -29,9 +30,6 @@ from mitsim.study.virtual.mapped import MappedMeasurements
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.views import View
 
-if TYPE_CHECKING:
-    from mitsim.study.session import Session
-
 #: default exposure limits of a sensor file [s], which are not those of a device
 _NO_LIMITS = (1e-9, 1e3)
 
@@ -47,28 +45,26 @@ class _StoredPlan(PartialDocument):
     power: float = Field(gt=0, le=1)
 
 
-def planned_for(session: Session, view: View) -> PlannedExposure | None:
-    """Return the exposures of a view: those of the study, or planned ones; None for the sensor's own rule.
+def kept_plan(
+    renderer: RenderedMeasurements, view: View, rules: PlanRules, folder: Path, digest: str
+) -> PlannedExposure:
+    """Return the planned exposures of a view, and keep the plan in a folder for the next call.
 
-    A plan in the folder of the session is used again if all that determines a trial is the same.
+    Parameters
+    ----------
+    renderer, view, rules
+        As of :func:`plan_view`.
+    folder
+        Of the plans of a study.
+    digest
+        Of all that determines a trial: a plan of another digest is made again.
 
-    Raises
-    ------
-    InputError
-        If the sensor cannot take or merge the exposures of the study, or measurements are drawn from a map, which holds
-        only for the exposure that it was made with.
+    See Also
+    --------
+    stated_exposures : exposures that a study states
     """
-    study, table = session.study, session.study.file.exposure
-    if table is None:
-        return None
-    renderer = rendered(session.measurements)
-    if table.exposures_s is not None:
-        given = PlannedExposure(tuple(sorted(table.exposures_s)), table.power)
-        _check_given(study, given)
-        return given
-    rules = PlanRules(table.most, table.within)
-    path = session.folder / "exposures" / f"view_{view.number:04d}.json"
-    digest_of_plan = with_exposure(session.digest, None, asdict(rules))
+    path = folder / f"view_{view.number:04d}.json"
+    digest_of_plan = with_exposure(digest, None, asdict(rules))
     if path.exists():
         try:
             stored = validate(path, read_json_object(path), _StoredPlan)
@@ -78,7 +74,7 @@ def planned_for(session: Session, view: View) -> PlannedExposure | None:
             return PlannedExposure(tuple(stored.exposures_s), stored.power)
     plan = plan_view(renderer, view, rules)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, plan_document(study, plan) | {"digest": digest_of_plan})
+    write_json(path, plan_document(renderer.study, plan) | {"digest": digest_of_plan})
     say(f"view {view.number}: {plan_in_words(plan)}")
     return plan.exposure
 
@@ -116,8 +112,15 @@ def rendered(measurements: RenderedMeasurements | MappedMeasurements) -> Rendere
     return measurements
 
 
-def _check_given(study: Study, given: PlannedExposure) -> None:
-    """Check that a sensor can take and merge the exposures of a study; raise an InputError if not."""
+def stated_exposures(study: Study, exposures_s: Sequence[float], power: float) -> PlannedExposure:
+    """Return the exposures [s] that a study states, checked.
+
+    Raises
+    ------
+    InputError
+        If the sensor cannot take or merge them.
+    """
+    given = PlannedExposure(tuple(sorted(exposures_s)), power)
     (shortest, longest), sensor = study.sensor.exposure.limits_s, study.sensor.name
     for seconds in given.exposures_s:
         if not shortest <= seconds <= longest:
@@ -126,6 +129,7 @@ def _check_given(study: Study, given: PlannedExposure) -> None:
     if len(given.exposures_s) > 1 and not study.sensor.merges_exposures:
         several, hint = f"{len(given.exposures_s)} exposures", f"{sensor} cannot merge exposures"
         raise InputError(study.path, "exposure.exposures_s", several, "one", hint)
+    return given
 
 
 def with_exposure(digest: str, planned: PlannedExposure | None, more: Any = None) -> str:

@@ -17,7 +17,6 @@ from mitsim.running.time_limit import TimeLimit
 from mitsim.study.session import Session
 from mitsim.study.virtual.drawn_numbers import related, statement_trials
 from mitsim.study.virtual.race import Job, complete
-from mitsim.study.virtual.stated import source_of_trials
 from mitsim.study.virtual.world import Trial
 from mitsim.views import View
 
@@ -38,11 +37,12 @@ def state_mean(session: Session, view: View, captures: int, count: int, limit: T
     limit
         Time.
     """
-    study, (runner, trials, _) = session.study, source_of_trials(session, view)
+    study, source = session.study, session.trials_of(view)
+    trials = source.folder
     days = list(dict.fromkeys(trial.day for trial in statement_trials(2 * count)))[:count]
     for day in days:
         jobs = [Job(view, Trial(day, capture)) for capture in range(captures)]
-        complete(trials, runner, jobs, f"capture day {day - days[0] + 1} of {len(days)}", limit.over)
+        complete(trials, source.runner, jobs, f"capture day {day - days[0] + 1} of {len(days)}", limit.over)
         if limit.over():
             break
     known = trials.known(view.number)

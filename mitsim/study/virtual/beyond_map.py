@@ -23,7 +23,7 @@ from pydantic import Field, model_validator
 from characterisation.files.documents import Document, read_toml
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 
 #: kinds of sensors: matching, coded light, time of flight
 MATCHED, CODED, FLIGHT = "matched", "coded", "time_of_flight"

@@ -18,7 +18,7 @@ import numpy as np
 from mitsim.capture.decoding import Settings
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.matcher import MatcherSettings
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.unknowns import DecoderUnknowns
 
 Choice = TypeVar("Choice")

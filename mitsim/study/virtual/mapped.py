@@ -33,7 +33,7 @@ from mitsim.maps.campaign.acquire import one_ahead
 from mitsim.maps.prediction import CharacterisedScene, Predictor
 from mitsim.maps.prediction.shared_errors import terms
 from mitsim.scene.ray_casting.raycast import Surfaces
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.study.calibration.accuracy import measured_points
 from mitsim.study.virtual.beyond_map import beyond_map

@@ -18,8 +18,8 @@ from mitsim.maps.prediction import Effect, Predictor
 from mitsim.maps.prediction.interreflections import InterreflectionEffect
 from mitsim.maps.prediction.shared_errors import SharedErrors, independent_fields
 from mitsim.scene.ray_casting.self_view import sees_itself
-from mitsim.sensor.preset import Sensor
 from mitsim.sensor.rig_parameters import moved, path_error
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.working_volume import in_image
 from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.study.calibration.accuracy import measured_points

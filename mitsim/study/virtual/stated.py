@@ -2,20 +2,18 @@
 
 Signal chain: trials with draws that were not used to choose the view, some of them repeated captures of a day -> their
 errors, and what each group of unknowns drew -> :class:`characterisation.statements.statement.Statement` of every
-measurement -> ``statement.json``.
+measurement.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from characterisation.files.atomic_io import json_values
 from characterisation.statements.budget import budget, largest_line
 from characterisation.statements.decision import tolerance_of
 from characterisation.statements.losses import losses, lost_features
@@ -23,24 +21,15 @@ from characterisation.statements.statement import Statement, statement
 from characterisation.statements.verdict_words import Judged
 from mitsim.running.text_table import aligned
 from mitsim.running.time_limit import TimeLimit
-from mitsim.running.version import __version__
 from mitsim.sensor.exposure import PlannedExposure
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.study import StatementTable, Study
-from mitsim.study.exposures.planned import planned_for, with_exposure
-from mitsim.study.maker_accuracy import maker_sigma
 from mitsim.study.virtual.drawn_decoder import decoder_is_drawn
 from mitsim.study.virtual.drawn_numbers import drawn_numbers, related, seeds, statement_trials
-from mitsim.study.virtual.influences import influences
-from mitsim.study.virtual.mapped import MappedMeasurements
 from mitsim.study.virtual.race import Job, TrialRunner, complete
 from mitsim.study.virtual.trials import TrialFolder
-from mitsim.study.virtual.world import BEYOND, FRESH, GROUPS, SET_DAYS, STATEMENT_DAYS, Trial, Unknowns
+from mitsim.study.virtual.world import BEYOND, GROUPS, SET_DAYS, STATEMENT_DAYS, Trial, Unknowns
 from mitsim.views import View
-
-if TYPE_CHECKING:
-    from mitsim.study.session import Session
-
 
 #: trials after which a statement asks whether it is settled, or time is over
 BATCH = 40
@@ -50,6 +39,18 @@ LEAST_COMPARED = 20
 
 #: largest number of trials of a statement, if the study names none: without a time limit, and within one
 MOST, MOST_WITHIN_A_LIMIT = 1000, 4000
+
+
+@dataclass(frozen=True)
+class TrialsOfView:
+    """What makes the trials of a statement of one view, and where they are kept.
+
+    ``planned`` are the exposures of the trials, None for the sensor's own rule.
+    """
+
+    runner: TrialRunner
+    folder: TrialFolder
+    planned: PlannedExposure | None
 
 
 @dataclass(frozen=True)
@@ -65,13 +66,15 @@ class StatedView:
 
 
 def state_view(
-    session: Session,
+    study: Study,
+    unknowns: Unknowns,
+    source: TrialsOfView,
     view: View,
     table: StatementTable | None = None,
     limit: TimeLimit | None = None,
     after_batch: Callable[[StatedView], None] | None = None,
 ) -> StatedView:
-    """State every measurement from one view at its exposures, and reuse trials in the folder of the session.
+    """State every measurement from one view at its exposures, and reuse finished trials.
 
     Draws of the race are not used: they selected the view, and are biased in its favour. Trials end when every
     measurement is settled (JCGM 101:2008, 7.9), when they have the number of the study, or when time is over. If the
@@ -80,10 +83,8 @@ def state_view(
 
     Parameters
     ----------
-    session
-        Of the study, with a folder.
-    view
-        The view.
+    study, unknowns, source, view
+        The study, what is unknown of it, the maker of the trials, and the view.
     table
         Replaces the study's number of trials, which are then made whether or not fewer would settle the statement.
     limit
@@ -92,7 +93,7 @@ def state_view(
     after_batch
         Receives the statement, without a budget, after every :data:`BATCH` trials but the last.
     """
-    study, (runner, trials, planned) = session.study, source_of_trials(session, view)
+    runner, trials, planned = source.runner, source.folder, source.planned
     limit = TimeLimit() if limit is None else limit
     label = f"state view {view.number}"
     made, rules = list[Trial](), table or study.file.statement
@@ -108,37 +109,30 @@ def state_view(
             break
         if after_batch is not None:
             after_batch(so_far)
-    groups = budget_groups(session.unknowns, session.source, study.sensor)
-    numbers = drawn_numbers(study, session.unknowns, session.source, made, groups)
+    groups = budget_groups(unknowns, runner.source, study.sensor)
+    numbers = drawn_numbers(study, unknowns, runner.source, made, groups)
     return StatedView(view, _statements(study, trials, view, made, (numbers, seeds(made, groups))), planned)
 
 
-def source_of_trials(session: Session, view: View) -> tuple[TrialRunner, TrialFolder, PlannedExposure | None]:
-    """Return what makes the trials of a statement of a view, where they are kept, and their planned exposures."""
-    runner, planned = session.runner, planned_for(session, view)
-    if planned is None:
-        return runner, session.trials, None
-    assert not isinstance(runner, MappedMeasurements)  # planned_for rejects a map
-    digest = with_exposure(session.digest, planned)
-    return (
-        runner.exposed_as(planned),
-        TrialFolder.of(session.folder / "planned_trials", digest, session.study.task),
-        planned,
-    )
-
-
-def compared(session: Session, view: int, other: int) -> float | None:
+def compared(study: Study, trials: TrialFolder, view: int, other: int) -> float | None:
     """Return the ratio of root mean square errors of two views: the geometric mean over the measurements, as the race.
 
     With tolerances for all measurements, it is the ratio of the largest errors relative to the tolerance. It is None if
     a view lacks trials of a statement, or a value.
+
+    Parameters
+    ----------
+    study, trials
+        The study, and its finished trials.
+    view, other
+        Numbers of the two views.
     """
-    figures, task = [], session.study.task
+    figures, task = [], study.task
     for number in (view, other):
-        made = [trial for trial in session.trials.known(number) if STATEMENT_DAYS <= trial.day < SET_DAYS]
+        made = [trial for trial in trials.known(number) if STATEMENT_DAYS <= trial.day < SET_DAYS]
         if len(made) < LEAST_COMPARED:
             return None
-        stated = _statements(session.study, session.trials, session.study.view(number), made)
+        stated = _statements(study, trials, study.view(number), made)
         figures.append(np.array([one.root_mean_square for one in stated]))
     sizes = np.array([one.tolerance_size or math.nan for one in task.measurements.values()])
     first, second = (each / sizes if np.isfinite(sizes).all() else each for each in figures)
@@ -202,35 +196,6 @@ def budget_groups(unknowns: Unknowns, source: str, sensor: Sensor) -> list[str]:
     return [group for group in GROUPS if group in unknowns.varied and group not in idle]
 
 
-def statement_document(session: Session, stated: StatedView) -> dict[str, Any]:
-    """Return the statement as JSON values; see docs/reference/formats/statement.md."""
-    study, unknowns, view = session.study, session.unknowns, stated.view
-    declared = influences(
-        unknowns.table, session.source, study.file.measure.light_path_depth, "coat" in unknowns.varied
-    )
-    exposed = {} if stated.planned is None else {"exposure": asdict(stated.planned)}
-    return exposed | {
-        "schema_version": 1,
-        "mitsim": __version__,
-        "study": str(study.path),
-        "sensor": study.sensor.name,
-        "measured_by": session.source,
-        "map_source": "" if study.performance_map is None else study.performance_map.data.attrs.get("source", ""),
-        "seed": study.file.seed,
-        "view": view.number,
-        "world_from_sensor": view.world_from_sensor.matrix().tolist(),
-        "coverage_probability": 0.95,
-        "calibration": unknowns.calibration.source,
-        "unknowns": unknowns.table.model_dump(mode="json"),
-        "measurements": {
-            one.measurement: _measurement(one)
-            | {"maker_sigma": maker_sigma(study.sensor, study.task.measurements[one.measurement], view.standoff)}
-            for one in stated.statements
-        },
-        "influences": [asdict(one) for one in declared],
-    }
-
-
 def statement_table(stated: Sequence[Statement]) -> str:
     """Return the statements as a text table."""
     about_error = ("bias", "u", "95 % interval of the error", "after correction", "no value", "most of it from")
@@ -287,16 +252,6 @@ def _largest(one: Statement) -> str:
         return ""
     largest = largest_line(one.budget)
     return "too few trials" if largest is None else f"{largest.group} ({100 * largest.share:.0f} %)"
-
-
-def _measurement(one: Statement) -> dict[str, Any]:
-    lines = one.budget
-    table = {key: value for key, value in asdict(one).items() if key not in ("measurement", "budget", "decided")}
-    table["decision"] = None if one.decided is None else asdict(one.decided)
-    table["budget"] = [asdict(line) | {"fresh": line.group in FRESH} for line in lines]
-    known = math.isfinite(one.repeatability) and math.isfinite(one.standard_uncertainty)
-    table["after_repeats"] = {str(n): one.after_repeats(n) for n in (1, 4, 16)} if known else {}
-    return {key: json_values(value) for key, value in table.items()}
 
 
 def digits(value: float) -> str:

@@ -21,7 +21,7 @@ from mitsim.capture.simulated.exposing import LightOnImagers
 from mitsim.scene import backend
 from mitsim.scene.load import Scene, scene_from_dict
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.twin.compare.denoise import denoised
 from mitsim.twin.compare.plain_image import PlainImage
 from mitsim.twin.finish.place import Bend, Place

@@ -39,8 +39,8 @@ from mitsim.scene.light_transport.projector_light import ProjectedPatterns
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.pattern import RandomDots
-from mitsim.sensor.preset import Sensor
 from mitsim.sensor.projector_images import ImagesDescription
+from mitsim.sensor.sensor import Sensor
 from mitsim.twin.compare.plain_image import plain_image
 from mitsim.twin.compare.plate import REFLECTANCE, plate, printed, texture_of
 from mitsim.twin.finish.electrons import chip_of, linearised

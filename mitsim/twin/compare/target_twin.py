@@ -27,7 +27,7 @@ from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decoding.cloud import capture_cloud, decoder_settings
 from mitsim.scene.load import Scene
 from mitsim.scene.test_targets import ball, plate
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 
 Floats = NDArray[np.float64]
@@ -78,6 +78,10 @@ def seen_target(shape: str, window: Roi | None, cloud: PointCloud, name: str, di
         If the points are too few or do not lie on the shape.
     InputError
         If the window does not lie in the grid.
+
+    See Also
+    --------
+    simulated_target : its twin
     """
     points, grid = window_points(window, cloud, name), cloud.grid
     if distance is not None:
@@ -112,6 +116,10 @@ def simulated_target(
     ------
     InputError
         If the sensor does not see the target.
+
+    See Also
+    --------
+    seen_target : the recorded one
     """
     scene, pose = _scene(target.surface, sensor)
     capture = SimulatedSensor(sensor).capture(scene, pose, rendering=Rendering(samples=SAMPLES), seed=seed)

@@ -24,7 +24,8 @@ from mitsim.capture.capture import Capture
 from mitsim.sensor.image_formation import converter
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.noise_sources import Noise
-from mitsim.sensor.preset import Sensor, load_sensor, presets
+from mitsim.sensor.preset import load_sensor, presets
+from mitsim.sensor.sensor import Sensor
 
 Floats = NDArray[np.float64]
 

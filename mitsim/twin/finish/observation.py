@@ -30,7 +30,7 @@ from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.modulation import AmplitudeModulation
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.twin.finish.electrons import PixelNoise, chip_of, linearised, pixel_noise
 from mitsim.twin.finish.place import Place
 from mitsim.twin.finish.white_coupon import Pattern, WhiteCouponRenderer, coupon_roi

@@ -26,7 +26,7 @@ from mitsim.maps.campaign.coupons import CouponRecipe, load_sample
 from mitsim.running.progress import say, track
 from mitsim.scene.light_transport.ambient import has_emitters
 from mitsim.sensor.pattern import DotPattern
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.twin.finish.dots import Dots, compare_dots
 from mitsim.twin.finish.electrons import sensor_of
 from mitsim.twin.finish.estimate import Fit, FittedQuantity, fit_views

@@ -19,8 +19,8 @@ from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.decoding.cloud import Settings, capture_cloud, capture_geometry
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.preset import Sensor
 from mitsim.sensor.roi import roi_around
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.twin.finish.place import Bend, Place, fit_bend, found_place, known_place, plane_points
 

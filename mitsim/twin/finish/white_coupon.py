@@ -23,8 +23,8 @@ from mitsim.scene.differentiable import lambertian_coupon
 from mitsim.scene.light_transport.projector_light import ProjectedPatterns
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.pattern import RandomDots
-from mitsim.sensor.preset import Sensor
 from mitsim.sensor.roi import roi_around
+from mitsim.sensor.sensor import Sensor
 from mitsim.twin.finish.place import Place
 
 Floats = NDArray[np.float64]

@@ -90,6 +90,11 @@ def fit_defocus(source: InputCapture, white: Floats, black: Floats, pairs: Float
         (n, 2, H, W) images of stripes and of their inverses, linear too.
     widths
         (n,) of the stripes [projector px].
+
+    See Also
+    --------
+    modulation : of stripes after a blur
+    fitted_blur : the blur of a modulation
     """
     projector = source.capture.rig.projector
     assert projector is not None

@@ -22,7 +22,7 @@ from scipy.stats import chi2
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.sensor.pattern import DotPattern
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.twin.compare.specimen_patches import contrast_window
 from mitsim.twin.finish.place import Place
 from mitsim.twin.finish.specimen import MARGIN_PX, image_mask

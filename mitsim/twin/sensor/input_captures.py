@@ -18,7 +18,7 @@ from scipy.ndimage import uniform_filter
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.twin.finish.fine_detail import finest_detail
 
 Kind = Literal["on", "off", "dark"]

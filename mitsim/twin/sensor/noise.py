@@ -17,7 +17,7 @@ from scipy.optimize import brentq
 
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.point_spread import point_spread
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.twin.compare.denoise import denoised
 from mitsim.twin.finish.electrons import linearised
 from mitsim.twin.finish.fine_detail import FINEST, MEDIAN_SQUARE, finest_detail

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from mitsim.sensor.pattern import DiffractionSpots, RandomDots
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.sensor_file import RoomTable
 from mitsim.twin.sensor.estimate import Scale
 

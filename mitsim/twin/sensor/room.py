@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.sensor.imager import electrons_per_radiance
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.vignetting import camera_illumination
 from mitsim.twin.compare.plate import REFLECTANCE
 from mitsim.twin.compare.rebuild import like

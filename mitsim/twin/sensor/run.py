@@ -22,7 +22,8 @@ from mitsim.decoding.cloud import decoder_settings
 from mitsim.running.progress import say
 from mitsim.sensor.light_code import LightCode
 from mitsim.sensor.pattern import DotPattern
-from mitsim.sensor.preset import Sensor, load_sensor
+from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.twin.compare.rebuild import like
 from mitsim.twin.finish.place import Place
 from mitsim.twin.finish.specimen import specimen_place

@@ -27,7 +27,7 @@ from mitsim.sensor.camera import Rig
 from mitsim.sensor.image_formation import expose, fixed_pattern
 from mitsim.sensor.imager import electrons_per_radiance
 from mitsim.sensor.noise_sources import Noise
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.vignetting import camera_illumination
 from mitsim.twin.compare.plate import REFLECTANCE, plate
 from mitsim.twin.finish.place import Place

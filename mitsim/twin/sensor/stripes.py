@@ -18,7 +18,7 @@ from mitsim.decoding.cloud import capture_pattern
 from mitsim.sensor.image_role import Role
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import LightCode, roles
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.twin.finish.electrons import linearised
 from mitsim.twin.finish.place import Place

@@ -24,7 +24,7 @@ from scipy.special import erf
 from characterisation.region_of_interest import Roi
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.imager import Imager
-from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor import Sensor
 
 Images = NDArray[np.float32]
 

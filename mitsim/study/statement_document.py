@@ -1,0 +1,55 @@
+"""Write the statement of a view as JSON values: ``statement.json``."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from typing import Any
+
+from characterisation.files.atomic_io import json_values
+from characterisation.statements.statement import Statement
+from mitsim.running.version import __version__
+from mitsim.study.maker_accuracy import maker_sigma
+from mitsim.study.session import Session
+from mitsim.study.virtual.influences import influences
+from mitsim.study.virtual.stated import StatedView
+from mitsim.study.virtual.world import FRESH
+
+
+def statement_document(session: Session, stated: StatedView) -> dict[str, Any]:
+    """Return the statement as JSON values; see docs/reference/formats/statement.md."""
+    study, unknowns, view = session.study, session.unknowns, stated.view
+    declared = influences(
+        unknowns.table, session.source, study.file.measure.light_path_depth, "coat" in unknowns.varied
+    )
+    exposed = {} if stated.planned is None else {"exposure": asdict(stated.planned)}
+    return exposed | {
+        "schema_version": 1,
+        "mitsim": __version__,
+        "study": str(study.path),
+        "sensor": study.sensor.name,
+        "measured_by": session.source,
+        "map_source": "" if study.performance_map is None else study.performance_map.data.attrs.get("source", ""),
+        "seed": study.file.seed,
+        "view": view.number,
+        "world_from_sensor": view.world_from_sensor.matrix().tolist(),
+        "coverage_probability": 0.95,
+        "calibration": unknowns.calibration.source,
+        "unknowns": unknowns.table.model_dump(mode="json"),
+        "measurements": {
+            one.measurement: _measurement(one)
+            | {"maker_sigma": maker_sigma(study.sensor, study.task.measurements[one.measurement], view.standoff)}
+            for one in stated.statements
+        },
+        "influences": [asdict(one) for one in declared],
+    }
+
+
+def _measurement(one: Statement) -> dict[str, Any]:
+    lines = one.budget
+    table = {key: value for key, value in asdict(one).items() if key not in ("measurement", "budget", "decided")}
+    table["decision"] = None if one.decided is None else asdict(one.decided)
+    table["budget"] = [asdict(line) | {"fresh": line.group in FRESH} for line in lines]
+    known = math.isfinite(one.repeatability) and math.isfinite(one.standard_uncertainty)
+    table["after_repeats"] = {str(n): one.after_repeats(n) for n in (1, 4, 16)} if known else {}
+    return {key: json_values(value) for key, value in table.items()}

@@ -1,0 +1,137 @@
+"""Features in windows: closed forms without noise, and uncertainties that describe the scatter with it."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from characterisation.features.fits import fit_cylinder
+from characterisation.features.starts import cylinder_start
+from characterisation.files.errors import InputError
+from characterisation.region_of_interest import Roi
+from characterisation.tasks.result import Result, repeatability
+from characterisation.tasks.windows import WindowPlan, measure_windows
+from mitsim.decoding.measured_document import repeatability_table
+from tests.seen_shapes import GRID, cloud_of, cylinder, plane, sphere
+
+#: left half a plane, right half one that leans by 30 deg against it; below them a ball and a pin
+LEFT, RIGHT = (Roi(5, 5, 85, 60), Roi(110, 5, 85, 60))
+LEAN = np.deg2rad(30)
+
+
+def corner():
+    flat, leaning = plane([0, 0, 500], [0, 0, -1]), plane([0, 0, 480], [np.sin(LEAN), 0, -np.cos(LEAN)])
+    return np.where(np.arange(GRID.width) < 100, flat, leaning)
+
+
+def by_name(results):
+    return {one.name: one for one in results}
+
+
+def test_planes_without_noise_are_as_they_were_made():
+    plan = WindowPlan({"a": ("plane", LEFT), "b": ("plane", RIGHT)}, [("angle", "a", "b")])
+    found = by_name(measure_windows(cloud_of(corner()), plan))
+    assert found["a-b angle"].value == pytest.approx(30.0, abs=1e-4)
+    assert found["a flatness"].value < 1e-3
+    assert found["a noise"].value < 1e-4
+    # the middle of the window's rays meets z = 500
+    rays = GRID.rays()[5:65, 5:90].reshape(-1, 3)
+    middle = (rays / rays[:, 2:]).mean(axis=0)
+    assert found["a distance"].value == pytest.approx(500 * np.linalg.norm(middle), abs=1e-3)
+    assert (found["a noise"].points, found["a noise"].points_given) == (60 * 85, 60 * 85)
+
+
+def test_the_distance_of_parallel_planes_is_their_offset():
+    flat = np.where(np.arange(GRID.width) < 100, plane([0, 0, 500], [0, 0.2, -1]), plane([0, 0, 520], [0, 0.2, -1]))
+    plan = WindowPlan({"a": ("plane", LEFT), "b": ("plane", RIGHT)}, [("distance", "a", "b")])
+    found = by_name(measure_windows(cloud_of(flat), plan))["a-b distance"]
+    assert found.value == pytest.approx(20 / np.sqrt(1.04), abs=1e-3)
+
+
+def test_balls_and_pins_without_noise_are_as_they_were_made():
+    ball, pin = sphere([-30, 0, 450], 20), cylinder([40, 0, 470], [0.1, 1, 0.05], 15)
+    cloud = cloud_of(np.where(np.arange(GRID.width) < 100, ball, pin))
+    whole = Roi(0, 0, 100, 160), Roi(100, 0, 100, 160)
+    found = by_name(measure_windows(cloud, WindowPlan({"ball": ("sphere", whole[0]), "pin": ("cylinder", whole[1])})))
+    assert found["ball diameter"].value == pytest.approx(40, abs=1e-3)
+    assert found["ball distance"].value == pytest.approx(np.hypot(30, 450), abs=1e-3)
+    assert found["pin diameter"].value == pytest.approx(30, abs=1e-3)
+    assert found["pin cylindricity"].value < 1e-3
+
+
+@pytest.fixture(scope="module")
+def trials():
+    """Sixty clouds of a corner, and of a ball, with noise of 0.2 mm along the rays."""
+    rng = np.random.default_rng(24)
+    small = Roi(30, 20, 40, 40), Roi(120, 20, 40, 40)
+    plan = WindowPlan({"a": ("plane", small[0]), "b": ("plane", small[1])}, [("angle", "a", "b")])
+    ball = WindowPlan({"ball": ("sphere", Roi(60, 45, 80, 70))})
+    return [
+        measure_windows(cloud_of(corner(), 0.2, rng), plan)
+        + measure_windows(cloud_of(sphere([0, 0, 450], 20), 0.2, rng), ball)
+        for _ in range(60)
+    ]
+
+
+@pytest.mark.parametrize("name", ["a distance", "a noise", "a-b angle", "ball diameter", "ball distance"])
+def test_the_uncertainty_is_the_scatter_of_independent_noise(trials, name):
+    """Over 60 trials s / sigma lies within 1 +- 3 / sqrt(2 * 59), and the mean within 4 standard errors."""
+    truth = {"a noise": 0.2, "a-b angle": 30.0, "ball diameter": 40.0, "ball distance": 450.0}
+    values = np.array([by_name(one)[name].value for one in trials])
+    stated = np.sqrt(np.mean([by_name(one)[name].uncertainty ** 2 for one in trials]))
+    assert abs(values.std(ddof=1) / stated - 1) < 3 / np.sqrt(2 * 59)
+    if name in truth:
+        # without the fit's own removal of points beyond 4 sigma: 6 in 10 000, 0.1 % of sigma
+        assert abs(values.mean() - truth[name]) < 4 * stated / np.sqrt(60) + (1e-3 * 0.2 if name == "a noise" else 0)
+
+
+def test_repeatability_is_mean_and_standard_deviation_over_clouds(trials):
+    over = {one.name: one for one in repeatability(trials)}
+    values = [by_name(one)["ball diameter"].value for one in trials]
+    assert over["ball diameter"].count == over["ball diameter"].cloud_count == 60
+    assert over["ball diameter"].mean == pytest.approx(np.mean(values))
+    assert over["ball diameter"].deviation == pytest.approx(np.std(values, ddof=1))
+
+
+def test_the_uncertainty_of_repeats_is_the_root_mean_square_of_those_of_the_fits():
+    (over,) = repeatability([[Result("a", "mm", 1.0, 0.3, "fit")], [Result("a", "mm", 2.0, 0.4, "fit")]])
+    assert over.uncertainty == pytest.approx(np.sqrt(0.125))
+    assert "u (rms of fits)" in repeatability_table([over])
+
+
+def test_a_window_that_shows_something_else_has_no_value_and_says_so(rng):
+    cloud = cloud_of(np.where(rng.random((160, 200)) < 0.3, corner(), rng.uniform(300, 900, (160, 200))))
+    found = measure_windows(cloud, WindowPlan({"a": ("plane", LEFT)}))
+    assert not any(one.possible for one in found)
+    assert "does the window show one plane?" in found[0].reason
+    assert repeatability([found])[0].count == 0
+
+
+def test_a_window_outside_the_grid_is_refused():
+    with pytest.raises(InputError, match="within 200 x 160 pixels"):
+        measure_windows(cloud_of(corner()), WindowPlan({"a": ("plane", Roi(150, 5, 80, 60))}))
+
+
+def test_pairs_that_cannot_be_measured_are_refused():
+    features = {"a": ("plane", LEFT), "ball": ("sphere", RIGHT)}
+    with pytest.raises(InputError, match=r"a \(plane\) and ball \(sphere\).*planes and cylinders"):
+        WindowPlan(features, [("angle", "a", "ball")]).check()
+    with pytest.raises(InputError, match="did you mean 'ball'"):
+        WindowPlan(features, [("distance", "a", "bal")]).check()
+
+
+@settings(max_examples=30)
+@given(
+    lean=st.floats(-0.9, 0.9),
+    roll=st.floats(0, np.pi),
+    radius=st.floats(8, 60),
+    distance=st.floats(350, 700),
+    seed=st.integers(0, 1000),
+)
+def test_a_cylinder_is_found_without_its_nominal_geometry(lean, roll, radius, distance, seed):
+    axis = np.array([np.cos(roll) * np.cos(lean), np.sin(roll) * np.cos(lean), np.sin(lean)])
+    seen = cloud_of(cylinder([0, 0, distance], axis, radius), 0.05, np.random.default_rng(seed))
+    points = seen.points[40:120:2, 50:150:2][seen.valid[40:120:2, 50:150:2]].astype(float)
+    fit = fit_cylinder(points, cylinder_start(points), np.zeros(3))
+    assert abs(fit.axis @ axis) > np.cos(np.deg2rad(2))
+    assert abs(fit.radius - radius) < 6 * np.sqrt(fit.covariance[4, 4]) + 0.01

@@ -1,0 +1,139 @@
+"""Two commands do not write to one folder; one that was killed keeps nothing, and what it left is swept."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from unittest import mock
+
+import pytest
+
+from characterisation.files.atomic_io import HOST, atomic_write, atomic_write_named, write_folder
+from characterisation.files.errors import InputError
+from mitsim.cli.folder_lock import LOCK, lock_folder, remove_partial, remove_partial_beside
+from mitsim.study.scoring import score_study
+from tests.shell import mitsim_here
+from tests.small_study import small_study
+from tests.smaller_sensors import coarse_sensor
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="locks of POSIX")
+
+HOLD = "import sys, time, pathlib; from mitsim.cli.folder_lock import lock_folder; f = pathlib.Path(sys.argv[1]); "
+HOLD += "release = lock_folder(f); (f / f'.scores.csv.{__import__(\"os\").getpid()}.partial').write_text('half'); "
+HOLD += "print('held', flush=True); time.sleep(600)"
+
+
+@pytest.fixture
+def holder(tmp_path):
+    with subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout.readline() == "held\n"
+        yield other
+        other.kill()
+
+
+def test_a_folder_that_is_held_is_refused_and_a_dead_holder_keeps_nothing(tmp_path, holder):
+    left = tmp_path / f".scores.csv.{holder.pid}.partial"
+    with pytest.raises(InputError, match=rf"process {holder.pid} on .*since \d{{4}}-"):
+        lock_folder(tmp_path)
+    assert remove_partial(tmp_path) == [] and left.exists()
+    os.kill(holder.pid, signal.SIGKILL)
+    holder.wait()
+    release = lock_folder(tmp_path)
+    assert not left.exists() and (tmp_path / LOCK).exists()
+    with pytest.raises(InputError, match=f"process {os.getpid()}"):
+        lock_folder(tmp_path)
+    release()
+    assert list(tmp_path.iterdir()) == []
+    lock_folder(tmp_path)()
+
+
+def test_only_left_overs_of_the_dead_are_swept(tmp_path):
+    (tmp_path / "captures" / f".view_0001.partial-999999999-{HOST}1b").mkdir(parents=True)
+    kept = [
+        ".poses.partial-x",
+        "a.partial",
+        ".hidden",
+        f".map.nc.{os.getpid()}.partial",
+        f".k.partial-{os.getppid()}-{HOST}0f",
+        ".k.partial-999999999-0000000f",  # of another machine, and fresh
+    ]
+    for name in kept:
+        (tmp_path / name).write_text("", encoding="utf-8")
+    assert [path.name for path in remove_partial(tmp_path)] == [f".view_0001.partial-999999999-{HOST}1b"]
+    assert {path.name for path in tmp_path.iterdir()} == {*kept, "captures"}
+    day_old = time.time() - 25 * 3600
+    os.utime(tmp_path / ".k.partial-999999999-0000000f", (day_old, day_old))
+    assert [path.name for path in remove_partial(tmp_path)] == [".k.partial-999999999-0000000f"]
+
+
+def test_beside_a_file_only_its_own_left_overs_are_swept(tmp_path):
+    kept = [f".other.ply.999999999-{HOST}.partial", f".a.ply.{os.getppid()}-{HOST}.partial", "a.ply"]
+    gone = [f".a.ply.999999999-{HOST}.partial", f".a.ply.partial-999999999-{HOST}ab"]
+    for name in {*kept, *gone}:
+        (tmp_path / name).write_text("", encoding="utf-8")
+    with (
+        pytest.raises(FileNotFoundError),
+        atomic_write_named(tmp_path / "a.ply") as partial,
+    ):  # its folder has letters behind the name
+        mine = partial.parent.name
+        (tmp_path / mine.replace(str(os.getpid()), "999999999")).mkdir()
+        assert {path.name for path in remove_partial_beside(tmp_path / "a.ply")} == {
+            *gone,
+            mine.replace(str(os.getpid()), "999999999"),
+        }
+        assert {path.name for path in tmp_path.iterdir()} == {*kept, mine}
+
+
+def test_what_is_being_written_names_its_process(tmp_path, monkeypatch):
+    names = []
+    with atomic_write(tmp_path / "a.csv") as partial:
+        names.append(partial.name)
+        partial.write_text("", encoding="utf-8")
+    monkeypatch.setattr("characterisation.files.atomic_io._sync_directory", lambda d: names.append(d.name))
+    write_folder(tmp_path / "poses", {"a": b""})
+    assert all(str(os.getpid()) in name for name in names[:2])
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_signals_end_a_command_as_ctrl_c_does(tmp_path, number):
+    # tests that a shell runs in its background, or under nohup, ignore SIGINT or SIGHUP, and so does what they start
+    wait = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    wait += "signal.signal(signal.SIGHUP, signal.SIG_DFL); "
+    wait += "import mitsim.cli.machine as m, time; import mitsim.cli.program as c; "
+    wait += "c.app.command(name='wait')(lambda: (print('on', flush=True), time.sleep(60))[1]); c.main()"
+    with subprocess.Popen(
+        [sys.executable, "-c", wait, "wait"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as command:
+        assert command.stdout.readline() == "on\n"
+        started = time.monotonic()
+        command.send_signal(number)
+        told = command.communicate(timeout=30)[1]
+    assert command.returncode == 130 and "interrupted; finished work is kept" in told
+    assert "Traceback" not in told and time.monotonic() - started < 20
+
+
+@pytest.mark.timeout(120)
+def test_commands_hold_their_folders_and_let_them_go(tmp_path, tmp_path_factory, holder):
+    study, into = str(tmp_path_factory.mktemp("study") / "study.toml"), ("-o", str(tmp_path))
+    sensor = coarse_sensor("ensenso-n10", 2, Path(study).parent)
+    Path(study).write_text(small_study("{ plane_Ra = 0.37, pillar_Ra = 0.37 }", sensor), encoding="utf-8")
+    into_view = ("--view", "1", *into)
+    for call in (("study", "score", study, *into), ("run", study, *into), ("study", "state", study, *into_view)):
+        assert f"process {holder.pid}" in mitsim_here(*call, code=2).stderr
+    assert {path.name for path in tmp_path.iterdir()} == {LOCK, f".scores.csv.{holder.pid}.partial"}
+    os.kill(holder.pid, signal.SIGKILL)
+    holder.wait()
+    seen = []
+
+    def scored(*given):
+        seen.append(json.loads((tmp_path / LOCK).read_text())["pid"])
+        return score_study(*given)
+
+    with mock.patch("mitsim.study.scoring.score_study", scored):
+        mitsim_here("study", "score", study, *into)
+    assert seen == [os.getpid()]
+    assert (tmp_path / "scores.csv").exists() and not (tmp_path / LOCK).exists()

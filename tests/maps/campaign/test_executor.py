@@ -1,0 +1,158 @@
+"""Work handed out to processes: the same results in any number of them, also where one dies or says no."""
+
+import os
+import pickle
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from characterisation.files.errors import InputError, MissingEnvironmentError
+from mitsim.capture.devices.device_error import DeviceError
+from mitsim.cli.options import requested_workers
+from mitsim.cli.program import app
+from mitsim.running import executor
+from mitsim.running.executor import Pool, fitting_processes, results_of
+from tests.smaller_sensors import coarse_sensor
+
+pytestmark = pytest.mark.timeout(300)
+
+ROOT = Path(__file__).parents[3]
+
+
+def squared(value):
+    return value**2
+
+
+def threads_of_renderer(_):
+    from mitsim.scene.backend import dr
+
+    return dr.thread_count()
+
+
+def refuse(value):
+    raise InputError("a.toml", "key", value, "another", "write one")
+
+
+def die_once(order):
+    number, mark = order
+    if number == 3 and not Path(mark).exists():
+        Path(mark).write_text("")
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def die(order):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.fixture(scope="module")
+def pool():
+    """Two processes as the program starts them: new interpreters."""
+    made = Pool(2)
+    yield made
+    made.close()
+
+
+def test_every_item_comes_once_with_its_result(pool):
+    found = dict(pool.distribute(range(20), lambda n: n + 1, squared))
+    assert found == {n: (n + 1) ** 2 for n in range(20)}
+    assert results_of([3, 1, 2], squared, pool, "squares") == [9, 1, 4] == results_of([3, 1, 2], squared, None, "")
+    assert list(pool.distribute([], squared, squared)) == []
+
+
+def test_each_process_renders_with_its_share_of_the_cores(pool):
+    assert results_of([0], threads_of_renderer, pool, "") == [max(1, executor.usable_cores() // 2)]
+
+
+def test_who_stops_asking_leaves_nothing_in_work(pool):
+    asked = pool.distribute(range(100), lambda n: n, squared)
+    next(asked)
+    asked.close()
+    assert dict(pool.distribute([5], lambda n: n, squared)) == {5: 25}
+
+
+def test_a_process_that_dies_loses_no_work(pool, tmp_path, capsys):
+    found = [item for item, _ in pool.distribute(range(8), lambda n: (n, str(tmp_path / "died")), die_once)]
+    assert sorted(found) == list(range(8)) and (tmp_path / "died").exists()
+    assert "a worker process died" in capsys.readouterr().err
+
+
+def test_processes_that_always_die_are_given_up(monkeypatch):
+    monkeypatch.setattr(executor, "DEATHS", 1)
+    with pytest.raises(MissingEnvironmentError, match="died in a row"):
+        list(Pool(2).distribute([1], lambda n: n, die))
+
+
+def test_what_a_worker_refuses_is_told_as_it_said_it(pool):
+    with pytest.raises(InputError, match=r"a\.toml: key: found 7; allowed: another\. write one") as caught:
+        list(pool.distribute([7], lambda n: n, refuse))
+    assert caught.value.field == "key"
+    for error in (caught.value, DeviceError("stage", "move", "nothing", "an answer", "look")):
+        again = pickle.loads(pickle.dumps(error))
+        assert type(again) is type(error) and str(again) == str(error)
+
+
+def test_processes_follow_cores_and_memory(monkeypatch):
+    monkeypatch.setattr(executor, "usable_cores", lambda: 16)
+    monkeypatch.setattr(executor, "available_memory", lambda: 9 << 30)
+    assert fitting_processes() == 4
+    monkeypatch.setattr(executor, "available_memory", lambda: 1 << 20)
+    assert fitting_processes() == 1
+    monkeypatch.setattr(executor, "available_memory", lambda: 1 << 50)
+    assert fitting_processes() == 16
+    for devices, expected in ((1, type(None)), (0, Pool)):  # one process uses a whole CUDA device
+        monkeypatch.setattr("mitsim.scene.backend.cuda_devices", lambda devices=devices: devices)
+        assert type(requested_workers(None, 0)) is expected
+    assert requested_workers(None, 1) is None and isinstance(requested_workers(None, 3), Pool)
+    with pytest.raises(InputError, match="--processes"):
+        requested_workers("tcp://a:1", 2)
+
+
+PLAN = "captures = 2\n[views]\nsubdivisions = 0\nstandoff_mm = 500\n"
+
+
+def test_commands_give_the_same_bytes_in_two_processes(tmp_path, pool, monkeypatch):
+    monkeypatch.setattr(executor, "Pool", {2: pool}.__getitem__)  # what --processes 2 starts, started once for all
+    (tmp_path / "plan.toml").write_text(PLAN)
+    sensor = coarse_sensor("ensenso-n10", 2, tmp_path)
+    white = (ROOT / "scenes/coupon/matt_white.xml").as_posix()
+    (tmp_path / "campaign.toml").write_text(
+        "distances_mm = [500]\nsamples_per_pixel = 1\norientations = [{ up_to_deg = 20, subdivisions = 0 }]\n"
+        f'samples = [{{ scene = "{white}" }}]\n'
+    )
+    many = [
+        "render",
+        f"{ROOT}/scenes/two_pillars/two_pillars.xml",
+        "--many",
+        tmp_path / "plan.toml",
+        "--samples",
+        1,
+        "--depth",
+        1,
+    ]
+    for command, call in (("many", many), ("map", ["map", "make", tmp_path / "campaign.toml"])):
+        for processes in (1, 2):
+            place = tmp_path / f"{command}_{processes}"
+            asked = [*map(str, [*call, "--sensor", sensor, "-o", place, "--processes", processes])]
+            done = CliRunner().invoke(app, asked)
+            assert done.exit_code == 0, (done.exception, done.stderr)
+        one, two = (
+            {str(p.relative_to(place)): p.read_bytes() for p in place.rglob("*") if p.is_file()}
+            for place in (tmp_path / f"{command}_1", tmp_path / f"{command}_2")
+        )
+        assert one.keys() == two.keys() and len(one) > 5
+        assert [name for name in one if one[name] != two[name]] == []
+
+
+def test_a_data_sheet_is_the_same_in_two_processes(pool, half_n10, monkeypatch):
+    from mitsim.maps import data_sheet
+
+    monkeypatch.setattr(data_sheet, "DISTANCES", 2)
+    monkeypatch.setattr(data_sheet, "METALS", [])
+    one, two = (data_sheet.measure_sensor(half_n10, 3, workers) for workers in (None, pool))
+    assert len(one.residuals.values) > 1000
+    np.testing.assert_equal(one.numbers(), two.numbers())
+    np.testing.assert_array_equal(one.residuals.values, two.residuals.values)

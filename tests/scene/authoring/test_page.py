@@ -1,0 +1,321 @@
+"""The page to author with, in a real browser: a bracket from STEP to a study that can be run, without an editor."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import time
+import tomllib
+import urllib.error
+import urllib.request
+import xml.etree.ElementTree as ElementTree
+from functools import partial
+
+import numpy as np
+import pytest
+
+from mitsim.report.author_page import fair_share
+from mitsim.scene.authoring.read_step import step_installed
+from mitsim.study import open_study
+from tests.quick_process import QuickProcess
+from tests.report.chromium import BROWSER
+from tests.scene.authoring.author import Author
+from tests.scene.authoring.bracket import bracket, write_step
+from tests.shell import mitsim_here
+
+needs_step = pytest.mark.skipif(not step_installed(), reason="OpenCASCADE, which reads STEP, is not installed")
+in_browser = [pytest.mark.browser, pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("bracket")
+
+
+@pytest.fixture(scope="module")
+def step_file(folder):
+    return write_step([("bracket", bracket(), None)], folder / "bracket.step")
+
+
+@pytest.fixture(scope="module")
+def served(folder, step_file):
+    """The command that serves the page of a bracket, and its address."""
+    # what tests start ignores SIGINT where a shell runs them in its background
+    heed = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
+    process = QuickProcess(
+        "-m", "mitsim", "part", step_file, "-o", folder / "made", "--Ra", "0.4", "--edit", limits=heed
+    )
+    end = time.monotonic() + 300
+    while (told := re.search(r"(?m)^(http://\S+)\n", process.said)) is None:
+        assert process.running and time.monotonic() < end, process.said
+        time.sleep(0.05)
+    yield process, told[1]
+    if process.running:
+        os.kill(process.pid, signal.SIGINT)
+        process.wait(30)
+
+
+#: boxes of the texts in the picture, and lines, each with the number of its dimension
+DRAWN = """(() => {
+  const { words, lines } = document.getElementById('author-canvas').drawn;
+  const owners = [...new Set([...words, ...lines].map((one) => one.own))], number = (one) => owners.indexOf(one.own);
+  return [words.map((one) => [number(one), one.left, one.top, one.right, one.bottom]),
+    lines.map((one) => [number(one), ...one.ends[0].slice(0, 2), ...one.ends[1].slice(0, 2)])];
+})()"""
+
+
+def covered(words, lines):
+    """Texts that cover another text, or a line of another dimension."""
+    inside = np.linspace(0, 1, 400)[:, None]
+    found = []
+    for k, (own, left, top, right, bottom) in enumerate(words):
+        beside = (one for j, one in enumerate(words) if j != k)
+        bad = any(a < right and left < c and b < bottom and top < d for _, a, b, c, d in beside)
+        for other, *ends in lines:
+            places = np.array(ends[:2]) * (1 - inside) + np.array(ends[2:]) * inside
+            within = (places > [left, top]) & (places < [right, bottom])
+            bad |= other != own and bool(within.all(axis=1).any())
+        found += [words[k]] if bad else []
+    return found
+
+
+@needs_step
+def test_nobody_else_gets_the_page_or_writes_files(served, folder):
+    _, address = served
+    before = sorted(path.name for path in (folder / "made").iterdir())
+    host = re.match(r"http://127\.0\.0\.1:\d+", address)[0]
+    body = json.dumps({"files": {"task": "[features]\n"}}).encode()
+    strangers = [
+        (f"{host}/", {}, None),
+        (f"{host}/save", {}, body),
+        (f"{address}save", {"Origin": "https://example.org"}, body),
+        (f"{address}save", {"Host": "example.org"}, body),
+        (f"{address}../task.toml", {}, None),
+    ]
+    for url, headers, data in strangers:
+        with pytest.raises(urllib.error.HTTPError) as caught:
+            urllib.request.urlopen(urllib.request.Request(url, data, headers), timeout=20)
+        assert caught.value.code == 403
+        caught.value.close()
+    for sent, says in (
+        (b'{"files": 3}', "hold the files of this page"),
+        (b'{"files": {"task": "kind ="}}', "not TOML"),
+        (b'{"files": {"scene": "<scene"}}', "made.xml"),
+    ):
+        with pytest.raises(urllib.error.HTTPError) as caught:
+            urllib.request.urlopen(urllib.request.Request(f"{address}save", sent), timeout=60)
+        with caught.value as answer:
+            assert says in json.loads(answer.read())["fault"]
+    assert sorted(path.name for path in (folder / "made").iterdir()) == before
+    assert (folder / "made" / "made.xml").read_text().startswith("<!-- Made from bracket.step")
+
+
+@needs_step
+@pytest.mark.parametrize("scheme", [pytest.param("light", marks=in_browser)])
+def test_a_bracket_from_step_to_a_study_without_an_editor(served, folder, browser, scheme):
+    process, address = served
+    browser.scheme(scheme)
+    page = Author(browser, address)
+    assert "bore_12mm_left" in page.faces()
+    page.choose("bore_12mm_left")
+    page.type("#author-name", "datum_bore")
+    page.choose("datum_bore")
+    page.type("#author-name", "seat_18mm")
+    assert "seat_18mm exists already" in page.says
+    page.choose("datum_bore", "bore_12mm_right")
+    page.measure("axis_distance", "0,1")
+    assert page.says == "Added datum_bore_to_bore_12mm_right_axis_distance: 70 ±0.1"
+    page.choose("seat_18mm")
+    for wrong in ("0.1 0.1", "+0.1 -0.1 0", "wide", "-0.1"):
+        page.measure("radius", wrong)
+        assert "a number over 0, or two deviations" in page.says
+    page.measure("radius", "+0,05 \u22120.1")
+    assert page.says == "Added seat_18mm_radius: R9 +0.05 \u22120.1"
+    page.type("[aria-label='tolerance of seat_18mm_radius']", "0 -0.1")
+    page.choose("front_at_y18mm", "top_at_z12mm")
+    offered = browser.tell("[...document.getElementById('author-kind').options].map((one) => one.value)")
+    assert offered == ["plane_angle", "perpendicularity"]
+    for wrong in ("-1", "-0.1 0.1"):
+        page.measure("perpendicularity", wrong)
+        assert page.says == f"The tolerance {wrong}: a number over 0, or empty"
+    page.measure("perpendicularity", "0.2")
+    page.choose("seat_18mm", "boss_20mm")
+    page.pick("#author-finish", "+")
+    page.type("[aria-label^='Ra of finish_2']", "7")
+    assert "contains this finish for Ra" in browser.tell("document.getElementById('author-finishes').textContent")
+    page.type("[aria-label^='Ra of finish_2']", "0.2")
+    browser.tell("document.getElementById('author-done').click()")
+    browser.until("document.getElementById('author-status').textContent.startsWith('Done')", 90)
+    code, told = process.wait(30)
+    assert code == 0
+    assert "saved 1 times" in told
+    assert browser.problems == []
+    assert {url.split("/")[2] for url in browser.requests if url.startswith("http")} == {address.split("/")[2]}
+    made = folder / "made"
+    task = tomllib.loads((made / "task.toml").read_text())
+    assert task["measurements"]["datum_bore_to_bore_12mm_right_axis_distance"] == {
+        "kind": "axis_distance",
+        "features": ["datum_bore", "bore_12mm_right"],
+        "nominal": 70,
+        "unit": "mm",
+        "tolerance": 0.1,
+    }
+    assert task["measurements"]["seat_18mm_radius"]["tolerance"] == [-0.1, 0]
+    assert task["measurements"]["front_at_y18mm_to_top_at_z12mm_perpendicularity"]["tolerance"] == 0.2
+    root = ElementTree.parse(made / "made.xml").getroot()
+    given = {shape.get("id"): shape.find("ref").get("id") for shape in root.iter("shape")}
+    assert {name for name, finish in given.items() if finish == "finish_2"} == {"seat_18mm", "boss_20mm"}
+    study = open_study(made / "study.toml")
+    assert {str(finish) for finish in study.scene.finishes} == {
+        "aluminium/ground Ra 0.4 um",
+        "aluminium/ground Ra 0.2 um",
+    }
+
+
+@needs_step
+@pytest.mark.browser
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
+def test_a_page_by_itself_is_turned_and_clicked_and_needs_no_network(step_file, step_here, browser, tmp_path):
+    for arguments in (
+        ["part", step_file, "-o", tmp_path / "made"],
+        ["check", tmp_path / "made/made.xml", "--task", tmp_path / "made/task.toml", "--html", tmp_path / "page.html"],
+    ):
+        mitsim_here(*arguments)
+    browser.scheme("dark")
+    page = Author(browser, (tmp_path / "page.html").as_uri())
+    box = browser.box("#author-canvas")
+    browser.click(box["x"] + box["width"] / 2, box["y"] + 0.62 * box["height"])
+    first = browser.tell("document.getElementById('author-name').value")
+    assert first in page.faces()
+    before = browser.shot(box)
+    browser.press("ArrowLeft")
+    browser.press("n")
+    browser.rest()
+    assert browser.tell("document.getElementById('author-name').value") != first
+    assert browser.shot(box) != before
+    browser.press("Home")
+    for chosen, kind in (
+        (("bore_12mm_left", "bore_12mm_right"), "axis_distance"),
+        (("boss_20mm",), "diameter"),
+        (("bottom",), "flatness"),
+    ):
+        page.choose(*chosen)
+        page.measure(kind, "0.1")
+    browser.rest()
+    words, lines = browser.tell(DRAWN)
+    assert len(words) >= 4 and len(lines) >= 4 and covered(words, lines) == []
+    assert [url for url in browser.requests if not url.startswith("file:")] == []
+    assert browser.problems == []
+
+
+@needs_step
+@pytest.mark.browser
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
+def test_rules_and_features_that_the_page_does_not_show_are_kept(step_file, step_here, browser, tmp_path):
+    made = tmp_path / "made"
+    mitsim_here("part", step_file, "-o", made)
+    own = (
+        "[features.middle]\nkind = 'mid_plane'\nof = ['left', 'right']\n"
+        "[decision]\nrule = 'simple_acceptance'\nuncertainty_ratio = 6\n"
+        "[measurements.size]\nkind = 'radius'\nfeatures = ['seat_18mm']\nnominal = 9\nunit = 'mm'\n"
+        "tolerance = [-0.1, 0]\ndecision = { guard_share = 0.1 }\n"
+    )
+    (made / "task.toml").write_text((made / "task.toml").read_text() + own)
+    mitsim_here("check", made / "made.xml", "--task", made / "task.toml", "--html", tmp_path / "page.html")
+    page = Author(browser, (tmp_path / "page.html").as_uri())
+    page.choose("left")
+    page.type("#author-name", "side")
+    written = tomllib.loads(page.downloaded()[1])
+    before = tomllib.loads((made / "task.toml").read_text())
+    assert written["decision"] == before["decision"]
+    assert written["measurements"] == before["measurements"]
+    assert written["features"]["middle"] == {"kind": "mid_plane", "of": ["side", "right"]}
+
+
+@needs_step
+@pytest.mark.browser
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
+def test_rims_tolerance_classes_and_a_coat_are_given_by_a_click(step_file, step_here, browser, tmp_path):
+    made = tmp_path / "made"
+    mitsim_here("part", step_file, "-o", made)
+    mitsim_here("check", made / "made.xml", "--task", made / "task.toml", "--html", tmp_path / "page.html")
+    page = Author(browser, (tmp_path / "page.html").as_uri())
+
+    page.choose("bore_12mm_left", "top_at_z12mm")
+    browser.tell("document.getElementById('author-rim').click()")
+    assert page.faces()[-1] == "◯ bore_12mm_left_rim_top_at_z12mm"
+    page.measure("diameter", "")
+    page.choose("bore_12mm_left", "top_at_z12mm")
+    browser.tell("document.getElementById('author-rim').click()")  # it is chosen, not made again
+    assert len([name for name in page.faces() if "_rim_" in name]) == 1
+    page.choose("bore_12mm_left", "left")  # a face along the axis has no rim
+    assert browser.tell("document.getElementById('author-rim')") is None
+
+    for names, kind in (
+        (("bore_12mm_left", "bore_12mm_right"), "axis_distance"),
+        (("bottom", "back"), "plane_angle"),
+        (("bottom",), "flatness"),
+        (("boss_20mm",), "radius"),
+    ):
+        page.choose(*names)
+        page.measure(kind, "0.5" if kind == "radius" else "")
+    page.choose("bore_12mm_right", "bore_12mm_left")
+    page.measure("axis_distance", "0.3")
+    assert "measures the same" in page.says
+    browser.tell("document.getElementById('author-give').click()")
+    assert page.says.startswith("4 of 4 measurements")
+    browser.tell("document.getElementById('author-spray').click()")
+    scene, task, *_ = page.downloaded()
+    written = tomllib.loads(task)
+    assert written["features"]["bore_12mm_left_rim_top_at_z12mm"] == {
+        "kind": "circle", "of": ["top_at_z12mm"], "point_mm": [-35, -8, 12], "radius_mm": 6
+    }  # fmt: skip
+    tolerances = {one["kind"]: (one["nominal"], one["tolerance"]) for one in written["measurements"].values()}
+    # ISO 2768-mK: 12 mm, 70 mm, a shorter leg of 100 mm, a plane of 100 mm; the radius keeps its own
+    assert tolerances == {
+        "diameter": (12, 0.2),
+        "axis_distance": (70, 0.3),
+        "plane_angle": (90, pytest.approx(20 / 60, abs=1e-4)),
+        "flatness": (0, 0.2),
+        "radius": (10, 0.5),
+    }
+    root = ElementTree.fromstring(scene)
+    assert {one.find("ref").get("id") for one in root.iter("shape")} == {"sprayed_matt_white"}
+    (made / "made.xml").write_text(scene)
+    (made / "task.toml").write_text(task)
+    checked = mitsim_here("check", made / "made.xml", "--task", made / "task.toml")
+    assert "matt_white" in checked.stdout
+    browser.tell("document.getElementById('author-spray').click()")
+    assert "finish" in {one.find("ref").get("id") for one in ElementTree.fromstring(page.downloaded()[0]).iter("shape")}
+    assert [one for one in browser.problems if "blob:none" not in one] == []  # downloads are caught, see Author
+
+
+@needs_step
+@pytest.mark.browser
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
+def test_heads_of_tables_are_whole_on_a_narrow_screen(step_file, step_here, browser, tmp_path):
+    mitsim_here("part", step_file, "-o", tmp_path / "made")
+    mitsim_here(
+        "check", tmp_path / "made/made.xml", "--task", tmp_path / "made/task.toml", "--html", tmp_path / "p.html"
+    )
+    browser.call("Emulation.setDeviceMetricsOverride", width=400, height=800, deviceScaleFactor=1, mobile=False)
+    try:
+        page = Author(browser, (tmp_path / "p.html").as_uri())
+        page.choose("boss_20mm")
+        page.measure("diameter", "0.1")
+        # one line of text each, and the page itself does not scroll sideways
+        heights = browser.tell("[...document.querySelectorAll('th[scope=col]')].map((one) => one.clientHeight)")
+        assert len(heights) == 12 and max(heights) < 45
+        assert browser.tell("document.documentElement.scrollWidth") <= 400
+    finally:
+        browser.reset()
+
+
+@pytest.mark.parametrize(
+    ("counts", "most", "share"), [([10, 20, 30], 60, 60), ([10, 200, 300], 110, 50), ([5], 3, 3), ([], 9, 9)]
+)
+def test_small_shapes_stay_whole_where_triangles_are_saved(counts, most, share):
+    assert fair_share(counts, most) == share
+    assert sum(min(count, share) for count in counts) <= most

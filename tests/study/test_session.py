@@ -1,0 +1,131 @@
+"""One session of a study for all commands: what it prepares, and when."""
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from characterisation.files.errors import InputError
+from mitsim.cli.options import keep_finished
+from mitsim.running.time_limit import TimeLimit
+from mitsim.study import RaceTable, StatementTable, StudyFile, open_study, session
+from mitsim.study.run import run_study, run_within
+from mitsim.study.run_folder import read_run
+from mitsim.study.session import Session
+from mitsim.study.statement_document import statement_document
+from mitsim.study.virtual import stated as state
+from mitsim.study.virtual.stated import BATCH, MOST, TrialsOfView, batches
+from mitsim.study.virtual.trials import Outcome
+from tests.smaller_sensors import coarse_sensor
+
+SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    table = {
+        "scene": "matt_white.xml",
+        "task": "task.toml",
+        "sensor": str(coarse_sensor("ensenso-n10", 2, tmp_path_factory.mktemp("sensor"))),
+        "measure": {"by": "map"},
+        "score": {"light_path_depth": 1},
+        "views": {"subdivisions": 0, "rolls_deg": [0], "lowest_elevation_deg": 20},
+    }
+    return open_study(SCENES / "study.toml", StudyFile.model_validate(table))
+
+
+def test_to_screen_needs_neither_a_folder_nor_the_measurements(study, monkeypatch):
+    monkeypatch.setattr(session, "measurements_of", lambda *_: pytest.fail("measurements were prepared"))
+    scores, inputs = Session(study).screen()
+    assert scores.sizes["view"] == len(inputs) == len(study.views)
+
+
+def test_measurements_that_were_released_are_made_again_the_same_and_unknowns_stay(study, tmp_path):
+    here, table = Session(study, tmp_path / "a"), StatementTable(trials=2)
+    view, unknowns, first = study.views[0], here.unknowns, here.measurements
+    here.release()
+    stated = here.state(view, table)
+    assert here.unknowns is unknowns and here.measurements is not first
+    other = Session(study, tmp_path / "b").state(view, table)
+    np.testing.assert_equal(statement_document(here, stated), statement_document(here, other))
+    assert (tmp_path / "a/trials/view_0000.jsonl").read_bytes() == (tmp_path / "b/trials/view_0000.jsonl").read_bytes()
+
+
+def test_a_session_that_shares_nothing_has_trials_of_its_own(study, tmp_path):
+    together, apart = Session(study, tmp_path), Session(study, tmp_path, separate_light=True)
+    assert together.digest != apart.digest
+
+
+def test_a_view_that_the_study_lacks_is_one_message(study):
+    assert study.view(2) is study.views[2]
+    with pytest.raises(InputError, match=f"--view.*99.*0 to {len(study.views) - 1}"):
+        study.view(99, "--view")
+
+
+def test_a_statement_ends_when_time_is_over_and_continues_where_it_ended(study, tmp_path):
+    here = Session(study, tmp_path)
+    none = here.state(study.views[0], None, TimeLimit(0.0))
+    assert none.statements[0].trials == 1 and not none.statements[0].budget  # the trial at hand
+    seen = []
+    table = StatementTable(trials=BATCH + 5)
+    limited = Session(replace(study, file=study.file.model_copy(update={"statement": table})), tmp_path)
+    whole = limited.state(study.views[0], None, None, seen.append)
+    assert [one.statements[0].trials for one in seen] == [BATCH]
+    assert whole.statements[0].trials == BATCH + 5
+    assert (tmp_path / "trials/view_0000.jsonl").read_text().count('"day"') == BATCH + 5
+
+
+def test_a_settled_statement_needs_no_more_trials():
+    table, limit = StatementTable(trials=500), TimeLimit(1.0)
+    assert batches(table, True, TimeLimit())[-1] == batches(table, True, limit)[-1] == 500
+    assert batches(table, False, limit) == [500]
+    assert batches(StatementTable(), True, limit)[-1] > batches(StatementTable(), True, TimeLimit())[-1]
+
+
+class NormalErrors:
+    """Virtual measurements whose errors are normal, or have a long tail."""
+
+    source = "render"
+
+    def __init__(self, names, long_tail):
+        self.names, self.long_tail = list(names), long_tail
+
+    def in_order(self, jobs):
+        return list(jobs)
+
+    def run(self, jobs):
+        for job in jobs:
+            rng = np.random.default_rng([job.trial.day, job.trial.capture])
+            tail = 12.0 if self.long_tail and rng.random() < 0.03 else 1.0
+            yield job, Outcome({name: float(rng.normal(0.0, 1.9 * tail)) for name in self.names})
+
+
+@pytest.mark.parametrize("long_tail", [False, True])
+def test_a_statement_goes_on_until_its_uncertainties_are_known(study, tmp_path, monkeypatch, long_tail):
+    """Trials beyond the default are made where tails are long, and no more than the standard error needs."""
+    runner = NormalErrors(study.task.measurements, long_tail)
+    monkeypatch.setattr(Session, "trials_of", lambda session, _: TrialsOfView(runner, session.trials, None))
+    monkeypatch.setattr(state, "_settled", lambda _: False)
+    stated = Session(study, tmp_path).state(study.views[4]).statements
+    known_to = max(one.moved[1] / one.standard_uncertainty for one in stated)
+    default = StatementTable()
+    assert stated[0].trials > default.trials if long_tail else stated[0].trials == default.trials
+    assert known_to <= default.known_to or stated[0].trials == MOST
+
+
+def test_a_run_within_a_limit_says_what_it_lacks_and_goes_on_without_one(study, tmp_path):
+    """A run that is out of time at its start writes a whole folder, which the same command completes."""
+    out_of_time = TimeLimit(1.0, time.monotonic() - 2.0)
+    run_within(study, tmp_path, out_of_time)
+    about = read_run(tmp_path).about
+    assert not about.finished and about.raced_views and any("statement" in one for one in about.lacks)
+    rules = {"race": RaceTable(shortlist=1, trials=4), "statement": StatementTable(trials=2)}
+    keep_finished(tmp_path, False, "run.json")
+    assert not (tmp_path / "run.json").exists()
+    whole = run_study(replace(study, file=study.file.model_copy(update=rules)), tmp_path / "other")
+    about = read_run(tmp_path / "other").about
+    assert whole[0].trials == 2 and about.finished and not about.lacks
+    with pytest.raises(InputError, match="finished run"):
+        keep_finished(tmp_path / "other", False, "run.json")

@@ -1,0 +1,45 @@
+"""Simulated captures of dots with everything known: how often the intervals of a fit hold the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from characterisation.files.errors import InputError
+from mitsim.twin.finish.place import known_place
+from mitsim.twin.sensor import specimen_simulator
+from mitsim.twin.sensor.dots import DotDraws, fit_dots
+from mitsim.twin.sensor.parameters import FLUX
+from tests.twin.sensor.small_unit import capture_of, place, small_sensor, standard_errors, unit
+
+
+def test_intervals_of_dots_hold_the_truth_as_often_as_they_say(monkeypatch):
+    """Three units with a dozen numbers each; the long version, 100 units, is tests/benchmarks/fit_sensor_coverage.py.
+
+    Numbers of one unit share its dots, so that 36 errors count as some 15 independent ones: their mean square is 1
+    within 3 sqrt(2 / 15), and at least four of five lie in their 95 % interval. The units are rendered with 16 rays a
+    pixel, the dots that they are compared with by 4: light without interreflections has no noise.
+    """
+    monkeypatch.setattr(specimen_simulator, "_SAMPLES", 4)
+    errors = np.array([error for seed in (101, 102, 103) for error in standard_errors(seed, draws=2)[1].values()])
+    assert len(errors) >= 30
+    assert np.mean(errors**2) < 1 + 3 * np.sqrt(2 / 15)
+    assert np.mean(np.abs(errors) < 1.96) >= 0.8
+
+
+def test_what_an_image_shows_is_found_whatever_the_file_says():
+    """Power and room are wrong by a factor in the file, and come out near the truth."""
+    truth = unit(7)
+    found = fit_dots(capture_of(truth, 7), small_sensor(), place(), [FLUX], "unit", draws=DotDraws(1, 3, 24))
+    values, spreads = found.in_file_units()
+    assert found.parameters[0] is FLUX and spreads[0] > 0
+    # full well, dots and corners are held at the file's, up to a third off: the power's share is what is left
+    share = values[0] / found.sensor.imager.full_well / (truth.projector.flux / truth.imager.full_well)
+    assert 0.5 < share < 2
+
+
+def test_a_sheet_that_is_too_small_is_one_message():
+    capture = capture_of(unit(1), 1)
+    tiny = known_place(place().world_from_sensor, 30.0, 30.0)
+    with pytest.raises(InputError, match=r"unit: specimen: found \d+ patches .* allowed: 8 or more"):
+        fit_dots(capture, small_sensor(), tiny, [FLUX], "unit", draws=DotDraws(patch_px=24))

@@ -1,0 +1,127 @@
+"""mitsim fit sensor from the shell's side: a file that loads, a table, undetermined numbers, and errors as messages."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from characterisation.files.errors import InputError
+from mitsim.capture.folder import write_capture
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.cli.program import app
+from mitsim.scene.load import scene_from_dict
+from mitsim.sensor.preset import load_sensor, presets
+from mitsim.sensor.transforms import look_at
+from mitsim.twin.sensor import run, specimen_simulator
+from mitsim.twin.sensor.input_captures import read_input_captures, repeats
+from mitsim.twin.sensor.write import Entry, moved_paths, with_cameras, with_entries, with_exposure
+
+
+@pytest.mark.parametrize("name", [name for name in presets() if name != "kinect-v2"])
+def test_every_preset_takes_fitted_numbers_and_is_a_sensor_again(name, tmp_path):
+    sensor, path = load_sensor(name), run.sensor_path(name)
+    text = moved_paths(path.read_text(encoding="utf-8"), path.parent, tmp_path)
+    entries = {
+        "projector.flux_w": "0.5",
+        "imager.smoothing_px": "0.4",
+        "imager.prnu": "0.002",
+        "room.irradiance_w_mm2": "1e-6",
+        "room.gradient": "[0.5, -0.2]",
+        "name": '"mine"',
+        "unknowns.calibration.row_mrad": "0.2",
+    }
+    text = with_cameras(text, dict(sensor.rig.cameras), "test")
+    text = with_exposure(text, 1e-3, "as recorded")
+    (tmp_path / "mine.toml").write_text(with_entries(text, {k: Entry(v, "fitted") for k, v in entries.items()}))
+    again = load_sensor(tmp_path / "mine.toml")
+    assert (again.projector.flux, again.imager.smoothing_px, again.imager.prnu) == (0.5, 0.4, 0.002)
+    assert again.room.gradient == (0.5, -0.2) and again.unknowns.calibration.row_mrad == 0.2
+    assert again.name == "mine" and again.exposure.base_s == 1e-3
+    for camera, other in zip(sensor.rig.cameras.values(), again.rig.cameras.values(), strict=True):
+        np.testing.assert_allclose(other.matrix, camera.matrix, rtol=1e-8)
+        np.testing.assert_allclose(other.sensor_from_camera.matrix(), camera.sensor_from_camera.matrix(), atol=1e-6)
+    assert again.imager.full_well == sensor.imager.full_well  # what is not determined is as it was
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """Three captures of one pose with the projector off, and two in the dark, of an N10 of another full well."""
+    folder = tmp_path_factory.mktemp("captures")
+    preset = load_sensor("ensenso-n10")
+    from mitsim.scene import backend
+
+    backend.activate()
+    chip = replace(preset.imager, full_well=15000, read_noise=50.0, dsnu=0.0, prnu=0.0, row_noise=0.0)
+    lit = replace(preset, imager=chip)
+    size = backend.mi.ScalarTransform4f().scale([110, 80, 1])  # 24 patches, just enough for terms over the field
+    sheet = {"type": "rectangle", "to_world": size, "bsdf": {"type": "matt_white"}}
+    scene = scene_from_dict({"sheet": sheet}, preset.wavelength_nm)
+    pose = look_at((0.0, 0.0, 500.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 0.0)
+    simulated = SimulatedSensor(lit)
+    light = simulated.light(scene, pose, rendering=Rendering(samples=4), seed=1)
+    for number in range(3):
+        write_capture(simulated.expose(light, 10 + number), folder / f"on_{number}")
+    none = replace(light, radiance={name: 0 * values for name, values in light.radiance.items()})
+    for number in range(2):
+        dark = simulated.expose(none, 20 + number)
+        dark.settings["dark"] = True
+        write_capture(dark, folder / f"dark_{number}")
+    return folder
+
+
+def test_repeats_are_found_and_the_dark_is_told_by_the_settings(recorded):
+    input_captures = read_input_captures(sorted(recorded.iterdir()), (), (), load_sensor("ensenso-n10"))
+    groups = {(group[0].kind, len(group)) for group in repeats(input_captures)}
+    assert groups == {("dark", 2), ("on", 3)}
+
+
+def test_a_file_of_ones_own_camera(recorded, tmp_path, monkeypatch):
+    # one draw of the dots, of few rays: how well three of them determine the numbers of dots is for test_dots.py
+    monkeypatch.setattr(run, "fit_sensor", partial(run.fit_sensor, draws=1))
+    monkeypatch.setattr(specimen_simulator, "_SAMPLES", 4)
+    output = tmp_path / "my-camera.toml"
+    folders = [str(folder) for folder in sorted(recorded.iterdir())]
+    result = CliRunner().invoke(
+        app, ["fit", "sensor", *folders, "--sensor", "ensenso-n10", "-o", str(output)], catch_exceptions=False
+    )
+    assert result.exit_code == 0
+    mine = load_sensor(output)
+    # repeats of dots and of the dark: well known, in spite of the 8 bits
+    assert mine.imager.full_well == pytest.approx(15000, rel=0.05)
+    assert mine.imager.read_noise == pytest.approx(50, rel=0.05)
+    assert "| imager.full_well_e |" in result.stdout and "not determined, kept" in result.stdout
+    assert "photon transfer of repeats" in output.read_text()
+    assert result.stderr.splitlines()[-1].startswith("verdict: ")
+    preset = run.sensor_path("ensenso-n10").read_text(encoding="utf-8")
+    for kept in re.findall(r"(?m)^\| ([\w.]+) \| [^|]* \| (?!repeats of one pose)[^|]* \|$", result.stdout):
+        line = next((one for one in preset.splitlines() if one.startswith(f"{kept.rpartition('.')[2]} ")), None)
+        assert line is None or line in output.read_text(), kept  # what is not determined is as it was
+    assert mine.name == "my-camera"
+
+
+def test_what_cannot_be_is_one_message(recorded, tmp_path):
+    preset = load_sensor("ensenso-n10")
+    with pytest.raises(InputError, match="CAPTURES: found none"):
+        read_input_captures([], (), (), preset)
+    with pytest.raises(InputError, match="a folder twice"):
+        read_input_captures([recorded / "on_0"], (), [recorded / "on_0"], preset)
+    with pytest.raises(InputError, match=r"technology: found active_stereo"):
+        read_input_captures([recorded / "on_0"], (), (), load_sensor("david-sls-3"))
+    with pytest.raises(InputError, match=r"--output.* a .toml file"):
+        CliRunner().invoke(
+            app, ["fit", "sensor", "x", "--sensor", "ensenso-n10", "-o", "x.json"], catch_exceptions=False
+        )
+
+
+def test_the_old_way_to_fit_a_finish_is_still_there():
+    runner = CliRunner()
+    assert "width alpha of a coupon's specular lobe" in runner.invoke(app, ["fit", "finish", "--help"]).stdout
+    assert "sensor" in runner.invoke(app, ["fit", "--help"]).stdout
+    with pytest.raises(InputError, match="capture"):  # captures without a word before them
+        runner.invoke(app, ["fit", "nowhere/capture_1"], catch_exceptions=False)
