@@ -32,7 +32,11 @@ from mitsim.study.statement_file import InfluenceEntry, StatedMeasurement, State
 _DIGITS = 16
 
 #: the end of a key of the unknowns, and its unit
-_UNITS = {"mrad": "mrad", "mm": "mm", "deg": "°", "kelvin": "K", "nm": "nm", "k": "K", "relative": "relative"}
+_UNITS = {"mrad": "mrad", "mm": "mm", "um": "µm", "deg": "°", "kelvin": "K", "nm": "nm", "relative": "relative"}
+
+#: what follows the number of a key without a unit, and the head of a group whose numbers are shares
+_COUNTS = {"scale": "times all of these", "spread": "relative", "daylight": "of it"}
+_HEADS = {"finish": "finish, shares of its range"}
 
 
 @dataclass(frozen=True)
@@ -163,7 +167,7 @@ def _notes(document: StatementDocument | None) -> list[str]:
     notes = [
         "Error = measured − true; bias = mean error over the virtual measurements, not subtracted; u = standard "
         "uncertainty, standard deviation about the bias; U = half the 95 % interval of the error; k = U / u; N = "
-        "number of virtual measurements. If y is read, the true value lies between y − (upper end) and y − (lower end)."
+        "number of virtual measurements. The interval leaves 2.5 % on either side. If y is read, the true value lies between y − (upper end) and y − (lower end)."
     ]
     by_part = {
         AT_THE_LIMIT: "for a part at the limit of its tolerance",
@@ -212,10 +216,10 @@ def _influences(document: StatementDocument, lay_left_out: bool) -> list[tuple[s
     fixed = [one for one in document.influences if not one.included and one.simulated]
     left_out = [one for one in document.influences if not one.included and not one.simulated]
     missing = _names(left_out) + (["direction of machining marks"] if lay_left_out else [])
-    # a map has its own finish and light
-    drawn = {
-        k: v for k, v in document.unknowns.items() if document.measured_by != "map" or k not in ("finish", "light")
-    }
+    # a map has its own finish, light and decoder
+    idle = {"finish", "light", "decoder", "unit"} if document.measured_by == "map" else set[str]()
+    idle |= set() if any("spray" in name for name in _names(varied)) else {"coat"}
+    drawn = {group: table for group, table in document.unknowns.items() if group not in idle}
     out = [("Varied", ", ".join(_names(varied))), ("with sizes of", unknowns_in_words(drawn))]
     out += [("Fixed", ", ".join(_names(fixed)))] if fixed else []
     return [*out, ("Left out", ", ".join(missing))]
@@ -226,22 +230,37 @@ def _names(influences: Sequence[InfluenceEntry]) -> list[str]:
 
 
 def unknowns_in_words(unknowns: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the sizes that the virtual measurements drew from: ``pose: placement 1 mm, ...; form: plane 0.02 mm``."""
-    groups = {name: list(_sizes(table)) for name, table in unknowns.items()}
-    return "; ".join(f"{name}: {', '.join(sizes)}" for name, sizes in groups.items() if sizes)
+    """Return the sizes that the virtual measurements drew from: ``pose: placement 1 mm, ...; form: plane 0.02 mm``.
+
+    One standard deviation each, or a range; a group without a size is left out.
+    """
+    groups = {name: list(_sizes(table)) for name, table in unknowns.items() if name != "decoder"}
+    if not unknowns.get("decoder", {}).get("known", True):
+        groups["decoder"] = ["drawn from the ranges in statement.json"]
+    return "; ".join(f"{_HEADS.get(name, name)}: {', '.join(sizes)}" for name, sizes in groups.items() if sizes)
 
 
 def _sizes(table: Mapping[str, Any]) -> Iterator[str]:
     for key, value in table.items():
         if isinstance(value, Mapping):
             yield from (f"{name} {size:g} mm" for name, size in value.items() if isinstance(size, int | float) and size)
-        elif isinstance(value, int | float) and not isinstance(value, bool) and value:
-            name, _, end = key.rpartition("_")
-            unit = _UNITS.get(end, "")
-            if name.endswith("_per"):
-                name, unit = name.removesuffix("_per"), f"per {unit}"
-            label = (name if unit else key).replace("_", " ").replace("told", "assumed pose")
-            yield f"{label} {value:g}" + ("°" if unit == "°" else f" {unit}" if unit else "")
+        elif isinstance(value, str) and key != "covariance":
+            yield f"{key} {value}"
+        elif isinstance(value, int | float) and not isinstance(value, bool) and value and (key, value) != ("scale", 1):
+            yield _size(key, f"{value:g}")
+        elif isinstance(value, list | tuple) and len(value) == 2 and value[1]:
+            yield _size(key, f"{value[0]:g} to {value[1]:g}")
+
+
+def _size(key: str, number: str) -> str:
+    """Return a key of the unknowns as its name, number and unit."""
+    name, _, end = key.rpartition("_")
+    unit = _UNITS.get(end, "")
+    if name.endswith("_per"):
+        name, unit = name.removesuffix("_per"), f"per {unit}"
+    label = (name if unit else key).replace("_", " ").replace("told", "assumed pose")
+    unit = unit or _COUNTS.get(key, "")
+    return f"{label} {number}" + ("°" if unit == "°" else f" {unit}" if unit else "")
 
 
 def _rules(rules: Iterable[str]) -> list[tuple[str, str]]:

@@ -102,7 +102,12 @@ def _administrative(to: Element, found: RunResults, declared: Declaration, issue
     _add(core, "mandatoryLangCodeISO639_1", "en")
     named = "/".join((declared.number, issuer.laboratory, issuer.customer, issuer.serial))
     _add(core, "uniqueIdentifier", str(uuid.uuid5(uuid.NAMESPACE_URL, f"{DCC}/{named}")))
-    _identified(_add(core, "identifications"), "calibrationLaboratory", declared.number, "SHA-256 of statement.json")
+    _identified(
+        _add(core, "identifications"),
+        "calibrationLaboratory",
+        declared.number,
+        "first digits of the SHA-256 of statement.json",
+    )
     for name in ("beginPerformanceDate", "endPerformanceDate"):
         _add(core, name, declared.date)
     _add(core, "performanceLocation", "other")
