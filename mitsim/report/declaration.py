@@ -167,7 +167,8 @@ def _notes(document: StatementDocument | None) -> list[str]:
     notes = [
         "Error = measured − true; bias = mean error over the virtual measurements, not subtracted; u = standard "
         "uncertainty, standard deviation about the bias; U = half the 95 % interval of the error; k = U / u; N = "
-        "number of virtual measurements. The interval leaves 2.5 % on either side. If y is read, the true value lies between y − (upper end) and y − (lower end)."
+        "number of virtual measurements. The interval leaves 2.5 % on either side. If y is read, the true value lies "
+        "between y − (upper end) and y − (lower end)."
     ]
     by_part = {
         AT_THE_LIMIT: "for a part at the limit of its tolerance",
@@ -216,8 +217,8 @@ def _influences(document: StatementDocument, lay_left_out: bool) -> list[tuple[s
     fixed = [one for one in document.influences if not one.included and one.simulated]
     left_out = [one for one in document.influences if not one.included and not one.simulated]
     missing = _names(left_out) + (["direction of machining marks"] if lay_left_out else [])
-    # a map has its own finish, light and decoder
-    idle = {"finish", "light", "decoder", "unit"} if document.measured_by == "map" else set[str]()
+    # a map has its own finish, light and decoder; another unit has no size
+    idle = {"unit", "finish", "light", "decoder"} if document.measured_by == "map" else {"unit"}
     idle |= set() if any("spray" in name for name in _names(varied)) else {"coat"}
     drawn = {group: table for group, table in document.unknowns.items() if group not in idle}
     out = [("Varied", ", ".join(_names(varied))), ("with sizes of", unknowns_in_words(drawn))]
