@@ -9,20 +9,20 @@ uncertainty u, 95 % interval, number of trials; and U and k = U / u of JCGM 100:
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from scipy.spatial.transform import Rotation
 
 from characterisation.statements.statement import AT_THE_LIMIT, FAR_FROM_NOMINAL
-from mitsim.report.first_rows import ResultRow
+from mitsim.report.first_rows import ResultRow, bias_words
 from mitsim.report.first_screen import FirstScreen, of_choice, of_run
 from mitsim.report.pose_texts import angles_in_words, origin_text, pose_of_view
 from mitsim.report.statement_section import exposed_in_words, interval_words
-from mitsim.running.numbers import NONE, SPACE, count, listed, quantity, rounded, signed, two_digits
+from mitsim.report.unknowns_words import unknowns_in_words
+from mitsim.running.numbers import NONE, count, listed, quantity, rounded, signed, two_digits
 from mitsim.study.choice_document import CHOICE, ChoiceDocument, PoseEntry, SensorEntry, read_choice
 from mitsim.study.run_folder import Run, read_run
 from mitsim.study.scene_geometry import SceneGeometry
@@ -30,13 +30,6 @@ from mitsim.study.statement_file import InfluenceEntry, StatedMeasurement, State
 
 #: hexadecimal digits of a digest that are printed
 _DIGITS = 16
-
-#: the end of a key of the unknowns, and its unit
-_UNITS = {"mrad": "mrad", "mm": "mm", "um": "µm", "deg": "°", "kelvin": "K", "nm": "nm", "relative": "relative"}
-
-#: what follows the number of a key without a unit, and the head of a group whose numbers are shares
-_COUNTS = {"scale": "times all of these", "spread": "relative", "daylight": "of it"}
-_HEADS = {"finish": "finish, shares of its range"}
 
 
 @dataclass(frozen=True)
@@ -143,21 +136,12 @@ def _row(result: ResultRow, one: StatedMeasurement | None) -> DeclaredRow:
     factor = one.coverage_factor
     return DeclaredRow(
         result,
-        _bias(one),
+        bias_words(one.bias, one.standard_uncertainty, one.unit),
         quantity(one.expanded_uncertainty, one.unit),
         NONE if factor is None else rounded(factor, 2),
         interval_words(one.interval, one.unit),
         count(one.trials),
     )
-
-
-def _bias(one: StatedMeasurement) -> str:
-    """Write the bias with as many decimal places as its standard uncertainty u has (JCGM 100:2008, 7.2.6)."""
-    if one.bias is None or not one.standard_uncertainty:
-        return quantity(one.bias, one.unit)
-    places = len(two_digits(one.standard_uncertainty).partition(".")[2])
-    sign = "+" if round(one.bias, places) > 0 else ""
-    return f"{sign}{rounded(one.bias, places)}" + ("°" if one.unit == "deg" else f"{SPACE}{one.unit}")
 
 
 def _notes(document: StatementDocument | None) -> list[str]:
@@ -228,40 +212,6 @@ def _influences(document: StatementDocument, lay_left_out: bool) -> list[tuple[s
 
 def _names(influences: Sequence[InfluenceEntry]) -> list[str]:
     return [one.name for one in influences]
-
-
-def unknowns_in_words(unknowns: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the sizes that the virtual measurements drew from: ``pose: placement 1 mm, ...; form: plane 0.02 mm``.
-
-    One standard deviation each, or a range; a group without a size is left out.
-    """
-    groups = {name: list(_sizes(table)) for name, table in unknowns.items() if name != "decoder"}
-    if not unknowns.get("decoder", {}).get("known", True):
-        groups["decoder"] = ["drawn from the ranges in statement.json"]
-    return "; ".join(f"{_HEADS.get(name, name)}: {', '.join(sizes)}" for name, sizes in groups.items() if sizes)
-
-
-def _sizes(table: Mapping[str, Any]) -> Iterator[str]:
-    for key, value in table.items():
-        if isinstance(value, Mapping):
-            yield from (f"{name} {size:g} mm" for name, size in value.items() if isinstance(size, int | float) and size)
-        elif isinstance(value, str) and key != "covariance":
-            yield f"{key} {value}"
-        elif isinstance(value, int | float) and not isinstance(value, bool) and value and (key, value) != ("scale", 1):
-            yield _size(key, f"{value:g}")
-        elif isinstance(value, list | tuple) and len(value) == 2 and value[1]:
-            yield _size(key, f"{value[0]:g} to {value[1]:g}")
-
-
-def _size(key: str, number: str) -> str:
-    """Return a key of the unknowns as its name, number and unit."""
-    name, _, end = key.rpartition("_")
-    unit = _UNITS.get(end, "")
-    if name.endswith("_per"):
-        name, unit = name.removesuffix("_per"), f"per {unit}"
-    label = (name if unit else key).replace("_", " ").replace("told", "assumed pose")
-    unit = unit or _COUNTS.get(key, "")
-    return f"{label} {number}" + ("°" if unit == "°" else f" {unit}" if unit else "")
 
 
 def _rules(rules: Iterable[str]) -> list[tuple[str, str]]:

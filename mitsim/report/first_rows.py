@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from markupsafe import Markup, escape
 
 from mitsim.report.placement_figure import VERDICTS
-from mitsim.running.numbers import MINUS, NONE, count, listed, percent, quantity, unit_symbol
+from mitsim.running.numbers import MINUS, NONE, count, listed, percent, quantity, rounded, two_digits, unit_symbol
 
 #: beginning of the names of rules whose demand is the share of the tolerance over the largest share that fits
 _BY_SHARE = ("ISO 14253-1", "simple acceptance")
@@ -110,7 +110,7 @@ class RowValues:
             about=self.about,
             nominal=exact(self.nominal, self.unit),
             tolerance=tolerance_words(self.tolerance, self.nominal, self.unit),
-            bias=_signed(self.bias, self.unit),
+            bias=bias_words(self.bias, self.uncertainty, self.unit),
             uncertainty=quantity(self.uncertainty, self.unit),
             needed=quantity(self.needed, self.unit),
             share=NONE if self.share is None else _share(self.share),
@@ -192,8 +192,15 @@ def _suffix(unit: str) -> str:
     return unit_symbol(unit) if unit == "deg" else f"\N{NO-BREAK SPACE}{unit}"
 
 
-def _signed(value: float | None, unit: str) -> str:
-    """Write a value with its sign: ``+0.31 mm``, ``−0.02°``; a dash for None."""
-    if value is None:
+def bias_words(bias: float | None, uncertainty: float | None, unit: str) -> str:
+    """Write a bias with its sign, and as many decimal places as its standard uncertainty has (JCGM 100:2008, 7.2.6).
+
+    Without an uncertainty two digits: ``+0.31 mm``, ``−0.02°``; a dash for None.
+    """
+    if bias is None:
         return NONE
-    return ("+" if value > 0 else MINUS if value < 0 else "") + quantity(abs(value), unit)
+    if not uncertainty or not math.isfinite(uncertainty):
+        return ("+" if bias > 0 else MINUS if bias < 0 else "") + quantity(abs(bias), unit)
+    places = len(two_digits(uncertainty).partition(".")[2])
+    sign = "+" if round(bias, places) > 0 else ""
+    return f"{sign}{rounded(bias, places)}{_suffix(unit)}"

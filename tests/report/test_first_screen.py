@@ -57,10 +57,18 @@ def test_a_share_is_given_with_its_limit_and_its_interval():
 
 
 @pytest.mark.parametrize(
-    ("bias", "written"), [(0.0312, "+0.031 mm"), (-0.5, "\N{MINUS SIGN}0.50 mm"), (0.0, "0 mm"), (None, "–")]
+    ("bias", "uncertainty", "written"),
+    [
+        (0.0312, 0.018, "+0.031 mm"),
+        (0.014, 0.112, "+0.01 mm"),
+        (-0.00018, 0.086, "0.000 mm"),
+        (-0.5, None, "\N{MINUS SIGN}0.50 mm"),
+        (None, 0.1, "–"),
+    ],
 )
-def test_the_bias_has_a_sign(bias, written):
-    assert values(bias=bias).texts().bias.replace("\N{NO-BREAK SPACE}", " ") == written
+def test_a_bias_has_a_sign_and_the_places_of_its_uncertainty(bias, uncertainty, written):
+    row = values(bias=bias, uncertainty=uncertainty).texts()
+    assert row.bias.replace("\N{NO-BREAK SPACE}", " ") == written
 
 
 def test_a_rule_that_limits_a_risk_has_no_largest_share():
