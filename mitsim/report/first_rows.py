@@ -71,7 +71,8 @@ class RowValues:
 
     ``tolerance`` as in the task, or half the interval that conforms. ``share`` of the tolerance that the uncertainty
     takes; ``demand`` of the ``rule`` with its interval; ``accepted`` lowest and highest reading. ``limited`` is what
-    limits the view, with the expected ``points`` on that feature; ``source`` the largest line of the budget.
+    limits the view, with the expected ``points`` on that feature; ``source`` the largest line of the budget. Values by
+    screening alone are not ``stated``: they accept no reading, and reject none.
     """
 
     name: str
@@ -93,6 +94,7 @@ class RowValues:
     limited: str = ""
     points: float | None = None
     source: str = ""
+    stated: bool = True
 
     @property
     def share_limit(self) -> float | None:
@@ -116,7 +118,7 @@ class RowValues:
             share=NONE if self.share is None else _share(self.share),
             share_interval="" if limit is None else _interval(self.demand_interval, limit),
             share_limit="" if limit is None else percent(limit),
-            accepted=accepted_words(self.accepted, self.unit, size) if self.rule else NONE,
+            accepted=accepted_words(self.accepted, self.unit, size) if self.rule and self.stated else NONE,
             false_accept=percent(self.false_accept),
             without_value=percent(self.without_value),
             limited=self.limited,

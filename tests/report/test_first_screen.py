@@ -10,7 +10,7 @@ import pytest
 from characterisation.statements.verdict_words import Judged
 from characterisation.tasks.definitions import DEFINITIONS
 from mitsim.report.first_rows import RowValues, measured_words, tolerance_words
-from mitsim.report.first_screen import of_choice, of_run, tone_of
+from mitsim.report.first_screen import of_choice, of_run, sensor_rows, tone_of
 from mitsim.report.page import write_report
 from mitsim.running.numbers import with_degree_signs
 from mitsim.study.choice_document import read_choice
@@ -177,3 +177,19 @@ def test_a_run_without_a_statement_shows_the_leading_view_so_far(run_folder, tmp
     (folder / "run.json").write_text(json.dumps(about | {"leaders": {}}))
     with without_pictures():
         assert "No view can make the measurements" in write_report(folder).read_text()
+
+
+def test_a_sensor_that_was_not_measured_and_may_fit_more_is_named(tmp_path):
+    folder = write_choice(tmp_path / "choice")
+    document = json.loads((folder / "choice.json").read_text(encoding="utf-8"))
+    best, open_one = document["sensors"] = document["sensors"][1:3]
+    assert best["fits"] == 1
+    open_one["why"] = "time was over"
+    for cell in open_one["measurements"].values():
+        cell |= {"demand": 0.5, "accepted": None}
+    (folder / "choice.json").write_text(json.dumps(document), encoding="utf-8")
+    choice = read_choice(folder)
+    (words,) = of_choice(choice, None).doubts
+    assert words.startswith("sensor-c was not measured (time was over), but is expected to fit 3 of 3 tolerances")
+    accepted = [{row.accepted for row in sensor_rows(choice, one)} for one in choice.sensors]
+    assert accepted[1] == {"–"} and "–" not in accepted[0]
