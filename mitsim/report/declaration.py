@@ -9,20 +9,20 @@ uncertainty u, 95 % interval, number of trials; and U and k = U / u of JCGM 100:
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from scipy.spatial.transform import Rotation
 
 from characterisation.statements.statement import AT_THE_LIMIT, FAR_FROM_NOMINAL
-from mitsim.report.first_rows import ResultRow
+from mitsim.report.first_rows import ResultRow, bias_words
 from mitsim.report.first_screen import FirstScreen, of_choice, of_run
 from mitsim.report.pose_texts import angles_in_words, origin_text, pose_of_view
 from mitsim.report.statement_section import exposed_in_words, interval_words
-from mitsim.running.numbers import NONE, SPACE, count, listed, quantity, rounded, signed, two_digits
+from mitsim.report.unknowns_words import unknowns_in_words
+from mitsim.running.numbers import NONE, count, listed, quantity, rounded, signed, two_digits
 from mitsim.study.choice_document import CHOICE, ChoiceDocument, PoseEntry, SensorEntry, read_choice
 from mitsim.study.run_folder import Run, read_run
 from mitsim.study.scene_geometry import SceneGeometry
@@ -30,9 +30,6 @@ from mitsim.study.statement_file import InfluenceEntry, StatedMeasurement, State
 
 #: hexadecimal digits of a digest that are printed
 _DIGITS = 16
-
-#: the end of a key of the unknowns, and its unit
-_UNITS = {"mrad": "mrad", "mm": "mm", "deg": "°", "kelvin": "K", "nm": "nm", "k": "K", "relative": "relative"}
 
 
 @dataclass(frozen=True)
@@ -139,21 +136,12 @@ def _row(result: ResultRow, one: StatedMeasurement | None) -> DeclaredRow:
     factor = one.coverage_factor
     return DeclaredRow(
         result,
-        _bias(one),
+        bias_words(one.bias, one.standard_uncertainty, one.unit),
         quantity(one.expanded_uncertainty, one.unit),
         NONE if factor is None else rounded(factor, 2),
         interval_words(one.interval, one.unit),
         count(one.trials),
     )
-
-
-def _bias(one: StatedMeasurement) -> str:
-    """Write the bias with as many decimal places as its standard uncertainty u has (JCGM 100:2008, 7.2.6)."""
-    if one.bias is None or not one.standard_uncertainty:
-        return quantity(one.bias, one.unit)
-    places = len(two_digits(one.standard_uncertainty).partition(".")[2])
-    sign = "+" if round(one.bias, places) > 0 else ""
-    return f"{sign}{rounded(one.bias, places)}" + ("°" if one.unit == "deg" else f"{SPACE}{one.unit}")
 
 
 def _notes(document: StatementDocument | None) -> list[str]:
@@ -163,7 +151,8 @@ def _notes(document: StatementDocument | None) -> list[str]:
     notes = [
         "Error = measured − true; bias = mean error over the virtual measurements, not subtracted; u = standard "
         "uncertainty, standard deviation about the bias; U = half the 95 % interval of the error; k = U / u; N = "
-        "number of virtual measurements. If y is read, the true value lies between y − (upper end) and y − (lower end)."
+        "number of virtual measurements. The interval leaves 2.5 % on either side. If y is read, the true value lies "
+        "between y − (upper end) and y − (lower end)."
     ]
     by_part = {
         AT_THE_LIMIT: "for a part at the limit of its tolerance",
@@ -212,10 +201,10 @@ def _influences(document: StatementDocument, lay_left_out: bool) -> list[tuple[s
     fixed = [one for one in document.influences if not one.included and one.simulated]
     left_out = [one for one in document.influences if not one.included and not one.simulated]
     missing = _names(left_out) + (["direction of machining marks"] if lay_left_out else [])
-    # a map has its own finish and light
-    drawn = {
-        k: v for k, v in document.unknowns.items() if document.measured_by != "map" or k not in ("finish", "light")
-    }
+    # a map has its own finish, light and decoder; another unit has no size
+    idle = {"unit", "finish", "light", "decoder"} if document.measured_by == "map" else {"unit"}
+    idle |= set() if any("spray" in name for name in _names(varied)) else {"coat"}
+    drawn = {group: table for group, table in document.unknowns.items() if group not in idle}
     out = [("Varied", ", ".join(_names(varied))), ("with sizes of", unknowns_in_words(drawn))]
     out += [("Fixed", ", ".join(_names(fixed)))] if fixed else []
     return [*out, ("Left out", ", ".join(missing))]
@@ -223,25 +212,6 @@ def _influences(document: StatementDocument, lay_left_out: bool) -> list[tuple[s
 
 def _names(influences: Sequence[InfluenceEntry]) -> list[str]:
     return [one.name for one in influences]
-
-
-def unknowns_in_words(unknowns: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the sizes that the virtual measurements drew from: ``pose: placement 1 mm, ...; form: plane 0.02 mm``."""
-    groups = {name: list(_sizes(table)) for name, table in unknowns.items()}
-    return "; ".join(f"{name}: {', '.join(sizes)}" for name, sizes in groups.items() if sizes)
-
-
-def _sizes(table: Mapping[str, Any]) -> Iterator[str]:
-    for key, value in table.items():
-        if isinstance(value, Mapping):
-            yield from (f"{name} {size:g} mm" for name, size in value.items() if isinstance(size, int | float) and size)
-        elif isinstance(value, int | float) and not isinstance(value, bool) and value:
-            name, _, end = key.rpartition("_")
-            unit = _UNITS.get(end, "")
-            if name.endswith("_per"):
-                name, unit = name.removesuffix("_per"), f"per {unit}"
-            label = (name if unit else key).replace("_", " ").replace("told", "assumed pose")
-            yield f"{label} {value:g}" + ("°" if unit == "°" else f" {unit}" if unit else "")
 
 
 def _rules(rules: Iterable[str]) -> list[tuple[str, str]]:

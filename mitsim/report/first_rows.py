@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from markupsafe import Markup, escape
 
 from mitsim.report.placement_figure import VERDICTS
-from mitsim.running.numbers import MINUS, NONE, count, listed, percent, quantity, unit_symbol
+from mitsim.running.numbers import MINUS, NONE, count, listed, percent, quantity, rounded, two_digits, unit_symbol
 
 #: beginning of the names of rules whose demand is the share of the tolerance over the largest share that fits
 _BY_SHARE = ("ISO 14253-1", "simple acceptance")
@@ -71,7 +71,8 @@ class RowValues:
 
     ``tolerance`` as in the task, or half the interval that conforms. ``share`` of the tolerance that the uncertainty
     takes; ``demand`` of the ``rule`` with its interval; ``accepted`` lowest and highest reading. ``limited`` is what
-    limits the view, with the expected ``points`` on that feature; ``source`` the largest line of the budget.
+    limits the view, with the expected ``points`` on that feature; ``source`` the largest line of the budget. Values by
+    screening alone are not ``stated``: they accept no reading, and reject none.
     """
 
     name: str
@@ -93,6 +94,7 @@ class RowValues:
     limited: str = ""
     points: float | None = None
     source: str = ""
+    stated: bool = True
 
     @property
     def share_limit(self) -> float | None:
@@ -110,13 +112,13 @@ class RowValues:
             about=self.about,
             nominal=exact(self.nominal, self.unit),
             tolerance=tolerance_words(self.tolerance, self.nominal, self.unit),
-            bias=_signed(self.bias, self.unit),
+            bias=bias_words(self.bias, self.uncertainty, self.unit),
             uncertainty=quantity(self.uncertainty, self.unit),
             needed=quantity(self.needed, self.unit),
             share=NONE if self.share is None else _share(self.share),
             share_interval="" if limit is None else _interval(self.demand_interval, limit),
             share_limit="" if limit is None else percent(limit),
-            accepted=accepted_words(self.accepted, self.unit, size) if self.rule else NONE,
+            accepted=accepted_words(self.accepted, self.unit, size) if self.rule and self.stated else NONE,
             false_accept=percent(self.false_accept),
             without_value=percent(self.without_value),
             limited=self.limited,
@@ -192,8 +194,15 @@ def _suffix(unit: str) -> str:
     return unit_symbol(unit) if unit == "deg" else f"\N{NO-BREAK SPACE}{unit}"
 
 
-def _signed(value: float | None, unit: str) -> str:
-    """Write a value with its sign: ``+0.31 mm``, ``−0.02°``; a dash for None."""
-    if value is None:
+def bias_words(bias: float | None, uncertainty: float | None, unit: str) -> str:
+    """Write a bias with its sign, and as many decimal places as its standard uncertainty has (JCGM 100:2008, 7.2.6).
+
+    Without an uncertainty two digits: ``+0.31 mm``, ``−0.02°``; a dash for None.
+    """
+    if bias is None:
         return NONE
-    return ("+" if value > 0 else MINUS if value < 0 else "") + quantity(abs(value), unit)
+    if not uncertainty or not math.isfinite(uncertainty):
+        return ("+" if bias > 0 else MINUS if bias < 0 else "") + quantity(abs(bias), unit)
+    places = len(two_digits(uncertainty).partition(".")[2])
+    sign = "+" if round(bias, places) > 0 else ""
+    return f"{sign}{rounded(bias, places)}{_suffix(unit)}"

@@ -192,6 +192,20 @@ def of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None) -> FirstSc
         poses,
         verdicts,
         max((cell.trials for cell in best.measurements.values()), default=0),
+        doubts=_not_measured(choice, best),
+    )
+
+
+def _not_measured(choice: ChoiceDocument, best: SensorEntry) -> tuple[str, ...]:
+    """Return a sentence on each sensor that may fit more tolerances than the best, and was not measured."""
+    tolerances = sum(one.tolerance is not None for one in choice.measurements.values())
+    if best.status != "stated":
+        return ()
+    return tuple(
+        f"{one.name} was not measured ({one.why}), but is expected to fit {one.expected_fits} of {tolerances} "
+        "tolerances: allow more minutes"
+        for one in choice.sensors
+        if one.status == "screened" and one.expected_fits > best.fits
     )
 
 
@@ -210,6 +224,7 @@ def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[ResultRow]:
             **_same_names(cell, _MEASURED)
             | {"without_value": cell.without_value if cell.trials or cell.by != "none" else math.nan},
             **_same_names(cell, _DECIDED),
+            stated=one.status == "stated",
         ).texts()
         for name, cell in one.measurements.items()
         for asked in (choice.measurements[name],)

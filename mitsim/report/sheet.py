@@ -133,7 +133,7 @@ def _head(page: Page, declaration: Declaration) -> None:
     page.write(declaration.title, 15, weight="bold")
     page.place -= 0.03
     page.write(_result(declaration.first.words), _RESULT, _COLOURS[declaration.first.tone], "bold")
-    page.place -= 0.04
+    page.place -= 0.1
 
 
 def _result(words: str) -> str:

@@ -12,7 +12,8 @@ from typing import Any
 from characterisation.plots.statements import GROUPS
 from characterisation.statements.losses import Loss, lost_features
 from characterisation.statements.statement import AT_THE_LIMIT, FAR_FROM_NOMINAL
-from mitsim.running.numbers import NONE, listed, percent, quantity, rounded
+from mitsim.report.unknowns_words import unknowns_in_words
+from mitsim.running.numbers import NONE, SPACE, listed, percent, quantity, rounded
 from mitsim.study.statement_file import BudgetEntry, ExposureEntry, StatedMeasurement, StatementDocument
 
 
@@ -28,7 +29,7 @@ def statement_section(document: StatementDocument) -> dict[str, Any]:
         "view": document.view,
         "rendered": document.measured_by == "render",
         "trials": max((one.trials for one in document.measurements.values()), default=0),
-        "calibration": document.calibration,
+        "calibration": _calibration(document),
         "exposure": exposed_in_words(document.exposure),
         "rows": rows,
         "tolerances": any(one.tolerance is not None for one in document.measurements.values()),
@@ -53,6 +54,13 @@ def statement_section(document: StatementDocument) -> dict[str, Any]:
         "far": [name for name, one in document.measurements.items() if one.errors_of == FAR_FROM_NOMINAL],
         "unsettled": [name for name, one in document.measurements.items() if not one.settled],
     }
+
+
+def _calibration(document: StatementDocument) -> str:
+    """Return the calibration and its drift in words; the file has the drift by the keys of the unknowns."""
+    calibration, _, _ = document.calibration.partition("; drift:")
+    sizes = unknowns_in_words({"drift": document.unknowns.get("calibration", {})})
+    return "; ".join(filter(None, [calibration, sizes]))
 
 
 def exposed_in_words(one: ExposureEntry | None) -> str:
@@ -117,7 +125,7 @@ def _budget_row(name: str, one: StatedMeasurement, groups: list[str]) -> dict[st
 def _share_interval(line: BudgetEntry) -> str:
     """Return the 95 % interval of a line's share in words."""
     low, high = line.share_interval
-    return f"{100 * low:.0f} to {100 * high:.0f} %"
+    return f"{100 * low:.0f} to {100 * high:.0f}{SPACE}%"
 
 
 def interval_words(ends: tuple[float | None, float | None], unit: str) -> str:

@@ -13,6 +13,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from characterisation.files.atomic_io import write_text
+from mitsim.report.card_tables import with_labels
 from mitsim.report.first_rows import breakable
 
 _FOLDER = Path(__file__).parent
@@ -20,7 +21,7 @@ _FOLDER = Path(__file__).parent
 
 def rendered(template: str, content: Mapping[str, Any]) -> str:
     """Return a page; the template escapes all names that a user chose, and an undefined name is an error."""
-    return _environment().get_template(template).render(content)
+    return with_labels(_environment().get_template(template).render(content))
 
 
 def write_page(path: Path, template: str, content: Mapping[str, Any]) -> Path:

@@ -34,6 +34,21 @@ function percent(share) {
 const cell = (text, className) => element('td', { class: className }, text);
 const rowHead = (...content) => element('th', { scope: 'row' }, ...content);
 
+// Replace the rows of a table and label their cells by its heads, as mitsim.report.card_tables does for the page's own.
+function replaceRows(body, rows) {
+  const heads = [...body.closest('table').tHead.rows[0].cells].map((one) => {
+    const copy = one.cloneNode(true);
+    copy.querySelectorAll('br, small').forEach((part) => part.before(part.localName === 'br' ? ' ' : ', '));
+    return copy.textContent;
+  });
+  body.replaceChildren(...rows);
+  for (const row of body.rows) {
+    [...row.cells].forEach((one, k) => {
+      if (one.localName === 'td' && one.colSpan === 1) one.dataset.label = heads[k];
+    });
+  }
+}
+
 function viewButton(number, text, label) {
   return element('button', { type: 'button', 'data-view': number, 'aria-label': label }, text);
 }
@@ -127,7 +142,7 @@ class Panel {
 
   features(measurement, i) {
     const least = this.data.minimum_points;
-    this.places.features.replaceChildren(...this.data.features.map((feature, k) => {
+    replaceRows(this.places.features, this.data.features.map((feature, k) => {
       const needed = measurement.features.includes(k), points = feature.points[i];
       const found = points >= least ? 'yes' : points > 0 ? `no, fewer than ${least}` : 'no';
       return element('tr', { class: needed ? '' : 'quiet' },
@@ -187,7 +202,7 @@ class Panel {
     ];
     const worst = Math.max(...Object.values(factors).filter(Number.isFinite).map((f) => Math.abs(Math.log(f))), Math.log(1.5));
     let passed = true;
-    this.places.path.replaceChildren(...steps.map(([key, name, here, there, factor, change]) => {
+    replaceRows(this.places.path, steps.map(([key, name, here, there, factor, change]) => {
       const stops = key !== '' && key === stop;
       const row = element('tr', { class: [stops ? 'vs-stop' : '', passed ? '' : 'quiet', ['whole', 'rank'].includes(key) ? 'strong' : ''].join(' ').trim() },
         rowHead(name), cell(here), cell(there, 'quiet'), this.factor(factor, worst),
@@ -234,6 +249,6 @@ class Panel {
         cell(degrees(views.elevation_deg[i])), cell(degrees(views.roll_deg[i])), cell(rounded(views.standoff_mm[i])));
     });
     const none = element('tr', {}, element('td', { class: 'left', colspan: 10 }, 'no view can make this measurement'));
-    this.places.best.replaceChildren(...(rows.length ? rows : [none]));
+    replaceRows(this.places.best, rows.length ? rows : [none]);
   }
 }

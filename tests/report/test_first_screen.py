@@ -10,7 +10,7 @@ import pytest
 from characterisation.statements.verdict_words import Judged
 from characterisation.tasks.definitions import DEFINITIONS
 from mitsim.report.first_rows import RowValues, measured_words, tolerance_words
-from mitsim.report.first_screen import of_choice, of_run, tone_of
+from mitsim.report.first_screen import of_choice, of_run, sensor_rows, tone_of
 from mitsim.report.page import write_report
 from mitsim.running.numbers import with_degree_signs
 from mitsim.study.choice_document import read_choice
@@ -56,10 +56,18 @@ def test_a_share_is_given_with_its_limit_and_its_interval():
 
 
 @pytest.mark.parametrize(
-    ("bias", "written"), [(0.0312, "+0.031 mm"), (-0.5, "\N{MINUS SIGN}0.50 mm"), (0.0, "0 mm"), (None, "–")]
+    ("bias", "uncertainty", "written"),
+    [
+        (0.0312, 0.018, "+0.031 mm"),
+        (0.014, 0.112, "+0.01 mm"),
+        (-0.00018, 0.086, "0.000 mm"),
+        (-0.5, None, "\N{MINUS SIGN}0.50 mm"),
+        (None, 0.1, "–"),
+    ],
 )
-def test_the_bias_has_a_sign(bias, written):
-    assert values(bias=bias).texts().bias.replace("\N{NO-BREAK SPACE}", " ") == written
+def test_a_bias_has_a_sign_and_the_places_of_its_uncertainty(bias, uncertainty, written):
+    row = values(bias=bias, uncertainty=uncertainty).texts()
+    assert row.bias.replace("\N{NO-BREAK SPACE}", " ") == written
 
 
 def test_a_rule_that_limits_a_risk_has_no_largest_share():
@@ -168,3 +176,19 @@ def test_a_run_without_a_statement_shows_the_leading_view_so_far(run_folder, tmp
     (folder / "run.json").write_text(json.dumps(about | {"leaders": {}}))
     with without_pictures():
         assert "No view can make the measurements" in write_report(folder).read_text()
+
+
+def test_a_sensor_that_was_not_measured_and_may_fit_more_is_named(tmp_path):
+    folder = write_choice(tmp_path / "choice")
+    document = json.loads((folder / "choice.json").read_text(encoding="utf-8"))
+    best, open_one = document["sensors"] = document["sensors"][1:3]
+    assert best["fits"] == 1
+    open_one["why"] = "time was over"
+    for cell in open_one["measurements"].values():
+        cell |= {"demand": 0.5, "accepted": None}
+    (folder / "choice.json").write_text(json.dumps(document), encoding="utf-8")
+    choice = read_choice(folder)
+    (words,) = of_choice(choice, None).doubts
+    assert words.startswith("sensor-c was not measured (time was over), but is expected to fit 3 of 3 tolerances")
+    accepted = [{row.accepted for row in sensor_rows(choice, one)} for one in choice.sensors]
+    assert accepted[1] == {"–"} and "–" not in accepted[0]

@@ -13,6 +13,7 @@ from markupsafe import escape
 
 from characterisation.files.atomic_io import write_netcdf
 from characterisation.files.errors import InputError
+from mitsim.report.card_tables import with_labels
 from mitsim.report.page import write_report
 from mitsim.running.numbers import two_digits
 from mitsim.study.run_folder import read_run
@@ -262,3 +263,11 @@ def test_marks_whose_direction_is_left_out_are_named_with_their_faces(tmp_path, 
     text = re.sub(r"\s+", " ", written(folder))
     assert f"on {html.escape(FEATURES[0])}, {html.escape(FEATURES[1])}. Such marks" in text
     assert "does not give their direction" in text
+
+
+def test_cells_of_tables_are_labelled_by_their_columns():
+    head = '<thead><tr><th>Name</th><th scope="col">Bias<small>its <b>u</b></small></th><th>A<br>B</th></tr></thead>'
+    body = '<tr><th>a</th><td class="x">1</td><td>2</td></tr><tr><td colspan="3">none</td></tr>'
+    table = f"<table>{head}{body}</table>"
+    cells = '<td class="x" data-label="Bias, its u">1</td><td data-label="A B">2</td>'
+    assert with_labels(f"<p>a</p>{table}") == f"<p>a</p>{table}".replace('<td class="x">1</td><td>2</td>', cells)

@@ -9,9 +9,10 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from scipy.spatial.transform import Rotation
 
-from mitsim.report.declaration import pose_in_full, read_declaration, unknowns_in_words
+from mitsim.report.declaration import pose_in_full, read_declaration
 from mitsim.report.sheet import sheet_figures, write_sheet
 from mitsim.report.sheet_layout import text_width, wrapped
+from mitsim.report.unknowns_words import unknowns_in_words
 from mitsim.study.choice_document import PoseEntry
 from mitsim.study.scene_geometry import read_scene_geometry
 from mitsim.study.statement_file import read_statement
@@ -123,13 +124,39 @@ def test_a_pose_in_full_gives_the_pose_back(run_folder):
     assert Rotation.from_quat(quaternion).as_matrix() == pytest.approx(turn.as_matrix(), abs=2e-6)
 
 
-def test_sizes_of_unknowns_have_units_and_nothing_else():
+def test_sizes_of_unknowns_have_units_and_meanings():
     table = {
+        "calibration": {"covariance": "rig.nc", "vergence_mrad": 0.24, "scale": 1.0},
         "temperature": {"body_per_kelvin": 2.3e-5, "part_kelvin": 1.0, "expansion_per_kelvin": None},
+        "finish": {"alpha": 1.0, "measured": {}},
         "form": {"features": {"plane": 0.02, "pin": 0.0}},
-        "light": {"room": "office"},
+        "light": {"room": "office", "daylight": 0.2},
+        "unit": {},
+        "decoder": {"known": False, "thresholds": [0.5, 2.0], "methods": ["sgbm", "census"]},
+        "coat": {"thickness_um": [5.0, 20.0], "spread": 0.3},
     }
-    assert unknowns_in_words(table) == "temperature: body 2.3e-05 per K, part 1 K; form: plane 0.02 mm"
+    assert unknowns_in_words(table).split("; ") == [
+        "calibration: vergence 0.24 mrad",
+        "temperature: body 2.3e-05 per K, part 1 K",
+        "finish, shares of its range: alpha 1",
+        "form: plane 0.02 mm",
+        "light: room office, daylight 0.2 of it",
+        "coat: thickness 5 to 20 µm, spread 0.3 relative",
+        "decoder: drawn from the ranges in statement.json",
+    ]
+    assert unknowns_in_words({"calibration": {"scale": 0.5}, "decoder": {"known": True}}) == (
+        "calibration: scale 0.5 times all of these"
+    )
+
+
+@pytest.mark.parametrize(("spray", "shown"), [("thickness of the spray on the part", True), ("dirt, oil", False)])
+def test_a_coat_is_declared_where_the_part_is_sprayed(run_folder, tmp_path, spray, shown):
+    folder = shutil.copytree(run_folder, tmp_path / "run")
+    statement = json.loads((folder / "statement.json").read_text(encoding="utf-8"))
+    statement["influences"] = [{"name": spray, "included": True, "how": "drawn", "simulated": True}]
+    statement["unknowns"] = {"coat": {"thickness_um": [5.0, 20.0]}}
+    (folder / "statement.json").write_text(json.dumps(statement), encoding="utf-8")
+    assert ("5 to 20 µm" in dict(read_declaration(folder, None).facts)["with sizes of"]) == shown
 
 
 def test_lines_fit_and_lose_no_character():

@@ -88,7 +88,7 @@ class Predictor:
         self.grid = grid = grid.thinned(step) if step > 1 else grid
         self.seen = seen_by_reference[step // 2 :: step, step // 2 :: step]
         others = list(rig.cameras.values())[1:]
-        self.view = ViewRays(grid, seen_by_reference, rig.baseline_direction, others, rig.projector)
+        self.view = ViewRays(grid, self.seen, rig.baseline_direction, others, rig.projector)
         self.rays = self.view.rays
         self.directions = grid.rays().reshape(-1, 3)
         self.single_directions = self.directions.astype(np.float32).reshape(grid.height, grid.width, 3)

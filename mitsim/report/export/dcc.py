@@ -1,9 +1,9 @@
-"""Write the statement of a run as a digital calibration certificate: DCC 3.2.0 of PTB, numbers after D-SI 2.1.0.
+"""Write the statement of a run as a digital calibration certificate: DCC 3.2.1 of PTB, numbers after D-SI 2.1.0.
 
 Signal chain: results of a run, who issues them -> administrative data, then for each measurement its nominal value,
 error with u and 95 % interval, expected reading with U and k, number of virtual measurements, verdict -> one document.
 
-The elements are those of PTB's schema (https://ptb.de/dcc/v3.2.0/dcc.xsd), which is LGPL-3.0 and no part of mitsim. The
+The elements are those of PTB's schema (https://ptb.de/dcc/v3.2.1/dcc.xsd), which is LGPL-3.0 and no part of mitsim. The
 document calls itself simulated and not traceable: it is the statement of a virtual experiment in the form that programs
 for certificates read, and no calibration. The laboratory signs it, mitsim does not.
 """
@@ -23,7 +23,7 @@ from mitsim.running.version import __version__
 
 DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"
 
-_SCHEMA = f"{DCC} https://ptb.de/dcc/v3.2.0/dcc.xsd"
+_SCHEMA = f"{DCC} https://ptb.de/dcc/v3.2.1/dcc.xsd"
 _XSI = "http://www.w3.org/2001/XMLSchema-instance"
 
 #: units of D-SI by those of a task
@@ -50,9 +50,9 @@ class Issuer:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if not value.strip():
+            if not value.strip() or not value.isprintable():  # XML has no control characters
                 hint = "a digital calibration certificate names its issuer"
-                raise InputError(f"--{field.name}", "", "nothing", "a text", hint)
+                raise InputError(f"--{field.name}", "", repr(value), "a line of text", hint)
         if not (len(self.country) == 2 and self.country.isascii() and self.country.isupper()):
             raise InputError("--country", "", repr(self.country), "two capital letters after ISO 3166-1: GB")
 
@@ -84,7 +84,7 @@ def write_dcc(found: RunResults, declared: Declaration, issuer: Issuer, path: st
 
 def dcc_document(found: RunResults, declared: Declaration, issuer: Issuer) -> Element:
     """Return the document; its identifier derives from the statement's digest and the issuer."""
-    root = Element(f"{{{DCC}}}digitalCalibrationCertificate", {"schemaVersion": "3.2.0"})
+    root = Element(f"{{{DCC}}}digitalCalibrationCertificate", {"schemaVersion": "3.2.1"})
     root.set(f"{{{_XSI}}}schemaLocation", _SCHEMA)
     _administrative(_add(root, "administrativeData"), found, declared, issuer)
     result = _add(_add(root, "measurementResults"), "measurementResult")
@@ -106,20 +106,28 @@ def _administrative(to: Element, found: RunResults, declared: Declaration, issue
     _add(core, "mandatoryLangCodeISO639_1", "en")
     named = "/".join((declared.number, issuer.laboratory, issuer.customer, issuer.serial))
     _add(core, "uniqueIdentifier", str(uuid.uuid5(uuid.NAMESPACE_URL, f"{DCC}/{named}")))
-    _identified(_add(core, "identifications"), "calibrationLaboratory", declared.number, "SHA-256 of statement.json")
+    _identified(
+        _add(core, "identifications"),
+        "calibrationLaboratory",
+        declared.number,
+        "first digits of the SHA-256 of statement.json",
+    )
     for name in ("beginPerformanceDate", "endPerformanceDate"):
         _add(core, name, declared.date)
     _add(core, "performanceLocation", "other")
     item = _add(_add(to, "items"), "item")
     _text(item, "name", f"3D vision sensor {found.sensor}, simulated")
-    _text(_add(item, "manufacturer"), "name", "see the sensor’s name")
     _add(item, "model", found.sensor)
     _identified(_add(item, "identifications"), "owner", issuer.serial, "serial number")
-    _contact(_add(_add(to, "calibrationLaboratory"), "contact"), issuer.laboratory, issuer.country)
+    laboratory = _add(_add(to, "calibrationLaboratory"), "contact")
+    _text(laboratory, "name", issuer.laboratory)
+    _add(_add(laboratory, "location"), "countryCode", issuer.country)
     person = _add(_add(to, "respPersons"), "respPerson")
     _text(_add(person, "person"), "name", issuer.responsible)
     _add(person, "mainSigner", "true")
-    _contact(_add(to, "customer"), issuer.customer, issuer.country)
+    customer = _add(to, "customer")
+    _text(customer, "name", issuer.customer)
+    _text(_add(customer, "location"), "further", "not stated")  # DCC asks for a location, mitsim knows none
     statements = _add(to, "statements")
     simulated = _add(statements, "statement")
     _add(simulated, "traceable", "false")
@@ -132,7 +140,7 @@ def _administrative(to: Element, found: RunResults, declared: Declaration, issue
 
 
 def _methods(to: Element, found: RunResults, declared: Declaration) -> None:
-    used = _add(_add(to, "usedMethods"), "usedMethod", refType="basic_uncertainty")
+    used = _add(_add(to, "usedMethods"), "usedMethod", refType="basic_methodMeasurementUncertainty")
     _text(used, "name", "Simulate and analyse, a virtual experiment")
     how = "rendered and decoded" if found.source == "render" else "drawn from a performance map"
     _text(used, "description", " ".join([f"Virtual measurements {how}.", *declared.notes]))
@@ -215,11 +223,6 @@ def _identified(to: Element, issuer: str, value: str, name: str) -> None:
     _add(one, "issuer", issuer)
     _add(one, "value", value)
     _text(one, "name", name)
-
-
-def _contact(to: Element, name: str, country: str) -> None:
-    _text(to, "name", name)
-    _add(_add(to, "location"), "countryCode", country)
 
 
 def _text(to: Element, tag: str, text: str) -> None:

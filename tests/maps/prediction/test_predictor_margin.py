@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 
+from characterisation.point_cloud import Status
 from mitsim.decoding.cloud import sensor_geometry
-from mitsim.maps.prediction import EDGE_MARGIN_PX, Predictor
+from mitsim.maps.prediction import EDGE_MARGIN_PX, CharacterisedScene, Predictor
+from mitsim.maps.use import performance_map
 from mitsim.scene.load import load_scene
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
+from mitsim.views.view_scores import MATT_WHITE
 
 
 @pytest.mark.parametrize("name", ["ensenso-n10", "realsense-d435"])
@@ -28,3 +31,15 @@ def test_no_block_of_a_pixel_that_belongs_to_a_feature_sees_another(scenes, name
     for down in range(-reach, reach + 1):
         for right in range(-reach, reach + 1):
             assert (surfaces.shape[row + down, column + right] == labels[row, column]).all()
+
+
+def test_a_thinned_grid_looks_up_the_pixels_that_its_own_rays_see(scenes):
+    sensor = load_sensor("zivid-2-m70")
+    scene = load_scene(scenes / "two_pillars/sprayed_pillars.xml", sensor.wavelength_nm).only("plane")
+    characterised = CharacterisedScene(scene, performance_map("zivid-2-m70"), MATT_WHITE)
+    thinned = Predictor.of_sensor(sensor, sensor_geometry(sensor)).thinned(7)
+    pose = look_at([0, -277, 585], [0, 0, 0], [0, 0, 1])
+    ideal = thinned.ideal(thinned.surfaces(scene, pose))
+    assert not thinned.seen.all()  # the reference camera lacks some pixels of the grid
+    seen = thinned.look_up(characterised, pose).seen
+    assert (seen.status == Status.VALID).sum() == (ideal.status == Status.VALID).sum() > 1000

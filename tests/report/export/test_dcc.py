@@ -18,7 +18,7 @@ SCHEMA = FOLDER / "dcc" / "dcc.xsd"
 
 ISSUER = Issuer("Laboratory & co", "GB", "A. Person", "Customer", "SN 12")
 
-#: children that DCC 3.2.0 and D-SI 2.1.0 allow in elements that mitsim writes, in their order: ``?`` may be absent,
+#: children that DCC 3.2.1 and D-SI 2.1.0 allow in elements that mitsim writes, in their order: ``?`` may be absent,
 #: ``+`` and ``*`` repeat
 GRAMMAR = {
     "digitalCalibrationCertificate": "administrativeData measurementResults",
@@ -28,14 +28,14 @@ GRAMMAR = {
     "usedSoftware": "software+",
     "software": "name release",
     "items": "item+",
-    "item": "name manufacturer model? identifications",
-    "manufacturer": "name",
+    "item": "name model? identifications",
     "identifications": "identification+",
     "identification": "issuer value name?",
     "calibrationLaboratory": "contact",
     "contact": "name location",
     "customer": "name location",
-    "location": "countryCode",
+    "location": "countryCode? further?",
+    "further": "content+",
     "respPersons": "respPerson+",
     "respPerson": "person mainSigner?",
     "person": "name",
@@ -145,6 +145,11 @@ def test_numbers_are_those_of_the_statement(document, every_kind):  # noqa: F811
             assert [float(child.text) for child in expanded] == [1, 1e9, 0.95]
 
 
+def test_the_country_is_the_laboratorys_alone(document):
+    countries = [one.getparent().getparent().getparent() for one in document.iter(f"{{{DCC}}}countryCode")]
+    assert [tag(one) for one in countries] == ["calibrationLaboratory"]
+
+
 def test_the_document_says_that_it_is_no_calibration(document):
     statements = document.findall(f".//{{{DCC}}}statement")
     assert statements[0].find("{*}traceable").text == "false" and "no calibration" in statements[0][1][0].text
@@ -152,7 +157,12 @@ def test_the_document_says_that_it_is_no_calibration(document):
 
 
 @pytest.mark.parametrize(
-    ("change", "field"), [({"laboratory": " "}, "--laboratory"), ({"country": "Germany"}, "--country")]
+    ("change", "field"),
+    [
+        ({"laboratory": " "}, "--laboratory"),
+        ({"country": "Germany"}, "--country"),
+        ({"serial": "SN\x0112"}, "--serial"),
+    ],
 )
 def test_an_issuer_is_named(change, field):
     with pytest.raises(InputError, match=field):
