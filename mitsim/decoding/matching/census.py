@@ -46,12 +46,12 @@ def census_words(image: NDArray[np.uint8], window: int) -> list[Words]:
     reach = window // 2
     padded = np.pad(image, reach, mode="edge")
     places = [(down, right) for down in range(window) for right in range(window) if (down, right) != (reach, reach)]
-    words = []
+    words = list[Words]()
     for begin in range(0, len(places), 64):
         some = places[begin : begin + 64]
-        kind = next(kind for kind in (np.uint8, np.uint16, np.uint32, np.uint64) if 8 * kind().nbytes >= len(some))
+        size = next(size for size in (1, 2, 4, 8) if 8 * size >= len(some))
         # bit by bit in a byte of its own, with an eighth of the memory that a word has
-        code = np.zeros((*image.shape, kind().nbytes), np.uint8)
+        code = np.zeros((*image.shape, size), np.uint8)
         byte, darker = np.empty(image.shape, np.uint8), np.empty(image.shape, bool)
         for number in range(0, len(some), 8):
             byte[:] = 0
@@ -60,7 +60,7 @@ def census_words(image: NDArray[np.uint8], window: int) -> list[Words]:
                 np.add(byte, byte, out=byte)
                 byte |= darker.view(np.uint8)
             code[..., number // 8] = byte
-        words.append(code.view(kind)[..., 0])
+        words.append(code.view(f"u{size}")[..., 0])
     return words
 
 
@@ -172,7 +172,7 @@ def _block_costs(reference: list[Words], other: list[Words], count: int, shift: 
     return out
 
 
-#: rows whose paths along the row advance together: their costs fit into the processor's cache
+#: rows whose costs are turned at once, so that their columns become lines
 _TOGETHER = 512
 
 
@@ -188,10 +188,11 @@ def _summed_paths(cost: Costs, penalties: _Penalties, mode: str) -> Costs:
     total = np.empty_like(cost)
     for begin in range(0, len(cost), _TOGETHER):
         band = cost[begin : begin + _TOGETHER]
-        columns = np.asarray(cv2.transpose(band.reshape(len(band), -1))).reshape(count, width, -1).swapaxes(0, 1)
-        sums = np.zeros((count, width, len(band)), np.int16)
+        columns = np.empty((count, width, len(band)), np.int16)
+        cv2.transpose(band.reshape(len(band), -1), columns.reshape(-1, len(band)))
+        sums = np.zeros_like(columns)
         for order in (1, -1):
-            _add_paths(sums.swapaxes(0, 1)[::order], columns[::order], (1,), penalties, saturates)
+            _add_paths(sums.swapaxes(0, 1)[::order], columns.swapaxes(0, 1)[::order], (1,), penalties, saturates)
         cv2.transpose(sums.reshape(-1, len(band)), total[begin : begin + _TOGETHER].reshape(len(band), -1))
     for order in orders:
         _add_paths(total[::order], cost[::order], directions, penalties, saturates)
@@ -283,7 +284,7 @@ class _Places:
     """Places of the least of each column of an array (count, n); NumPy's argmin along columns takes several times."""
 
     def __init__(self, count: int, width: int) -> None:
-        self.count, places = count, np.arange(count, 0, -1, np.uint8 if count < 256 else np.uint16)
+        self.count, places = count, np.arange(count, 0, -1).astype(np.uint8 if count < 256 else np.uint16)
         self._before_end = np.ascontiguousarray(np.broadcast_to(places[:, None], (count, width)))
         self._is_least, self._place = np.empty((count, width), bool), np.empty((count, width), places.dtype)
 
