@@ -225,11 +225,18 @@ class PointCloud:
         """Return the points (n, 3) [mm] of one feature, in the sensor frame."""
         if self.feature is None:
             raise ValueError("this cloud has no feature labels")
-        mask = self.valid & (self.feature == self.feature_names.index(name))
-        return np.asarray(self.points[mask], np.float64)
+        labelled = self.points.reshape(-1, 3)[np.flatnonzero(self.feature == self.feature_names.index(name))]
+        return np.asarray(labelled[np.isfinite(labelled[:, 2])], np.float64)
 
-    def rays_of_feature(self, name: str) -> NDArray[np.float64]:
+    def rays_of_feature(self, name: str, most: int | None = None) -> NDArray[np.float64]:
         """Return the unit view directions (n, 3), sensor frame, of all pixels with its label, with or without a point.
+
+        Parameters
+        ----------
+        name
+            Of the feature.
+        most
+            Largest number of directions: of more pixels, evenly chosen ones; None for all.
 
         Raises
         ------
@@ -238,7 +245,9 @@ class PointCloud:
         """
         if self.feature is None:
             raise ValueError("this cloud has no feature labels")
-        rows, columns = np.nonzero(self.feature == self.feature_names.index(name))
+        labelled = np.flatnonzero(self.feature == self.feature_names.index(name))
+        step = 1 if most is None else max(-(-len(labelled) // most), 1)
+        rows, columns = np.divmod(labelled[::step], self.grid.width)
         return self.grid.rays_at(columns, rows)
 
     def to_open3d(self) -> Any:

@@ -29,14 +29,14 @@ from numpy.typing import ArrayLike, NDArray
 from characterisation.features.best_fit import counted_as_one
 from characterisation.features.figures import Circle, EdgePoint
 from characterisation.features.fits import COVERAGE, GATE, LEAST_GATE_MM, check_radius
-from characterisation.features.fitted import CircleFit, EdgePointFit, Fit
+from characterisation.features.fitted import CircleFit, ConeFit, CylinderFit, EdgePointFit, Fit, PlaneFit, SphereFit
 from characterisation.features.robust_fit import CLIP, FitError, UndeterminedError, rays_from
-from characterisation.features.surfaces import GRAZING_COSINE, Surface, tangents
+from characterisation.features.surfaces import GRAZING_COSINE, Surface, distances, tangents
 
 Array = NDArray[np.float64]
 
 #: Largest number of places where a fit is compared with nominal.
-_PLACES = 500
+PLACES = 500
 
 #: Largest number of residuals from which their correlation is estimated.
 _RESIDUALS = 1000
@@ -51,14 +51,18 @@ def places_seen(nominal: Surface, rays: ArrayLike, viewpoint: ArrayLike) -> Arra
     Rays that miss, or meet the surface at grazing incidence, are left out. Of many places, evenly chosen ones remain.
     """
     directions = np.asarray(rays, float).reshape(-1, 3)
-    directions = directions[:: 1 + len(directions) // _PLACES]
+    directions = directions[:: max(-(-len(directions) // PLACES), 1)]
     at = nominal.meet(np.broadcast_to(np.asarray(viewpoint, float), directions.shape), directions)
     met: Array = at.foot[(np.abs(at.cosine) > GRAZING_COSINE) & np.isfinite(at.foot).all(axis=1)]
     return met
 
 
 def check_surface(
-    fit: Fit, nominal: Surface, points: ArrayLike, places: ArrayLike, viewpoint: ArrayLike | None = None
+    fit: PlaneFit | CylinderFit | SphereFit | ConeFit,
+    nominal: Surface,
+    points: ArrayLike,
+    places: ArrayLike,
+    viewpoint: ArrayLike | None = None,
 ) -> None:
     """Check that the fit of a surface is credible.
 
@@ -85,10 +89,10 @@ def check_surface(
     array, where = np.asarray(points, float).reshape(-1, 3), np.asarray(places, float).reshape(-1, 3)
     if not len(where):
         return
-    zero, rays = np.zeros(fit.parameter_count), rays_from(viewpoint, array)
-    residual, _, cosine = fit.linearised(zero, array, rays)
+    rays = rays_from(viewpoint, array)
+    residual, cosine = distances(fit, array, rays)
     used = (np.abs(cosine) > GRAZING_COSINE) & (np.abs(residual) <= CLIP * max(fit.residual_std, _ROUNDING))
-    nominal_residual = nominal.linearised(zero, array[used], None if rays is None else rays[used])[0]
+    nominal_residual, _ = distances(nominal, array[used], None if rays is None else rays[used])
     if residual[used] @ residual[used] > (1 + _ROUNDING) * (nominal_residual @ nominal_residual) + _ROUNDING**2:
         sizes = [float(np.sqrt(np.mean(one**2))) for one in (residual[used], nominal_residual)]
         raise FitError(
@@ -107,7 +111,7 @@ def surface_limit(noise: float, nominal: Surface, points: Array) -> float:
     ``noise`` [mm] and at least :data:`~characterisation.features.fits.LEAST_GATE_MM`, from a surface that is displaced
     by the median distance of the points.
     """
-    distance = nominal.linearised(np.zeros(nominal.parameter_count), points, None)[0]
+    distance, _ = distances(nominal, points, None)
     return max(GATE * noise, LEAST_GATE_MM) + float(np.median(np.abs(distance)))
 
 

@@ -32,6 +32,7 @@ from characterisation.features.surfaces import (
     Plane,
     Sphere,
     Surface,
+    distances,
     lengths,
     unit,
 )
@@ -276,7 +277,7 @@ def belonging(points: ArrayLike, nominal: Surface, viewpoint: ArrayLike | None =
     a quarter of normal residuals lie within 0.3186 standard deviations. A displaced part increases it accordingly.
     """
     array = np.asarray(points, float).reshape(-1, 3)
-    distance = np.abs(nominal.linearised(np.zeros(nominal.parameter_count), array, None)[0])
+    distance = np.abs(distances(nominal, array, None)[0])
     known = np.isfinite(distance)
     if viewpoint is not None:
         known[known] = _not_false(array[known], nominal, np.asarray(viewpoint, float))
@@ -292,7 +293,7 @@ def _not_false(points: Array, nominal: Surface, viewpoint: Array) -> NDArray[np.
     away = points - viewpoint
     distance = lengths(away)
     rays = np.divide(away, distance[:, None], out=np.zeros_like(away), where=distance[:, None] > 0)
-    residual = nominal.meet(points, rays).residual
+    residual, _ = distances(nominal, points, rays)
     return np.asarray(np.abs(residual) <= FALSE_SHARE_OF_DISTANCE * (distance - residual))
 
 

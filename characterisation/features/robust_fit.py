@@ -10,6 +10,7 @@ it is a lower bound.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, ClassVar, Protocol, TypeVar
@@ -129,28 +130,36 @@ def _stepwise(
     """Fit least squares along the rays from a close start; return the shape and the points used.
 
     A Gauss-Newton step needs one pass over the points, and selects them for the next step. A general solver takes many
-    times as long for half a million points. Returns None where the steps do not converge.
+    times as long for half a million points. A point at the limit can enter and leave the selection in turn without end:
+    a selection that returns is kept to the end, as is the last of :data:`STEPS`. Returns None where the steps do not
+    converge.
     """
     zero = np.zeros(shape.parameter_count)
     kept, before = np.zeros(len(every), bool), np.inf
-    for _ in range(STEPS):
+    selections, held = set[bytes](), False
+    for number in range(STEPS + CHOICES):
         with np.errstate(divide="ignore", invalid="ignore"):  # a degenerate surface gives values that are not finite
             residual, jacobian, cosine = linearised(shape, zero, every, True)
-        near = _near(shape, residual, cosine, least_scale)
-        residual, jacobian = residual[near], jacobian[near]
-        square = float(residual @ residual)
-        if not np.isfinite(square) or not np.isfinite(jacobian).all():
+        near = kept if held else _near(shape, residual, cosine, least_scale)
+        beyond = np.flatnonzero(~near)
+        residual[beyond], jacobian[beyond] = 0.0, 0.0
+        square, normal = float(residual @ residual), jacobian.T @ jacobian
+        if not np.isfinite(square) or not np.isfinite(normal).all():
             return None
-        if np.array_equal(near, kept):
-            if abs(before - square) <= SAME * before:
-                return shape, near
-            if square > before:
-                return None
+        same = held or np.array_equal(near, kept)
+        if same and square > before * (1 + SAME):
+            return None
+        _check_normal(normal, jacobian, int(near.sum()), shape.kind)
+        gradient = jacobian.T @ residual
+        norms = np.sqrt(np.diagonal(normal))
+        step = -np.linalg.solve(normal / np.outer(norms, norms), gradient / norms) / norms
+        shape = shape.moved(step)
+        if same and -float(gradient @ step) <= SAME * square:  # the decrease of the sum of squares by this step
+            return shape, near
+        digest = hashlib.blake2b(np.packbits(near).tobytes(), digest_size=16).digest()
+        held = held or (not same and (digest in selections or number >= STEPS))
+        selections.add(digest)
         kept, before = near, square
-        check_rank(jacobian, shape.kind)
-        norms = np.linalg.norm(jacobian, axis=0)
-        scaled = jacobian / norms
-        shape = shape.moved(-np.linalg.solve(scaled.T @ scaled, scaled.T @ residual) / norms)
     return None
 
 
@@ -192,24 +201,30 @@ def covariance_of(residual: Array, jacobian: Array, kind: str) -> tuple[Array, f
     FitError
         If the derivatives (n, p) do not determine all parameters.
     """
-    check_rank(jacobian, kind)
     count, parameters = jacobian.shape
+    normal = jacobian.T @ jacobian
+    _check_normal(normal, jacobian, count, kind)
     variance = float(residual @ residual) / (count - parameters)
-    norms = np.linalg.norm(jacobian, axis=0)
-    inverse = np.linalg.inv((jacobian / norms).T @ (jacobian / norms)) / np.outer(norms, norms)
+    scales = np.outer(*2 * [np.sqrt(np.diagonal(normal))])
+    inverse = np.linalg.inv(normal / scales) / scales
     return variance * inverse, float(np.sqrt(variance)), count
 
 
 def check_rank(jacobian: Array, kind: str) -> None:
     """Reject derivatives (n, p) that leave a parameter, or a combination of parameters, undetermined."""
-    norms = np.linalg.norm(jacobian, axis=0)
-    scaled = jacobian / np.where(norms > 0, norms, 1.0)
-    squares = np.linalg.eigvalsh(scaled.T @ scaled) if np.isfinite(norms).all() else norms
+    _check_normal(jacobian.T @ jacobian, jacobian, len(jacobian), kind)
+
+
+def _check_normal(normal: Array, jacobian: Array, count: int, kind: str) -> None:
+    """Check the rank of derivatives (n, p) by their products (p, p), and by themselves where these do not tell."""
+    norms = np.sqrt(np.diagonal(normal))
+    norms = np.where(norms > 0, norms, 1.0)
+    squares = np.linalg.eigvalsh(normal / np.outer(norms, norms)) if np.isfinite(norms).all() else norms
     if squares[0] > _PLAIN_RANK**2 * squares[-1]:
         return
-    singular = np.linalg.svd(scaled, compute_uv=False)
+    singular = np.linalg.svd(jacobian / norms, compute_uv=False)
     if not np.isfinite(singular).all() or singular[-1] < 1e-7 * singular[0]:
-        raise FitError(f"{len(jacobian)} points that do not determine a {kind}")
+        raise FitError(f"{count} points that do not determine a {kind}")
 
 
 def usable(points: ArrayLike, kind: str, parameter_count: int) -> Array:
@@ -235,4 +250,7 @@ def robust_std(residual: Array) -> float:
 
     It is 1.4826 median |r|, and at least :data:`SMALLEST_SCALE`.
     """
-    return max(MEDIAN_TO_STD * float(np.median(np.abs(residual))), SMALLEST_SCALE)
+    sizes, middle = np.abs(residual), len(residual) // 2
+    sizes.partition(middle)  # np.median looks for three places
+    median = sizes[middle] if len(sizes) % 2 else 0.5 * (sizes[middle] + sizes[:middle].max())
+    return max(MEDIAN_TO_STD * float(median), SMALLEST_SCALE)

@@ -125,13 +125,19 @@ class Plane:
 
     def linearised(self, parameters: Array, points: Array, rays: Array | None) -> tuple[Array, Array, Array]:
         """Return residuals (n,) [mm], their derivatives (n, 3) by the parameters, and N.V (n,) (1 without rays)."""
-        moved = self.moved(parameters)
-        at = moved.meet(points, rays)
-        basis = self._basis
+        moved, basis = self.moved(parameters), self._basis
         length = float(np.linalg.norm(self.normal + parameters[1:] @ basis))
+        # by coordinate in the frame of normal, e1 and e2: rows of numbers, ten times faster than rows of points
+        frame = np.array([moved.normal, *basis])
+        distance, *places = frame @ points.T - (frame @ moved.point)[:, None]
+        along = np.broadcast_to(moved.normal, points.shape) if rays is None else rays
+        cosine, *rising = frame @ along.T
+        slope = _guarded(cosine)
+        residual = distance / slope
         by_shift = np.full(len(points), -(self.normal @ moved.normal))
-        jacobian = np.column_stack([by_shift, (at.foot - moved.point) @ basis.T / length]) / at.slope[:, None]
-        return at.residual, jacobian, at.cosine
+        by_tilts = [(place - residual * rise) / length for place, rise in zip(places, rising, strict=True)]
+        jacobian = np.array([by_shift, *by_tilts]) / slope
+        return residual, jacobian.T, cosine
 
 
 @dataclass(frozen=True)
@@ -322,6 +328,15 @@ class Cone:
 
 
 Surface = Plane | Cylinder | Sphere | Cone
+
+
+def distances(surface: Surface, points: Array, rays: Array | None) -> tuple[Array, Array]:
+    """Return the residual (n,) [mm] and N.V (n,) of points (n, 3), as a :class:`Meeting` has them."""
+    if isinstance(surface, Plane):
+        cosine = np.ones(len(points)) if rays is None else rays @ surface.normal
+        return (points @ surface.normal - surface.point @ surface.normal) / _guarded(cosine), cosine
+    at = surface.meet(points, rays)
+    return at.residual, at.cosine
 
 
 def _met_round(points: Array, rays: Array | None, radial: Array, across: Array | None, radius: float) -> Meeting:

@@ -15,7 +15,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from characterisation.features.credibility import check_surface, places_seen
+from characterisation.features.credibility import PLACES, check_surface, places_seen
 from characterisation.features.edges import fit_circle, fit_edge_point
 from characterisation.features.figures import Circle, EdgePoint
 from characterisation.features.fits import LEAST_BELONGING, belonging, fit_surface
@@ -99,7 +99,7 @@ def _selected(cloud: PointCloud, task: Task, sensor_from_part: ArrayLike, minimu
             raise InputError("task", f"features.{name}", repr(name), labels, nearest(name, known))
         points, nominal = cloud.of_feature(name), task.features[name].nominal(sensor_from_part)
         near = points[belonging(points, nominal, cloud.grid.origin)]
-        places = places_seen(nominal, cloud.rays_of_feature(name), cloud.grid.origin)
+        places = places_seen(nominal, cloud.rays_of_feature(name, PLACES), cloud.grid.origin)
         selected[name] = _Selected(near, len(points), places)
         if len(near) < minimum_points:
             few = FitError(f"{len(near)} points, at least {minimum_points} are required")

@@ -107,7 +107,7 @@ def keep_light(
     turned = [any(is_turned(finish[number]) for finish in finishes) for number in range(len(bsdfs))]
     out = {}
     for index, (camera, roi) in enumerate(rois.items()):
-        shape = shapes_met(scene, simulated.pixel_rays(camera), world_from_sensor)[roi.slices]
+        shape = shapes_met(scene, simulated.pixel_rays(camera).within(roi), world_from_sensor)
         # a pixel at the edge of the part may see it although its centre does not
         pixels = np.flatnonzero(binary_dilation(shape >= 0, np.ones((3, 3))))
         photons = int(np.ceil(np.sqrt(settings.photons * settings.samples * len(pixels)))) ** 2

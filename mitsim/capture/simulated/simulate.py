@@ -171,7 +171,7 @@ class SimulatedSensor:
             return np.zeros((self.patterns.count + ambient, roi.height, roi.width), np.float32)
         paths = LightPaths(indirect.samples, seed, depth, indirect_only=True, with_ambient=ambient)
         images = trace(scene, rays, self.patterns, world_from_sensor, paths, roi)
-        shape = shapes_met(scene, self.pixel_rays(camera), world_from_sensor)[roi.slices]
+        shape = shapes_met(scene, self.pixel_rays(camera).within(roi), world_from_sensor)
         return smoothed(images, shape, indirect.smoothing_px)
 
     def radiance(

@@ -80,7 +80,7 @@ def contrast_map(
     camera
         Camera that sees the speckle.
     rays
-        View rays of its pixels.
+        View rays of its pixels, or of a region of them.
     world_from_sensor
         Pose of the sensor.
 
@@ -129,11 +129,9 @@ def draw_speckle(
     --------
     contrast_map : the contrast of the speckle
     """
-    values = contrast_map(scene, sensor, camera, rays, world_from_sensor)
+    values = contrast_map(scene, sensor, camera, rays.within(roi), world_from_sensor)
     if not np.any(values):
         return None
-    if isinstance(values, np.ndarray):
-        values = values[roi.slices]
     imager = sensor.imager
     size_px = correlation_size_px(imager.pixel_um, sensor.wavelength_nm, imager.f_number)
     field = speckle_field((roi.height, roi.width), values, size_px, rng)

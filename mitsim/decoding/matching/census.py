@@ -16,7 +16,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.lib.stride_tricks import as_strided, sliding_window_view
 from numpy.typing import NDArray
@@ -25,7 +27,7 @@ from mitsim.decoding.matching.sgbm import Matches, both_ways_disagreement, pixel
 from mitsim.decoding.matching.sub_pixel import Fit, offset_of_minimum
 from mitsim.sensor.matcher import MatcherSettings
 
-Words = NDArray[np.uint64]
+Words = NDArray[np.unsignedinteger[Any]]
 Costs = NDArray[np.int16]
 
 #: bits of the code to which the penalties refer
@@ -35,7 +37,7 @@ _LARGEST = np.iinfo(np.int16).max
 
 
 def census_words(image: NDArray[np.uint8], window: int) -> list[Words]:
-    """Return the code of each pixel of an image (h, W), in words (h, W) of up to 64 bits.
+    """Return the code of each pixel of an image (h, W), in words (h, W) of the fewest bytes that hold it.
 
     A bit tells whether a pixel of the window, of ``window`` x ``window`` pixels without the middle one, is darker than
     the middle. Beyond the image, its edge is repeated.
@@ -44,13 +46,21 @@ def census_words(image: NDArray[np.uint8], window: int) -> list[Words]:
     reach = window // 2
     padded = np.pad(image, reach, mode="edge")
     places = [(down, right) for down in range(window) for right in range(window) if (down, right) != (reach, reach)]
-    words = []
+    words = list[Words]()
     for begin in range(0, len(places), 64):
-        word = np.zeros(image.shape, np.uint64)
-        for bit, (down, right) in enumerate(places[begin : begin + 64]):
-            darker = padded[down : down + height, right : right + width] < image
-            word |= darker.astype(np.uint64) << np.uint64(bit)
-        words.append(word)
+        some = places[begin : begin + 64]
+        size = next(size for size in (1, 2, 4, 8) if 8 * size >= len(some))
+        # bit by bit in a byte of its own, with an eighth of the memory that a word has
+        code = np.zeros((*image.shape, size), np.uint8)
+        byte, darker = np.empty(image.shape, np.uint8), np.empty(image.shape, bool)
+        for number in range(0, len(some), 8):
+            byte[:] = 0
+            for down, right in some[number : number + 8]:
+                np.less(padded[down : down + height, right : right + width], image, out=darker)
+                np.add(byte, byte, out=byte)
+                byte |= darker.view(np.uint8)
+            code[..., number // 8] = byte
+        words.append(code.view(f"u{size}")[..., 0])
     return words
 
 
@@ -97,11 +107,12 @@ def match_census_both_ways(
     exists = (source - first >= 0) & (source - first < whole)
     for shared, inner in strips(height, width, count):
         mine, theirs = ([each[shared] for each in words] for words in (reference, other))
-        cost = _block_costs(mine, theirs, count, shift, settings.block_size, penalties)
-        total = _summed_paths(cost, penalties, settings)
-        for row, costs in enumerate(total[inner], shared.start + inner.start):
-            found[row] = _best_disparities(costs, settings.uniqueness_percent, fit)
-            back[row, : width + count][exists] = _best_of_right(costs)[exists]
+        cost = _block_costs(mine, theirs, count, shift, settings.block_size)
+        total = _summed_paths(cost, penalties, settings.mode)[inner]
+        rows = slice(shared.start + inner.start, shared.start + inner.stop)
+        least = _least_sums(total)
+        found[rows] = _best_disparities(least, count, settings.uniqueness_percent, fit)
+        back[rows, : width + count][:, exists] = least.of_right[:, exists]
     matched_back = pixels_matched_back(back)[:, count : count + width]
     return Matches(found + np.float32(first), both_ways_disagreement(found, back, count), matched_back)
 
@@ -123,100 +134,172 @@ class _Penalties:
     p2: int
 
 
-def _block_costs(
-    reference: list[Words], other: list[Words], count: int, shift: int, block: int, penalties: _Penalties
-) -> Costs:
-    """Return costs (h, w, count): different bits of both codes over a block and all words, divided, plus P2."""
+def _block_costs(reference: list[Words], other: list[Words], count: int, shift: int, block: int) -> Costs:
+    """Return costs (h, count, w): different bits of both codes over a block and all words, divided.
+
+    The pixels of a row are adjacent, so that every sum and minimum over disparities runs along them.
+    """
     height, width, reach = len(reference[0]), reference[0].shape[1] - count, block // 2
-    # the pixels compared with column x, at x - d; the disparities of a column are adjacent in the mirrored image
-    compared = [
-        sliding_window_view(np.ascontiguousarray(each[:, ::-1]), count, axis=1)[:, :width][:, ::-1] for each in other
-    ]
-    along = np.empty((height, width, count), np.int16)
-    for row in range(height):
-        bits = np.zeros((width, count), np.int16)
-        for word, words in zip(reference, compared, strict=True):
-            bits += np.bitwise_count(word[row, count:, None] ^ words[row])
-        padded = np.pad(bits >> shift, ((reach, reach), (0, 0)), mode="edge")
-        along[row] = sum(padded[step : step + width] for step in range(2 * reach + 1))
-    out = np.full_like(along, penalties.p2)
-    for row in range(height):
-        for step in range(-reach, reach + 1):
-            out[row] += along[min(max(row + step, 0), height - 1)]
+    # the pixels compared with column x, at x - d
+    compared = [sliding_window_view(each, width, axis=1)[:, count:0:-1] for each in other]
+    along = np.empty((height, count, width), np.int16)
+    different, bits = [np.empty((count, width), each.dtype) for each in reference], np.empty((count, width), np.uint8)
+    padded = np.empty((count, width + 2 * reach), np.int16)
+    middle = padded[:, reach : reach + width]
+    for row, sums in enumerate(along):
+        middle[:] = 0
+        for word, words, differing in zip(reference, compared, different, strict=True):
+            np.bitwise_xor(word[row, count:], words[row], out=differing)
+            middle += np.bitwise_count(differing, out=bits)
+        if shift:
+            middle >>= shift
+        padded[:, :reach], padded[:, reach + width :] = middle[:, :1], middle[:, -1:]
+        sums[:] = padded[:, :width]
+        for step in range(1, block):
+            sums += padded[:, step : step + width]
+    if block == 1:
+        return along
+    out = np.empty_like(along)
+    for row, sums in enumerate(out):
+        if row == 0:
+            sums[:] = along[0]
+            for step in range(1, reach + 1):
+                sums += along[0]
+                sums += along[min(step, height - 1)]
+        else:
+            np.add(out[row - 1], along[min(row + reach, height - 1)], out=sums)
+            sums -= along[max(row - reach - 1, 0)]
     return out
 
 
-def _summed_paths(cost: Costs, penalties: _Penalties, settings: MatcherSettings) -> Costs:
-    """Return the sums (h, w, count) of the paths that end in each pixel.
+#: rows whose costs are turned at once, so that their columns become lines
+_TOGETHER = 512
+
+
+def _summed_paths(cost: Costs, penalties: _Penalties, mode: str) -> Costs:
+    """Return the sums (h, count, w) of the paths that end in each pixel.
 
     All eight paths for the mode ``hh``. One pass over the image, as in hardware, has none from below: both along the
     row and the three from above for ``sgbm``, or the one straight from above for ``3way``.
     """
-    height, width, count = cost.shape
-    total = np.zeros_like(cost)
-    for columns in (range(width), range(width - 1, -1, -1)):
-        path, least = np.zeros((height, count), np.int16), np.zeros(height, np.int16)
-        for column in columns:
-            path = _next_path_costs(path, least, cost[:, column], penalties)
-            least = path.min(axis=1)
-            _add_saturated(total[:, column], path)
-    ways = [range(height), range(height - 1, -1, -1)] if settings.mode == "hh" else [range(height)]
-    for rows in ways:
-        # from the column before, the same and the next; beyond the image paths are 0, as in OpenCV
-        paths, leasts = np.zeros((3, width + 2, count), np.int16), np.zeros((3, width + 2), np.int16)
-        for row in rows:
-            for direction in (1,) if settings.mode == "3way" else (0, 1, 2):
-                before = slice(direction, direction + width)
-                path = _next_path_costs(paths[direction, before], leasts[direction, before], cost[row], penalties)
-                paths[direction, 1:-1], leasts[direction, 1:-1] = path, path.min(axis=1)
-                _add_saturated(total[row], path)
+    _, count, width = cost.shape
+    directions, orders = (1,) if mode == "3way" else (0, 1, 2), (1, -1) if mode == "hh" else (1,)
+    saturates = (2 + len(directions) * len(orders)) * (int(cost.max()) + penalties.p2) > _LARGEST
+    total = np.empty_like(cost)
+    for begin in range(0, len(cost), _TOGETHER):
+        band = cost[begin : begin + _TOGETHER]
+        columns = np.empty((count, width, len(band)), np.int16)
+        cv2.transpose(band.reshape(len(band), -1), columns.reshape(-1, len(band)))
+        sums = np.zeros_like(columns)
+        for order in (1, -1):
+            _add_paths(sums.swapaxes(0, 1)[::order], columns.swapaxes(0, 1)[::order], (1,), penalties, saturates)
+        cv2.transpose(sums.reshape(-1, len(band)), total[begin : begin + _TOGETHER].reshape(len(band), -1))
+    for order in orders:
+        _add_paths(total[::order], cost[::order], directions, penalties, saturates)
     return total
 
 
-def _next_path_costs(previous: Costs, least: Costs, cost: Costs, penalties: _Penalties) -> Costs:
-    """Return the path costs (..., count) one pixel further, by formula 13 of Hirschmueller.
+def _add_paths(total: Costs, cost: Costs, directions: tuple[int, ...], penalties: _Penalties, saturates: bool) -> None:
+    """Add to sums, in place, the costs of paths from each line of pixels to the next, by formula 13 of Hirschmueller.
 
-    ``previous`` (..., count) are the costs one pixel before, and ``least`` (...) their minima.
+    Parameters
+    ----------
+    total, cost
+        (lines, count, n) sums and costs.
+    directions
+        From which pixel of the line before: 0 the one before, 1 the same, 2 the one after.
+    penalties
+        Smoothness penalties.
+    saturates
+        Whether sums may exceed 16 bits; they are then limited to the largest integer.
     """
-    limit, stepped = least[..., None] + np.int16(penalties.p2), previous + np.int16(penalties.p1)
-    path: Costs = np.minimum(previous, limit)
-    np.minimum(path[..., 1:], stepped[..., :-1], out=path[..., 1:])
-    np.minimum(path[..., :-1], stepped[..., 1:], out=path[..., :-1])
-    path -= limit
-    path += cost
-    return path
+    _, count, width = cost.shape
+    # costs above the least of each pixel are what the formula needs; beyond the image they are 0, as in OpenCV
+    edge = 0 if directions == (1,) else 1
+    above = np.zeros((len(directions), count, width + 2 * edge), np.int16)
+    path, stepped = np.empty((count, width), np.int16), np.empty((count, width), np.int16)
+    step, limit = np.int16(penalties.p1), np.full(path.shape, penalties.p2, np.int16)  # no loop of NumPy has a scalar
+    for sums, costs in zip(total, cost, strict=True):
+        for before, direction in zip(above, directions, strict=True):
+            start = direction + edge - 1
+            previous, now = before[:, start : start + width], before[:, edge : edge + width]
+            np.add(previous, step, out=stepped)
+            np.minimum(previous, limit, out=path)
+            np.minimum(path[1:], stepped[:-1], out=path[1:])
+            np.minimum(path[:-1], stepped[1:], out=path[:-1])
+            path += costs
+            np.subtract(path, path.min(axis=0), out=now)
+            if saturates:
+                np.minimum(sums, np.subtract(_LARGEST, path, out=stepped), out=sums)
+            sums += path
 
 
-def _add_saturated(total: Costs, term: Costs) -> None:
-    """Add in place, limited to the largest 16-bit integer."""
-    np.minimum(total, np.int16(_LARGEST) - term, out=total)
-    total += term
+@dataclass(frozen=True)
+class _Least:
+    """Least sums (h, count, w) of left pixels and right columns.
+
+    Attributes
+    ----------
+    best
+        (h, w) disparity of the least sum of each left pixel, the first of equal ones.
+    sums
+        (3, h, w) sums at one disparity less, at the best one, and at one more.
+    second
+        (h, w) least sum of the other disparities.
+    of_right
+        (h, w + count) disparity of the least sum of each right column; left column i sees i + count - k at k. NaN for
+        columns that no left column sees.
+    """
+
+    best: NDArray[np.intp]
+    sums: Costs
+    second: Costs
+    of_right: NDArray[np.float32]
 
 
-def _best_disparities(total: Costs, uniqueness: int, fit: Fit) -> NDArray[np.float32]:
-    """Return disparities (w,) from a row's sums (w, count), NaN where another is nearly as good."""
-    count, column = total.shape[1], np.arange(len(total))
-    best = total.argmin(axis=1)
-    beside = [np.clip(best + step, 0, count - 1) for step in (-1, 0, 1)]
-    lower, least, upper = (total[column, each].astype(np.float32) for each in beside)
-    competing = total * np.float32(100 - uniqueness) < 100 * least[:, None]
+def _least_sums(total: Costs) -> _Least:
+    """Return the least sums of sums (h, count, w), which are overwritten."""
+    height, count, width = total.shape
+    best, of_right = np.empty((height, width), np.intp), np.empty((height, width + count), np.float32)
+    padded = np.full((count, width + 2 * count), _LARGEST, np.int16)
+    down, right = padded.strides
+    seen = as_strided(padded, (count, width + count), (down + right, right), writeable=False)
+    of_left, of_seen = _Places(count, width), _Places(count, width + count)
+    for row, sums in enumerate(total):
+        padded[:, count : count + width] = sums
+        least, place = of_seen.of_least(seen)
+        of_right[row] = np.where(least < _LARGEST, place, np.nan)
+        _, best[row] = of_left.of_least(sums)
+    first = np.arange(height)[:, None] * count * width + np.arange(width)
+    beside = [first + width * np.clip(best + step, 0, count - 1) for step in (-1, 0, 1)]
+    flat = total.reshape(-1)
+    chosen = np.stack([flat[each] for each in beside])
     for each in beside:
-        competing[column, each] = False
-    inside = (best > 0) & (best < count - 1)
-    disparity = best + np.where(inside, offset_of_minimum(lower, least, upper, fit), 0)
-    return np.where(competing.any(axis=1), np.nan, disparity).astype(np.float32)
+        flat[each] = _LARGEST
+    second = total.min(axis=1)
+    return _Least(best, chosen, second, of_right)
 
 
-def _best_of_right(total: Costs) -> NDArray[np.float32]:
-    """Return the disparity (w + count,) of least sum of each right column; left column i sees i + count - k at k.
+class _Places:
+    """Places of the least of each column of an array (count, n); NumPy's argmin along columns takes several times."""
 
-    NaN for columns that no left column sees.
-    """
-    width, count = total.shape
-    padded = np.full((width + 2 * count, count), _LARGEST, np.int16)
-    padded[count : count + width] = total
-    step = padded.strides[0]
-    seen = as_strided(padded, (width + count, count), (step, step + padded.strides[1]), writeable=False)
-    best = seen.argmin(axis=1)
-    known = np.take_along_axis(seen, best[:, None], axis=1)[:, 0] < _LARGEST
-    return np.where(known, best, np.nan).astype(np.float32)
+    def __init__(self, count: int, width: int) -> None:
+        self.count, places = count, np.arange(count, 0, -1).astype(np.uint8 if count < 256 else np.uint16)
+        self._before_end = np.ascontiguousarray(np.broadcast_to(places[:, None], (count, width)))
+        self._is_least, self._place = np.empty((count, width), bool), np.empty((count, width), places.dtype)
+
+    def of_least(self, costs: Costs) -> tuple[Costs, NDArray[np.intp]]:
+        """Return the least (n,) of each column, and the first place (n,) that has it."""
+        least = costs.min(axis=0)
+        np.equal(costs, least, out=self._is_least)
+        np.multiply(self._is_least.view(np.uint8), self._before_end, out=self._place)
+        return least, self.count - self._place.max(axis=0).astype(np.intp)
+
+
+def _best_disparities(least: _Least, count: int, uniqueness: int, fit: Fit) -> NDArray[np.float32]:
+    """Return disparities (h, w), of a number of ``count``, NaN where another is nearly as good."""
+    lower, middle, upper = least.sums.astype(np.float32)
+    inside = (least.best > 0) & (least.best < count - 1)
+    disparity = least.best + np.where(inside, offset_of_minimum(lower, middle, upper, fit), 0)
+    unique = least.second * np.float32(100 - uniqueness) >= 100 * middle
+    return np.where(unique, disparity, np.nan).astype(np.float32)

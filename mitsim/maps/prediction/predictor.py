@@ -154,8 +154,11 @@ class Predictor:
 
         Back faces, which return no light, count as shapes.
         """
-        shape = shapes_met(scene, self.rays, world_from_sensor)
-        return self._labels(scene, world_from_sensor, shape, Roi.whole(self.grid.width, self.grid.height))
+        roi = self.view.roi(scene.bounds, world_from_sensor, self.margin)  # all beyond it is -1
+        shape = shapes_met(scene, self.rays.within(roi), world_from_sensor)
+        labels = np.full((self.grid.height, self.grid.width), -1, np.int16)
+        labels[roi.slices] = self._labels(scene, world_from_sensor, shape, roi)
+        return labels
 
     def _labels(
         self, scene: Scene, world_from_sensor: Transform, shape: NDArray[np.int16], roi: Roi

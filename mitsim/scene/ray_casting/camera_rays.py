@@ -70,10 +70,7 @@ class CameraRays:
             return other
         other.distortion = Distortion(camera)
         down, across = (_spline(size + 1, _GRID_PX) for size in (camera.height, camera.width))
-        columns, rows = np.meshgrid(across.knots - 0.5, down.knots - 0.5)
-        corners = np.stack([columns, rows], axis=-1)
-        pair = self.camera.rays_to_fold(corners), camera.rays_to_fold(corners)
-        before, after = (rays[..., :2] / rays[..., 2:] for rays in pair)
+        before, after = _at_knots(self.camera), _ideal_at_knots(camera)
         differences = [
             down.coefficients @ component @ across.coefficients.T for component in np.moveaxis(after - before, -1, 0)
         ]
@@ -124,6 +121,17 @@ class _Spline:
     knots: NDArray[np.float64]
     coefficients: NDArray[np.float64]
     basis: csr_array
+
+
+def _ideal_at_knots(camera: Camera) -> NDArray[np.float64]:
+    """Return the ideal image coordinates (k, m, 2) at the knots of the grid on which calibrations are compared."""
+    down, across = (_spline(size + 1, _GRID_PX) for size in (camera.height, camera.width))
+    columns, rows = np.meshgrid(across.knots - 0.5, down.knots - 0.5)
+    rays = camera.rays_to_fold(np.stack([columns, rows], axis=-1))
+    return np.asarray(rays[..., :2] / rays[..., 2:])
+
+
+_at_knots = lru_cache(maxsize=16)(_ideal_at_knots)  # of the calibration that others are compared with
 
 
 @cache

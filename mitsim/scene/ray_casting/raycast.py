@@ -8,6 +8,7 @@ There is one ray per pixel and no filter, because an average of labels is no lab
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -15,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.point_cloud import ViewGrid
+from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
-from mitsim.scene.device import known_to_device, opaque_point, vectors_to_host
+from mitsim.scene.device import known_to_device, opaque_index, opaque_point, vectors_to_host
 from mitsim.scene.first_hits import shape_indices
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.eye import Eye, shadow_ray
@@ -58,6 +60,17 @@ class PixelRays:
     def frame(self, world_from_sensor: Transform) -> Eye:
         """Return the origin of the rays and the axes of the sensor, in the world frame."""
         return Eye(Transform(world_from_sensor.rotation, world_from_sensor.points(self.origin)))
+
+    def within(self, roi: Roi) -> PixelRays:
+        """Return the rays of a region."""
+        left, top, width, whole = (opaque_index(each) for each in (roi.left, roi.top, roi.width, self.size[1]))
+        index = dr.arange(mi.UInt32, roi.width * roi.height)
+        pixel = (index // width + top) * whole + index % width + left
+        part = copy.copy(self)
+        part.size = (roi.height, roi.width)
+        part.directions = dr.gather(mi.Vector3f, self.directions, pixel)
+        part.active = True if self.active is True else dr.gather(mi.Bool, self.active, pixel)
+        return part
 
     @staticmethod
     def of_grid(grid: ViewGrid) -> PixelRays:

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from characterisation.features.fits import belonging, fit_cylinder, fit_plane, fit_sphere
-from characterisation.features.robust_fit import FitError
+from characterisation.features.robust_fit import FitError, rays_from, robust_fit
 from characterisation.features.surfaces import Cylinder, Plane, Sphere, tangents
 
 EYE = np.zeros(3)
@@ -321,3 +321,23 @@ def test_a_plane_is_found_among_false_matches_far_in_front_and_behind(share, rng
     found = fit_plane(points, np.zeros(3))
     assert abs(np.dot(found.normal, [0.2, 0, -1]) / np.hypot(1, 0.2)) > np.cos(np.deg2rad(0.1))
     assert found.count > 0.95 * (~wrong).sum()
+
+
+@pytest.mark.parametrize("seed", [9, 21, 34])
+def test_a_point_that_enters_and_leaves_the_selection_in_turn_ends_the_fit_soon(seed):
+    """Chosen seeds: without an end, the selection of these points alternates between two sets."""
+    rng, count, passes = np.random.default_rng(seed), 2000, []
+    points = np.column_stack([rng.uniform(-50, 50, (count, 2)), 400 + 0.1 * rng.standard_t(2, count)])
+    rays = rays_from(np.zeros(3), points)
+
+    def linearised(shape, parameters, chosen, along_rays):
+        passes.append(along_rays)
+        return shape.linearised(parameters, points[chosen], rays[chosen] if along_rays else None)
+
+    start = Plane(np.array([0.0, 0.0, 400.0]), np.array([0.0, 0.0, -1.0]))
+    plane, kept = robust_fit(start, linearised, count)
+    assert sum(passes) < 12
+    residual, jacobian, _ = plane.linearised(np.zeros(3), points[kept], rays[kept])
+    # least squares of the points used: residuals are perpendicular to every derivative
+    cosine = jacobian.T @ residual / np.linalg.norm(jacobian, axis=0) / np.linalg.norm(residual)
+    np.testing.assert_allclose(cosine, 0, atol=1e-6)

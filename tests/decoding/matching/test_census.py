@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from mitsim.decoding.matching import sgbm
+from mitsim.decoding.matching import census, sgbm
 from mitsim.decoding.matching.census import census_words, match_census_both_ways
 from mitsim.decoding.matching.sub_pixel import offset_of_minimum
 from mitsim.sensor.matcher import MatcherSettings
@@ -61,6 +61,28 @@ def test_whole_disparities_are_those_of_a_slow_search_without_penalties():
             for d in range(5, 37)
         ]
         assert abs(found[row, column] - (5 + int(np.argmin(costs)))) <= 0.5
+
+
+@pytest.mark.parametrize("largest", [200, 30_000])
+@pytest.mark.parametrize(("mode", "steps"), [("hh", 8), ("sgbm", 5), ("3way", 3)])
+def test_paths_are_those_of_the_formula_pixel_by_pixel(mode, steps, largest, monkeypatch):
+    """Sums of 200 fit into 16 bits; those of 30,000 are limited to the largest integer."""
+    height, count, width, p1, p2 = 7, 16, 9, 11, 40
+    cost = np.random.default_rng(largest).integers(0, largest, (height, count, width))
+    every = [(0, 1), (0, -1), (1, 0), (1, 1), (1, -1), (-1, 0), (-1, 1), (-1, -1)]
+    total = np.zeros_like(cost)
+    for down, right in every[:steps]:
+        path = {}
+        for row in range(height)[:: -1 if down < 0 else 1]:
+            for column in range(width)[:: -1 if right < 0 else 1]:
+                before = path.get((row - down, column - right), np.zeros(count, int))
+                wide = np.pad(before, 1, constant_values=10**6)
+                best = np.min([before, wide[:-2] + p1, wide[2:] + p1, np.full(count, before.min() + p2)], axis=0)
+                path[row, column] = cost[row, :, column] + best - before.min()
+                total[row, :, column] += path[row, column]
+    monkeypatch.setattr(census, "_TOGETHER", 3)
+    found = census._summed_paths(cost.astype(np.int16), census._Penalties(p1, p2), mode)
+    np.testing.assert_array_equal(found, np.minimum(total, 32767))
 
 
 @pytest.mark.parametrize("fit", ["parabola", "equiangular"])

@@ -1,13 +1,15 @@
-"""How near to an edge a pixel may be to belong to a feature."""
+"""How near to an edge a pixel may be to belong to a feature, and the pixels of a region."""
 
 import numpy as np
 import pytest
 
 from characterisation.point_cloud import Status
+from characterisation.region_of_interest import Roi
 from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.prediction import EDGE_MARGIN_PX, CharacterisedScene, Predictor
 from mitsim.maps.use import performance_map
 from mitsim.scene.load import load_scene
+from mitsim.scene.ray_casting.raycast import PixelRays, shapes_met
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
 from mitsim.views.view_scores import MATT_WHITE
@@ -43,3 +45,27 @@ def test_a_thinned_grid_looks_up_the_pixels_that_its_own_rays_see(scenes):
     assert not thinned.seen.all()  # the reference camera lacks some pixels of the grid
     seen = thinned.look_up(characterised, pose).seen
     assert (seen.status == Status.VALID).sum() == (ideal.status == Status.VALID).sum() > 1000
+
+
+@pytest.mark.parametrize("step", [1, 3])
+@pytest.mark.parametrize("target", [[0, 0, 20], [90, 40, 20]])
+def test_labels_of_decoded_points_are_those_of_the_whole_image(scenes, target, step):
+    """Also where the part reaches beyond the image."""
+    sensor = load_sensor("ensenso-n10")
+    predictor = Predictor.of_sensor(sensor, sensor_geometry(sensor))
+    predictor = predictor if step == 1 else predictor.thinned(step)
+    scene = load_scene(scenes / "two_pillars/two_pillars.xml", sensor.wavelength_nm)
+    pose = look_at([0, -300, 200], target, [0, 0, 1])
+    labels = predictor.quick_labels(scene, pose)
+    assert (labels >= 0).any(axis=1).sum() > 50 and (labels < 0).mean() > 0.2
+    np.testing.assert_array_equal(labels, predictor.labels(scene, pose, predictor.surfaces(scene, pose)))
+
+
+def test_rays_of_a_region_meet_what_they_meet_in_the_whole_image(scenes):
+    sensor = load_sensor("ensenso-n10")
+    scene = load_scene(scenes / "two_pillars/two_pillars.xml", sensor.wavelength_nm)
+    rays, roi = PixelRays.of_camera(next(iter(sensor.rig.cameras.values()))), Roi(301, 172, 113, 87)
+    pose = look_at([0, -400, 300], [0, 0, 20], [0, 0, 1])
+    whole = shapes_met(scene, rays, pose)[roi.slices]
+    assert len(np.unique(whole)) > 2
+    np.testing.assert_array_equal(shapes_met(scene, rays.within(roi), pose), whole)
