@@ -1,0 +1,1 @@
+"""Tests of mitsim and characterisation, in folders that mirror the packages."""
