@@ -20,6 +20,7 @@ from mitsim.scene.first_hits import visible_surfaces
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
 from mitsim.sensor.working_volume import common_view, field_of_view, in_image, in_working_volume, pose_at, usual_place
+from tests.small_study import small_study
 from tests.smaller_sensors import binned
 
 METAL = """<bsdf type="machined_metal"><string name="metal" value="aluminium"/>
@@ -340,6 +341,18 @@ def test_the_command_prints_writes_and_judges(tmp_path):
     (tmp_path / "other.toml").write_text((ROOT / task).read_text().replace("pillar2", "pillar3"))
     done = mitsim_here("check", scene, "--task", tmp_path / "other.toml", code=1)
     assert "error: pillar3: a feature of the task without a shape in the scene. Did you mean" in done.stdout
+
+
+def test_a_nominal_value_that_the_part_does_not_have_is_an_error_of_check_and_stops_a_study(tmp_path):
+    scene, task = "scenes/two_pillars/two_pillars.xml", tmp_path / "task.toml"
+    task.write_text((ROOT / "scenes/two_pillars/task.toml").read_text().replace("nominal = 70.0", "nominal = 35.0", 1))
+    done = mitsim_here("check", scene, "--task", task, code=1)
+    assert "error: point1_point2_distance: the nominal value is 35; allowed: 70 mm, from the geometry of" in done.stdout
+    study = tmp_path / "study.toml"
+    study.write_text(small_study("{}", task=task))
+    done = mitsim_here("study", "score", study, "-o", tmp_path / "scores", code=2)
+    assert "measurements.point1_point2_distance.nominal: found 35; allowed: 70 mm" in done.stderr
+    assert not list(tmp_path.glob("scores/*"))
 
 
 def test_bad_input_is_told_with_code_2(tmp_path):

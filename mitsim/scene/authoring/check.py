@@ -25,8 +25,8 @@ from scipy.spatial import cKDTree
 from characterisation.files.documents import Document, read_toml
 from characterisation.files.errors import nearest
 from characterisation.tasks.decision_table import Decision
-from characterisation.tasks.task_file import Feature, Measurement
-from characterisation.tasks.task_reading import read_task
+from characterisation.tasks.task_file import Feature, Measurement, Task
+from characterisation.tasks.task_reading import misstated, read_task
 from mitsim.scene.authoring.face import surface_distance
 from mitsim.scene.first_hits import VisibleSurfaces
 from mitsim.scene.inspect import SceneFacts, ShapeFacts
@@ -367,6 +367,14 @@ def _task(facts: SceneFacts, task: TaskFeatures) -> Iterator[SceneFinding]:
             yield SceneFinding("error", name, "a feature of the task without a shape in the scene", advice)
         else:
             yield from _nominal(facts.shapes[names.index(name)], feature)
+    if task.measurements:
+        whole = Task(features=task.features, measurements=task.measurements, decision=task.decision)
+        for name in whole.measurements:
+            if fault := misstated(whole, name):
+                value, allowed, hint = fault
+                yield SceneFinding(
+                    "error", name, f"the nominal value is {value}; allowed: {allowed}", hint[0].upper() + hint[1:]
+                )
 
 
 def _nominal(shape: ShapeFacts, feature: Feature) -> Iterator[SceneFinding]:
