@@ -31,7 +31,8 @@ EARLIER = "earlier"
 #: files that show that a folder holds results, and all files that belong to them; ``run.json`` first, as it names
 #: others
 _KNOWN_BY = ("run.json", "scores.nc", "checks.nc", "statement.json")
-_RESULTS = (*_KNOWN_BY, "report.html", "scores.csv", "part.ply", TASK, "stand.npz", "poses", "clouds", "captures")
+_WRITTEN = ("report.html", "sheet.pdf", "scores.csv", "view_set.csv", "part.ply", TASK, "stand.npz")
+_RESULTS = (*_KNOWN_BY, *_WRITTEN, "poses", "clouds", "captures")
 
 #: hint for a folder whose files are of several runs
 AGAIN = "run the study again: mitsim run STUDY.toml -o DIR"

@@ -105,7 +105,7 @@ def test_what_a_task_knows_becomes_measurements_and_the_rest_is_listed(drawn, tm
 
 @needs_step
 def test_limits_of_a_drawing_count_from_the_model(tmp_path, step_here):
-    """Both bores are 12 mm: a drawing that states 12.1 with limits about the model keeps these; 14 +- 0.1 is a fault."""
+    """Both bores are 12 mm: a drawing that states 12.1 with limits about the model keeps these; 14 is a fault."""
     path = write_step([("bracket", bracket(), None)], tmp_path / "bracket.step", "AP242DIS")
     face = {one.name: one.entities[0] for one in read_part(path).faces}
     drawing = Drawing(path.read_text())

@@ -70,6 +70,8 @@ def test_files_that_run_json_does_not_name_are_not_read(folder):
 
 
 def test_results_of_another_study_are_moved_away_whole(folder):
+    for name in ("sheet.pdf", "view_set.csv"):
+        (folder / name).write_bytes(b"of the study before")
     before = {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     (folder / "trials").mkdir()
     (folder / "trials" / "view_0001.jsonl").write_text("kept", encoding="utf-8")
