@@ -39,7 +39,7 @@ AGAIN = "run the study again: mitsim run STUDY.toml -o DIR"
 
 
 def claim_folder(folder: str | Path, command: str, digest: str) -> Path | None:
-    """Reserve a folder for the results of a command, before it writes anything.
+    """Reserve a folder for the results of a command, before it writes anything; remove its ``run.json``.
 
     Parameters
     ----------
@@ -71,6 +71,7 @@ def claim_folder(folder: str | Path, command: str, digest: str) -> Path | None:
             moved.mkdir(parents=True)
             for name in there:
                 (folder / name).rename(moved / name)
+        (folder / "run.json").unlink(missing_ok=True)  # until the command ends, the folder holds no whole run
         if before != mine:
             folder.mkdir(parents=True, exist_ok=True)
             write_json(folder / OWNER, mine)
