@@ -112,7 +112,8 @@ def _inspected(
 ) -> tuple[Authored, VisibleSurfaces, Transform]:
     """Load a scene and look for mistakes; return also what the sensor sees, and its pose: the usual one if None."""
     from mitsim.report.author_page import Authored
-    from mitsim.scene.authoring.check import findings, read_features
+    from mitsim.scene.authoring.check import findings
+    from mitsim.scene.authoring.check_task import read_features
     from mitsim.scene.first_hits import visible_surfaces
     from mitsim.scene.inspect import inspect
     from mitsim.scene.load import load_scene

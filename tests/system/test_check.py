@@ -15,7 +15,8 @@ from characterisation.files.errors import InputError
 from mitsim.report.scene_preview import preview_figure
 from mitsim.report.scene_table import as_data, as_text
 from mitsim.report.style import write_png
-from mitsim.scene.authoring.check import findings, read_features
+from mitsim.scene.authoring.check import findings
+from mitsim.scene.authoring.check_task import read_features
 from mitsim.scene.first_hits import visible_surfaces
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
@@ -270,6 +271,22 @@ def test_text_and_data_say_the_same(scenes, n10):
     assert pillar["bounds_mm"] == [[-55, -20, 0], [-15, 20, 60]]
     assert (pillar["triangles"], pillar["closed"], pillar["finish"]) == (None, None, "aluminium/ground")
     json.dumps(data, allow_nan=False)
+
+
+def test_the_wall_of_a_bore_is_noted_until_its_rim_is_a_feature(check):
+    wall = (
+        '<shape type="cylinder" id="{name}"><point name="p0" x="{x}" y="0" z="-10"/><point name="p1" x="{x}" y="0" z="0"/>'
+        '<float name="radius" value="20"/><boolean name="flip_normals" value="{flip}"/>' + METAL + "</shape>"
+    )
+    body = wall.format(name="bore", x=-30, flip="true") + wall.format(name="pin", x=30, flip="false")
+    task = "[features.top]\nkind='plane'\npoint_mm=[0,0,0]\ndirection=[0,0,1]\n"
+    for name, x in (("bore", -30), ("pin", 30)):
+        task += f"[features.{name}]\nkind='cylinder'\npoint_mm=[{x},0,0]\ndirection=[0,0,1]\nradius_mm=20\n"
+        task += f"[measurements.{name}_d]\nkind='diameter'\nfeatures=['{name}']\nnominal=40\nunit='mm'\n"
+    checked = check(body, task=task)
+    assert checked.says("note", "bore", "measure its rim") and not checked.says("note", "pin", "measure its rim")
+    rim = "[features.rim]\nkind='circle'\nof=['top']\npoint_mm=[-30,0,0]\nradius_mm=20\n"
+    assert not check(body, task=task + rim).says("note", "bore", "measure its rim")
 
 
 def test_the_picture_shows_every_feature_in_a_colour_of_its_own(scenes, n10, tmp_path):
