@@ -10,6 +10,7 @@ from mitsim.study.run_record import draw_clouds, own_files, run_record, runners_
 from mitsim.study.scoring import write_inputs, write_raced
 from mitsim.study.session import Session
 from mitsim.study.virtual.race import Raced
+from mitsim.views.view_scores import not_scored_in_words
 
 
 def complete_winner(session: Session, scores: xr.Dataset, raced: Raced, leaders: dict[str, int]) -> None:
@@ -38,5 +39,6 @@ def complete_winner(session: Session, scores: xr.Dataset, raced: Raced, leaders:
     draw_clouds(session, performance_map, drawn)
     about = run_record(study, performance_map, raced, [], None) | {"leaders": leaders}
     about["runners_up"] = runners_up(session, raced)
+    about["lacks"] = list(filter(None, [not_scored_in_words(scores)]))
     about["files"] = digests_of(folder, own_files(study, drawn, [], stated=True))
     write_json(folder / "run.json", about)
