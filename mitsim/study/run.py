@@ -221,9 +221,9 @@ def lacking(study: Study, scores: xr.Dataset, raced: Raced, stated: StatedView |
         return out
     out += filter(None, [not_scored_in_words(scores)])
     if len(raced.views) and not raced.decided:
-        trials = f"{raced.trials} trial{'s' if raced.trials > 1 else ''}"
+        raced_by = f"{raced.trials} trial{'s' if raced.trials > 1 else ''}"
         out.append(
-            f"views compared by {trials}: view {raced.leader(ALL)} leads, "
+            f"views compared by {raced_by}: view {raced.leader(ALL)} leads, "
             f"{in_words(raced.standings[ALL], raced.margin)}"
         )
     if len(raced.views) and stated is None:

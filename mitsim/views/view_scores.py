@@ -192,8 +192,8 @@ def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above 
     overall = rank_views(-risk.mean(axis=0), np.asarray(possible.all(axis=0)))
     long_name = "rank by the mean logarithm of the predicted risk over all measurements, 1 is best"
     add("overall_rank", ("view",), overall, long_name)
-    limit, feature = _limits(task, scored, scores, possible)
-    add("limit", by, limit, "limiting factor of the view, against the best view")
+    factor, feature = _limits(task, scored, scores, possible)
+    add("limit", by, factor, "limiting factor of the view, against the best view")
     add("limiting_feature", by, feature, "the feature that contributes most")
     measurements = task.measurements.values()
     scores["nominal"] = ("measurement", [m.nominal for m in measurements], {"units": "mm or deg"})
