@@ -101,8 +101,8 @@ class RowValues:
             return None
         return self.share / self.demand
 
-    def texts(self) -> ResultRow:
-        """Return the row of the table, as texts."""
+    def texts(self, readings: bool = True) -> ResultRow:
+        """Return the row of the table, as texts; without ``readings``, nothing is said of those that are accepted."""
         limit = self.share_limit
         size = _size(self.tolerance)
         return ResultRow(
@@ -116,7 +116,7 @@ class RowValues:
             share=NONE if self.share is None else _share(self.share),
             share_interval="" if limit is None else _interval(self.demand_interval, limit),
             share_limit="" if limit is None else percent(limit),
-            accepted=accepted_words(self.accepted, self.unit, size) if self.rule else NONE,
+            accepted=accepted_words(self.accepted, self.unit, size) if self.rule and readings else NONE,
             false_accept=percent(self.false_accept),
             without_value=percent(self.without_value),
             limited=self.limited,
