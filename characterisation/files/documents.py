@@ -42,6 +42,9 @@ _BRACKETS = re.compile(r"[][{}]")
 _PART = r"(?<![A-Za-z0-9_-])(?:[A-Za-z0-9_-]++|[\"'][^\"'\n]*+[\"'])[ \t]*+\.[ \t]*+"
 _LONG_KEY = re.compile(f"(?:{_PART}){{{DEEPEST}}}")
 
+#: a value such as ``0,3``
+_DECIMAL_COMMA = re.compile(r"=\s*[+-]?\d+,\d")
+
 #: what a name may be made of: it may become part of a file's name, of a table or of a page; none begins or ends with a
 #: space or a dot, and no separator of a path, quotation mark, bracket of markup or control character is in one
 _NAME = r"\w(?:[\w .,()#&'=@~°%+-]*[\w)'°%+-])?"
@@ -100,9 +103,19 @@ def read_toml_table(path: str | Path) -> dict[str, Any]:
         table = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # also a whole number of thousands of digits
         cause = " ".join(str(error).split())[:200]
-        raise InputError(path, "", f"text that is not TOML ({cause})", "TOML, see https://toml.io") from None
+        line = _line_named(text, cause)
+        found = f"text that is not TOML ({cause}{f': {line[:100]}' if line else ''})"
+        hint = "a decimal number has a point, not a comma" if _DECIMAL_COMMA.search(line) else ""
+        raise InputError(path, "", found, "TOML, see https://toml.io", hint) from None
     _check_numbers(path, table)
     return table
+
+
+def _line_named(text: str, cause: str) -> str:
+    """Return the line of a text that a message of the parser names, or an empty text."""
+    number = re.search(r"\bline (\d+)", cause)
+    lines = text.split("\n")
+    return lines[int(number[1]) - 1].strip() if number and int(number[1]) <= len(lines) else ""
 
 
 def _check_nesting(path: Path, text: str) -> None:

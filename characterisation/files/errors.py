@@ -53,6 +53,14 @@ def _shortened(value: Any) -> str:
 
 
 def nearest(name: str, known: list[str]) -> str:
-    """Return ``did you mean 'x'?`` for the known name nearest to a misspelt one, or an empty string."""
-    close = get_close_matches(name, known, n=1, cutoff=0.6)
-    return f"did you mean {close[0]!r}?" if close else ""
+    """Return ``did you mean 'x'?`` for the known name nearest to a misspelt one, or an empty string.
+
+    Names are compared without capitals, and with spaces and underscores as hyphens.
+    """
+    by_spelling = {_spelling(one): one for one in known}
+    close = get_close_matches(_spelling(name), list(by_spelling), n=1, cutoff=0.6)
+    return f"did you mean {by_spelling[close[0]]!r}?" if close else ""
+
+
+def _spelling(name: str) -> str:
+    return name.casefold().replace(" ", "-").replace("_", "-")

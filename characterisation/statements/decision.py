@@ -65,6 +65,13 @@ GUARD_SHARE = 0.25
 #: default for the least test uncertainty ratio: the same 4 : 1
 UNCERTAINTY_RATIO = 4.0
 
+#: least number of trials whose order statistics give the coverage interval
+FEW = 39
+
+#: errors with a normal distribution, a mean of 0 and a standard deviation of 1
+_NORMAL = norm.ppf((np.arange(1000) + 0.5) / 1000)
+_NORMAL /= _NORMAL.std(ddof=1)
+
 Verdict = Literal["fits", "does not fit", "undecidable", "not decided", "no tolerance"]
 
 
@@ -141,7 +148,7 @@ class Decided:
         - ``does not fit``: some readings are accepted, but the demand is not met.
         - ``undecidable``: no reading can be accepted, because the expanded uncertainty is as large as the tolerance, or
           no value was measured.
-        - ``not decided``: too few trials to decide.
+        - ``not decided``: too few trials to decide, such as a single one with a value.
     fits_corrected
         Whether it fits if the bias is subtracted.
     needed
@@ -176,8 +183,9 @@ def decide(errors: Errors, tolerance: Tolerance) -> Decided:
     rule = tolerance.rule
     if len(errors) < 2:
         nan = math.nan
+        unsure: Verdict = "not decided" if len(errors) else "undecidable"
         return Decided(
-            WORDS[rule.rule], None, nan, (nan, nan), "undecidable", False, nan, nan, (nan, nan), nan, nan, None, None
+            WORDS[rule.rule], None, nan, (nan, nan), unsure, False, nan, nan, (nan, nan), nan, nan, None, None
         )
     bias = float(stated_errors(errors).mean())
     taken: Errors = without_bias(errors, bias) if rule.subtract_bias else errors
@@ -263,11 +271,14 @@ def demand(errors: Errors, tolerance: Tolerance) -> float:
 def needed(errors: Errors, tolerance: Tolerance) -> float:
     """Return the largest standard uncertainty that fits, for errors without bias.
 
-    The distribution of the errors is that of ``errors``, scaled.
+    The distribution of the errors is that of ``errors``, scaled; for fewer than :data:`FEW` trials it is normal. The
+    result is about a sensor, so it does not contain that a few trials determine an interval badly.
     """
     u = float(stated_errors(errors).std(ddof=1))
     if not u > 0:
         return math.nan
+    if len(errors) < FEW:
+        errors = u * _NORMAL
     unbiased = replace(tolerance, rule=tolerance.rule.model_copy(update={"subtract_bias": False}))
     if tolerance.rule.rule != "jcgm_106" and not isinstance(errors, OneSidedErrors):
         return u / demand(errors - errors.mean(), unbiased)  # the demand is proportional to the errors

@@ -44,8 +44,11 @@ def result_in_words(judged: Sequence[Judged]) -> str:
     fitting = [one for one in asked if one.verdict == "fits"]
     rest = sorted((one for one in asked if one.verdict not in ("fits", "not decided")), key=_ratio, reverse=True)
     lines = [f"fits {len(fitting)} of {len(asked)} tolerances", *(_why(one) for one in rest)]
-    if unsure := [one.name for one in asked if one.verdict == "not decided"]:
-        lines.append(f"{', '.join(unsure)}: not decided, more virtual measurements are needed")
+    unsure = [one for one in asked if one.verdict == "not decided"]
+    if valued := [one.name for one in unsure if math.isfinite(one.uncertainty)]:
+        lines.append(f"{', '.join(valued)}: not decided, more virtual measurements are needed")
+    if single := [one.name for one in unsure if not math.isfinite(one.uncertainty)]:
+        lines.append(f"{', '.join(single)}: not decided, a single virtual measurement gave a value")
     lines += [
         f"{one.name} fits, but has no value in {_percent(one.without_value)} of the virtual measurements"
         for one in fitting

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag
 
 from characterisation.features.pose_fit import Pose
-from characterisation.tasks.definitions import DEFINITIONS
+from characterisation.tasks.definitions import DEFINITIONS, Definition
 from characterisation.tasks.deviations import deviations, fold_of
 from characterisation.tasks.places import intersection, mid_plane
 from characterisation.tasks.task_file import Feature, Measurement, Task
@@ -84,14 +84,9 @@ def measurement_model(task: Task, measurement: str, sensor_from_part: ArrayLike 
         value = partial(definition.value, sensor_from_part=motion, point=point)
         pose_of = _deviations(asked, motion, [Pose(motion, motion[:3, :3] @ point + motion[:3, 3])], point=point)
         return MeasurementModel((InputQuantity("pose", asked.features),), value, pose_of)
-    extra: dict[str, Any] = {}
-    outline = np.array(task.features[asked.features[0]].outline_mm or (), float).reshape(-1, 3)
-    outline = outline @ motion[:3, :3].T + motion[:3, 3]
+    outline = _outline(task, asked, motion)
     nominal = [task.nominal(name, motion) for name in asked.features]
-    if "nominal" in definition.needs:
-        extra["nominal"] = nominal
-    if "outline" in definition.needs:
-        extra["outline"] = outline
+    extra = _further_arguments(definition, nominal, outline)
     fitted = task.fitted_for(measurement)
 
     def features_of(fits: Sequence[Any]) -> list[Any]:
@@ -107,6 +102,33 @@ def measurement_model(task: Task, measurement: str, sensor_from_part: ArrayLike 
         value_of_fits,
         None if of_features is None else lambda *fits: of_features(*features_of(fits)),
     )
+
+
+def nominal_value(task: Task, measurement: str) -> float:
+    """Return the value [mm or deg] of a measurement on the nominal geometry of its features: 0 for a form or a pose."""
+    asked = task.measurements[measurement]
+    definition = DEFINITIONS[asked.kind]
+    if definition.of != "features":
+        return 0.0
+    nominal = [task.nominal(name) for name in asked.features]
+    value = definition.value(*nominal, **_further_arguments(definition, nominal, _outline(task, asked, np.eye(4))))
+    return float(np.rad2deg(value)) if asked.unit == "deg" else value
+
+
+def _outline(task: Task, asked: Measurement, motion: Array) -> Array:
+    """Return the outline (k, 3) [mm] of the first feature of a measurement, moved; empty without an outline."""
+    outline = np.array(task.features[asked.features[0]].outline_mm or (), float).reshape(-1, 3)
+    return outline @ motion[:3, :3].T + motion[:3, 3]
+
+
+def _further_arguments(definition: Definition, nominal: Sequence[Any], outline: Array) -> dict[str, Any]:
+    """Return the arguments of a measurement beside its features: their nominal places, the outline of the first."""
+    extra: dict[str, Any] = {}
+    if "nominal" in definition.needs:
+        extra["nominal"] = nominal
+    if "outline" in definition.needs:
+        extra["outline"] = outline
+    return extra
 
 
 def _deviations(

@@ -153,6 +153,8 @@ class Measurement(Document):
         kind = info.data.get("kind")
         zone = kind is not None and DEFINITIONS[kind].zone
         wanted = "a number greater than 0" + ("" if zone else ", or [lower, upper] deviation in increasing order")
+        if isinstance(value, str):
+            wanted += " (±0.1 is 0.1)" if "±" in value else "" if zone else "; a class such as H7 is its two deviations"
         if value is None or (_is_number(value) and value > 0):
             return value if value is None else float(value)
         pair = isinstance(value, list | tuple) and len(value) == 2 and all(_is_number(end) for end in value)

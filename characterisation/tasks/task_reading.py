@@ -16,6 +16,7 @@ from characterisation.features.surfaces import Cone, Cylinder, Plane
 from characterisation.files.documents import read_toml
 from characterisation.files.errors import InputError, nearest
 from characterisation.tasks.definitions import AXIS, DEFINITIONS, FLAT, Definition
+from characterisation.tasks.measurement_model import nominal_value
 from characterisation.tasks.task_file import KEYS, Feature, Nominal, Task
 from characterisation.tasks.zones import ASKEW, frame_fault
 
@@ -32,6 +33,9 @@ PARENTS: dict[str, tuple[tuple[tuple[str, ...], ...], str]] = {
 
 #: largest distance of nominal geometry from its plane or axis [mm]
 MISPLACED_MM = 0.05
+
+#: largest difference of a nominal value from that of the nominal geometry [mm or deg]
+MISSTATED = 0.005
 
 #: largest tilt of a direction out of its face
 LEANING = 1e-3
@@ -96,6 +100,44 @@ def check_features(task: Task, task_path: str | Path, shape_ids: Iterable[str]) 
             allowed = f"ids of the scene's shapes: {', '.join(known) or 'there are none'}"
             hint = nearest(name, known)
             raise InputError(task_path, f"features.{name}", repr(name), allowed, hint)
+
+
+def check_nominal_values(task: Task, task_path: str | Path) -> None:
+    """Check that nominal values are those of the nominal geometry, from which simulated errors are counted.
+
+    Raises
+    ------
+    InputError
+        For the first measurement that states another; the hint gives the same limits about the value of the geometry.
+    """
+    for name in task.measurements:
+        if fault := misstated(task, name):
+            found, allowed, hint = fault
+            raise InputError(task_path, f"measurements.{name}.nominal", found, allowed, hint)
+
+
+def misstated(task: Task, measurement: str) -> tuple[str, str, str] | None:
+    """Return value, allowed value and hint if a nominal value differs from the nominal geometry; None if it does not.
+
+    The model of a part may lie at the middle of its tolerance. Limits about another nominal value are the same limits.
+    """
+    asked, model = task.measurements[measurement], nominal_value(task, measurement)
+    if abs(model - asked.nominal) <= MISSTATED:
+        return None
+    of = ", ".join(asked.features)
+    if asked.zone:
+        allowed = f"features whose {asked.kind} is 0 in the model: that of {of} is {model:.6g} {asked.unit}"
+        return "0", allowed, "correct the kind or the features"
+    allowed = f"{model:.6g} {asked.unit}, from the geometry of {of}"
+    low, high = asked.limits
+    if not low <= model <= high:
+        hint = "correct the value, the kind or the features"
+    elif asked.tolerance is None:
+        hint = "errors are counted from the model"
+    else:
+        deviations = f"[{low - model:.6g}, {high - model:.6g}]"
+        hint = f"errors are counted from the model; the same limits are nominal = {model:.6g}, tolerance = {deviations}"
+    return f"{asked.nominal:g}", allowed, hint
 
 
 def _check_feature(path: str | Path, task: Task, name: str) -> None:

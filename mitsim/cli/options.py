@@ -252,8 +252,8 @@ def check_file(file: Path) -> None:
 def keep_finished(folder: Path, overwrite: bool, last: str) -> None:
     """Check that a folder holds no finished run; ``last`` is the file that a run writes at its end.
 
-    With ``overwrite``, remove that file: an interrupted run must not look finished. A run that ended for lack of time
-    says so in the file, and goes on.
+    A run that ended for lack of time says so in the file, and goes on. Whoever writes the new run removes the file, or
+    moves it away with the other files of its run: an interrupted run must not look finished.
 
     Raises
     ------
@@ -265,7 +265,6 @@ def keep_finished(folder: Path, overwrite: bool, last: str) -> None:
     if not overwrite and _is_finished(folder / last):
         hint = "to repeat the run, add --overwrite (it reuses finished trials); to rewrite its page, use mitsim report"
         raise InputError("--output", "", f"{folder}, a finished run", "a folder without one", hint)
-    (folder / last).unlink()
 
 
 def _is_finished(path: Path) -> bool:

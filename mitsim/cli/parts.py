@@ -112,7 +112,8 @@ def _inspected(
 ) -> tuple[Authored, VisibleSurfaces, Transform]:
     """Load a scene and look for mistakes; return also what the sensor sees, and its pose: the usual one if None."""
     from mitsim.report.author_page import Authored
-    from mitsim.scene.authoring.check import findings, read_features
+    from mitsim.scene.authoring.check import findings
+    from mitsim.scene.authoring.check_task import read_features
     from mitsim.scene.inspect import inspect
     from mitsim.scene.load import load_scene
     from mitsim.scene.visible_surfaces import visible_surfaces
@@ -206,9 +207,12 @@ def part(
         print(f"{face.name}\t{described(face)}")
     if made.drawing is not None:
         say("\n".join(made.drawing.remarks()))
-    say(f"scene: {output / (output.absolute().name + '.xml')}\ntask: {output / 'task.toml'}")
+    scene = output / f"{output.absolute().name}.xml"
+    say(f"scene: {scene}\ntask: {output / 'task.toml'}")
     if edit:
-        _edit(output / (output.absolute().name + ".xml"), sensor, port)
+        _edit(scene, sensor, port)
+    elif made.drawing is None or not made.drawing.measurements:
+        say(f"next: write measurements into task.toml, or choose them on a page: mitsim part {scene} --edit")
 
 
 def _edit(scene: Path, sensor: str | None, port: int) -> None:

@@ -149,6 +149,7 @@ def choose(
     done = read_choice(output)
     if done is not None and done.finished:
         keep_finished(output, overwrite, CHOICE)
+        (output / CHOICE).unlink()
     report_lays(candidates[0].study)
     for one in excluded:
         say(f"{one.name} is excluded: {one.reason}")

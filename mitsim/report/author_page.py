@@ -24,7 +24,8 @@ from characterisation.tasks.definitions import DEFINITIONS
 from mitsim.report.templates import joined_script, rendered, script_content
 from mitsim.report.view_clouds import box_around, packed, packed_normals, smoothly_shaded
 from mitsim.report.view_data import COLOURS, as_json
-from mitsim.scene.authoring.check import SceneFinding, TaskFeatures
+from mitsim.scene.authoring.check_task import TaskFeatures
+from mitsim.scene.authoring.finding import SceneFinding
 from mitsim.scene.authoring.general_tolerances import ANGLES, LINEAR, ZONES
 from mitsim.scene.inspect import SceneFacts
 from mitsim.scene.load import Scene

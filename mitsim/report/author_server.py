@@ -20,7 +20,7 @@ from typing import Any
 from characterisation.files.atomic_io import atomic_write, write_text
 from characterisation.files.documents import read_toml
 from characterisation.files.errors import InputError
-from mitsim.scene.authoring.check import read_features
+from mitsim.scene.authoring.check_task import read_features
 
 _LARGEST = 64 * 1024**2
 

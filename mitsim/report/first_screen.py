@@ -210,7 +210,7 @@ def _not_measured(choice: ChoiceDocument, best: SensorEntry) -> tuple[str, ...]:
 
 
 def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[ResultRow]:
-    """Return the rows for the measurements of one sensor."""
+    """Return the rows for the measurements of one sensor; screening alone gives no readings and no losses."""
     return [
         RowValues(
             name=name,
@@ -221,8 +221,7 @@ def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[ResultRow]:
             uncertainty=cell.uncertainty,
             share=cell.share_of_tolerance,
             rule=asked.rule,
-            **_same_names(cell, _MEASURED)
-            | {"without_value": cell.without_value if cell.trials or cell.by != "none" else math.nan},
+            **_same_names(cell, _MEASURED) | ({} if cell.trials else {"without_value": math.nan}),
             **_same_names(cell, _DECIDED),
             stated=one.status == "stated",
         ).texts()

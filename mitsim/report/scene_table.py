@@ -11,7 +11,7 @@ import numpy as np
 
 from mitsim.running.numbers import or_none
 from mitsim.running.text_table import aligned
-from mitsim.scene.authoring.check import SceneFinding
+from mitsim.scene.authoring.finding import SceneFinding
 from mitsim.scene.inspect import SceneFacts, ShapeFacts
 from mitsim.scene.visible_surfaces import VisibleSurfaces
 

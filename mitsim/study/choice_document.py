@@ -102,7 +102,8 @@ class SensorEntry(PartialDocument):
 
     In a task with tolerances, only measurements with a tolerance count for ``ratio``. ``status`` is ``stated`` (virtual
     measurements), ``screened`` (screening only: fewer measurements possible, far from fitting, or out of time) or
-    ``excluded``; ``why`` gives the reason. ``poses`` starts with the view for all measurements.
+    ``excluded``; ``why`` gives the reason. ``poses`` starts with the view for all measurements. ``lacks`` says what was
+    not done for lack of time.
     """
 
     name: str
@@ -116,6 +117,7 @@ class SensorEntry(PartialDocument):
     capture: CaptureEntry | None = None
     measurements: dict[str, CellEntry] = Field(default_factory=dict)
     map_digest: str = ""
+    lacks: str = ""
 
     @property
     def impossible(self) -> dict[str, str]:

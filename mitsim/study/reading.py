@@ -19,7 +19,7 @@ from characterisation.maps.samples import Samples
 from characterisation.maps.shipped import map_path, shipped_maps
 from characterisation.statements.decision import needed, tolerance_of
 from characterisation.tasks.task_file import Task
-from characterisation.tasks.task_reading import check_features, read_task
+from characterisation.tasks.task_reading import check_features, check_nominal_values, read_task
 from mitsim.maps.campaign.missing_finishes import (
     Ask,
     NeededFinishes,
@@ -144,6 +144,7 @@ def open_study(
         sprayed=file.sprayed,
     )
     check_features(task, folder / file.task, scene.names)
+    check_nominal_values(task, folder / file.task)
     file = _with_limits(path, file, task)
     radius = float(np.linalg.norm(scene.bounds[1] - scene.bounds[0])) / 2
     standoffs = chosen_standoffs(path, file.views, sensor, radius)

@@ -58,6 +58,7 @@ from mitsim.study.view_sets.confirmed_set import (
 from mitsim.study.virtual.race import ALL, Raced, in_words
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.stated import StatedView
+from mitsim.views.view_scores import not_scored_in_words
 
 #: number of best views per measurement whose predicted clouds are written to the run folder
 SHOWN = 3
@@ -147,7 +148,7 @@ def run_within(
     performance_map = _map(study, twin, folder)
     clock.lap("characterise")
 
-    scores, chosen, search = score_study(session, performance_map)
+    scores, chosen, search = score_study(session, performance_map, plan.screening_limit(limit))
     clock.lap("score")
     answers = _Answers(session, performance_map, scores, limit, clock, report)
     minutes_of_race = study.file.race.minutes
@@ -207,30 +208,32 @@ def run_within(
         view_sets=[] if chosen is None else [_set_record(study, chosen, tried)],
         remedies=remedies,
         seconds=clock.steps,
-        lacks=lacking(study, raced, stated, limit),
+        lacks=lacking(study, scores, raced, stated, limit),
         finished=not limit.over(),
     )
     return [] if stated is None else stated.statements
 
 
-def lacking(study: Study, raced: Raced, stated: StatedView | None, limit: TimeLimit) -> list[str]:
+def lacking(study: Study, scores: xr.Dataset, raced: Raced, stated: StatedView | None, limit: TimeLimit) -> list[str]:
     """Return what a run with a limit has not done, each in a few words; nothing for a run that ended by its own rules.
 
     Parameters
     ----------
     study
         Study of the run.
-    raced, stated
-        Results of race and statement.
+    scores, raced, stated
+        Results of screening, race and statement.
     limit
         Time of the run.
     """
     out = list[str]()
     if not limit.over() and limit.end is None:
         return out
+    out += filter(None, [not_scored_in_words(scores)])
     if len(raced.views) and not raced.decided:
+        raced_by = f"{raced.trials} trial{'s' if raced.trials > 1 else ''}"
         out.append(
-            f"views compared by {raced.trials} trials: view {raced.leader(ALL)} leads, "
+            f"views compared by {raced_by}: view {raced.leader(ALL)} leads, "
             f"{in_words(raced.standings[ALL], raced.margin)}"
         )
     if len(raced.views) and stated is None:
@@ -239,7 +242,8 @@ def lacking(study: Study, raced: Raced, stated: StatedView | None, limit: TimeLi
         open_ones = [one.measurement for one in stated.statements if not one.settled]
         if open_ones:
             trials = stated.statements[0].trials
-            out.append(f"statement from {trials} trials: {len(open_ones)} of {len(stated.statements)} not settled")
+            by = f"{trials} trial{'s' if trials > 1 else ''}"
+            out.append(f"statement from {by}: {len(open_ones)} of {len(stated.statements)} not settled")
         if not any(one.budget for one in stated.statements):
             out.append("no budget")
     if limit.over():

@@ -31,14 +31,15 @@ EARLIER = "earlier"
 #: files that show that a folder holds results, and all files that belong to them; ``run.json`` first, as it names
 #: others
 _KNOWN_BY = ("run.json", "scores.nc", "checks.nc", "statement.json")
-_RESULTS = (*_KNOWN_BY, "report.html", "scores.csv", "part.ply", TASK, "stand.npz", "poses", "clouds", "captures")
+_WRITTEN = ("report.html", "sheet.pdf", "scores.csv", "view_set.csv", "part.ply", TASK, "stand.npz")
+_RESULTS = (*_KNOWN_BY, *_WRITTEN, "poses", "clouds", "captures")
 
 #: hint for a folder whose files are of several runs
 AGAIN = "run the study again: mitsim run STUDY.toml -o DIR"
 
 
 def claim_folder(folder: str | Path, command: str, digest: str) -> Path | None:
-    """Reserve a folder for the results of a command, before it writes anything.
+    """Reserve a folder for the results of a command, before it writes anything; remove its ``run.json``.
 
     Parameters
     ----------
@@ -70,6 +71,7 @@ def claim_folder(folder: str | Path, command: str, digest: str) -> Path | None:
             moved.mkdir(parents=True)
             for name in there:
                 (folder / name).rename(moved / name)
+        (folder / "run.json").unlink(missing_ok=True)  # until the command ends, the folder holds no whole run
         if before != mine:
             folder.mkdir(parents=True, exist_ok=True)
             write_json(folder / OWNER, mine)

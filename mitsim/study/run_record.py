@@ -26,6 +26,7 @@ from mitsim.study.scoring import write_inputs, write_raced
 from mitsim.study.session import Session
 from mitsim.study.virtual.race import ALL, Raced
 from mitsim.study.virtual.stated import compared
+from mitsim.views.view_scores import not_scored_in_words
 
 #: number of runners-up in the record of a run
 RUNNERS_UP = 5
@@ -175,4 +176,5 @@ def complete_winner(session: Session, scores: xr.Dataset, raced: Raced, leaders:
     write_raced(session, scores, raced)
     drawn = sorted(set(leaders.values()))
     draw_clouds(session, performance_map, drawn)
-    write_record(session, performance_map, raced, drawn, [], stated=True, leaders=leaders)
+    lacks = list(filter(None, [not_scored_in_words(scores)]))
+    write_record(session, performance_map, raced, drawn, [], stated=True, leaders=leaders, lacks=lacks)

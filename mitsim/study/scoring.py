@@ -26,6 +26,7 @@ from characterisation.scores.view_sets import ViewSet
 from characterisation.tasks.measurement_model import InputQuantity
 from mitsim.maps.campaign.run import write_netcdf
 from mitsim.running.progress import say
+from mitsim.running.time_limit import TimeLimit
 from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.study import SetTable, Study
 from mitsim.study.run_files import TASK
@@ -39,15 +40,15 @@ from mitsim.views import write_views
 
 
 def score_study(
-    session: Session, performance_map: PerformanceMap | None = None
+    session: Session, performance_map: PerformanceMap | None = None, limit: TimeLimit | None = None
 ) -> tuple[xr.Dataset, ViewSet | None, Search]:
     """Score all views, choose a set if the study asks for one, and write ``scores`` and the inputs.
 
-    The map is by default that of the study. Returns the scores, the set, and the function that finds a set for other
-    limits.
+    The map is by default that of the study. A ``limit`` of time bounds the number of views that are scored. Returns the
+    scores, the set, and the function that finds a set for other limits.
     """
     study, folder = session.study, session.folder
-    scores, inputs = session.screen(performance_map)
+    scores, inputs = session.screen(performance_map, limit)
     shares = stated_shares(study.task)
     search = partial(set_within, study, inputs, shares)
     chosen = _chosen_set(study, search)

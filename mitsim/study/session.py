@@ -131,12 +131,15 @@ class Session:
             )
 
     def screen(
-        self, performance_map: PerformanceMap | None = None
+        self, performance_map: PerformanceMap | None = None, limit: TimeLimit | None = None
     ) -> tuple[xr.Dataset, list[dict[InputQuantity, Any]]]:
-        """Score all views with a map, by default that of the study: :func:`mitsim.study.virtual.screening.screen`."""
+        """Score all views with a map, by default that of the study, or those that a limit of time allows.
+
+        The function is :func:`mitsim.study.virtual.screening.screen`.
+        """
         performance_map = self.study.performance_map if performance_map is None else performance_map
         assert performance_map is not None
-        return screen(self.study, self.predictor, performance_map, self.unknowns)
+        return screen(self.study, self.predictor, performance_map, self.unknowns, limit)
 
     def race(
         self,

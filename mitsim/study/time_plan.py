@@ -14,6 +14,9 @@ from mitsim.running.time_limit import TimeLimit
 #: expected time of screening [s] for each view; largest share of the whole that is planned for it
 SCREENING_S, _SCREENING_SHARE = 0.2, 0.3
 
+#: share of the time that is left after which screening ends with the views that it has scored
+_LONGEST_SCREENING = 0.4
+
 #: share of the whole for pictures and report, with its bounds [s]
 _REPORT_SHARE, _REPORT_S = 0.15, (5.0, 40.0)
 
@@ -52,6 +55,10 @@ class TimePlan:
             (self.report, "pictures and report"),
         ]
         return f"about {_in_words(self.total)}: " + ", ".join(f"{_in_words(seconds)} {name}" for seconds, name in steps)
+
+    def screening_limit(self, limit: TimeLimit) -> TimeLimit:
+        """Return the limit of the screening, which starts now: on a slow machine it takes longer than planned."""
+        return limit.part(_LONGEST_SCREENING)
 
     def race_limit(self, limit: TimeLimit) -> TimeLimit:
         """Return the limit of the race, which starts now."""

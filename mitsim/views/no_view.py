@@ -59,7 +59,7 @@ def why_no_view(scores: xr.Dataset, measurement: str, shapes: Sequence[str]) -> 
         rarest = int(points[best].argmin())
         return (
             f"enough points are too rare, at most in {100 * chance:.0f} % of the captures: from the best view "
-            f"{shapes[rarest]} has {points[best].min():.0f} on average, {needed:.0f} are needed"
+            f"{shapes[rarest]} has {points[best].min():.0f} on average by direct light alone, {needed:.0f} are needed"
         )
     return f"the points of {listed(shapes)} that a view shows do not determine it"
 

@@ -4,20 +4,22 @@ Signal chain: view -> thinned rays x part -> F, sigma, noise area and persistent
 expected fits and measurements with their uncertainty (:mod:`characterisation.tasks.prediction`), and the points and
 noise of the talk's score V_m -> ranks by each, and the limiting factor of each view -> sets of views.
 
-Scores are expectations; nothing is drawn at random.
+Scores are expectations; nothing is drawn at random. Within a limit of time, views far apart are scored first; a view
+that time did not reach counts as one that cannot measure.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from characterisation.features.robust_fit import FitError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.scores.view_score import rank_views, score_views, view_statistics
 from characterisation.tasks.covariance import LEAST_CHANCE, ExpectedPoints
@@ -44,6 +46,7 @@ from mitsim.maps.prediction import (
     together,
 )
 from mitsim.running.progress import track
+from mitsim.running.time_limit import TimeLimit
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
 from mitsim.sensor.transforms import Transform
@@ -60,6 +63,9 @@ RAYS = 40_000
 
 #: statistics of V_m in :class:`_ViewScore`, in the order of :func:`view_statistics`
 _STATISTICS = ("n", "sigma", "n_white", "sigma_white", "n_only")
+
+#: fewest views that are scored within a limit of time: as many as the corners of an icosahedron
+FEWEST_VIEWS = 12
 
 #: R_f below which a lack of points is attributed to occlusion
 OCCLUDED = 0.75
@@ -92,7 +98,7 @@ class _ViewScore:
     measurements: list[ExpectedMeasurement]
 
 
-def score_candidates(
+def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above this module
     scene: Scene,
     task: Task,
     views: Sequence[View],
@@ -100,6 +106,7 @@ def score_candidates(
     performance_map: PerformanceMap,
     minimum_points: float,
     effects: Sequence[Effect] = (),
+    limit: TimeLimit | None = None,
 ) -> tuple[xr.Dataset, list[dict[InputQuantity, Any]]]:
     """Score and rank views.
 
@@ -119,6 +126,8 @@ def score_candidates(
         Least number of points of a shape.
     effects
         Effects beyond the map that the predicted uncertainty includes. V_m includes none.
+    limit
+        Time of the scoring, after at least :data:`FEWEST_VIEWS` views; by default all views are scored.
 
     Returns
     -------
@@ -126,7 +135,8 @@ def score_candidates(
         That of :func:`characterisation.scores.view_score.score_views`, with ``predicted_uncertainty`` [mm or deg],
         ``chance``, ``uncertainty_possible``, ``uncertainty_rank``, ``limit`` and ``limiting_feature`` (measurement,
         view); ``overall_rank`` (view); ``mean_sigma``, ``n_white``, ``mean_sigma_white`` and ``n_only_white`` (view,
-        feature); the poses; and ``nominal``, ``tolerance`` and ``unit`` of the measurements.
+        feature); the poses; and ``nominal``, ``tolerance`` and ``unit`` of the measurements. The attribute
+        ``views_scored`` counts the views that were scored.
     list of dict
         For every view, the input quantities of its measurements, from which sets of views are chosen.
 
@@ -150,10 +160,20 @@ def score_candidates(
         return _score_view(cast, view, scene, task, performance_map, minimum_points, looking)
 
     # the rays of the next view are cast while this view is evaluated
-    scored = [one for _, one in track(one_ahead(views, cast, score), "score views", len(views))]
+    bounded = limit is not None and limit.end is not None
+    order = _far_apart(views) if bounded else list(range(len(views)))
+    by_place = dict[int, _ViewScore]()
+    for place, (_, one) in zip(
+        order, track(one_ahead([views[i] for i in order], cast, score), "score views", len(views)), strict=False
+    ):
+        by_place[place] = one
+        if limit is not None and limit.over() and len(by_place) >= FEWEST_VIEWS:
+            break
+    scored = [by_place.get(place) or _not_scored(by_place[order[0]]) for place in range(len(views))]
     columns = (np.array([getattr(one, key) for one in scored]) for key in _STATISTICS)
     statistics = view_statistics(names, *columns)
     scores = score_views(statistics, task, minimum_points)
+    scores.attrs["views_scored"] = len(by_place)
     for name in ("mean_sigma", "n_white", "mean_sigma_white", "n_only_white"):
         scores[name] = statistics[name]
     uncertainty, chance = (
@@ -176,8 +196,8 @@ def score_candidates(
     overall = rank_views(-risk.mean(axis=0), np.asarray(possible.all(axis=0)))
     long_name = "rank by the mean logarithm of the predicted risk over all measurements, 1 is best"
     add("overall_rank", ("view",), overall, long_name)
-    limit, feature = _limits(task, scored, scores, possible)
-    add("limit", by, limit, "limiting factor of the view, against the best view")
+    factor, feature = _limits(task, scored, scores, possible)
+    add("limit", by, factor, "limiting factor of the view, against the best view")
     add("limiting_feature", by, feature, "the feature that contributes most")
     measurements = task.measurements.values()
     scores["nominal"] = ("measurement", [m.nominal for m in measurements], {"units": "mm or deg"})
@@ -185,6 +205,37 @@ def score_candidates(
     scores["tolerance"] = ("measurement", tolerances, {"units": "mm or deg"})
     scores["unit"] = ("measurement", [m.unit for m in measurements])
     return with_poses(scores, views), [one.inputs for one in scored]
+
+
+def not_scored_in_words(scores: xr.Dataset) -> str:
+    """Return how many views were scored within a limit of time; empty if all were."""
+    scored, views = int(scores.attrs.get("views_scored", scores.sizes["view"])), scores.sizes["view"]
+    return f"{scored} of {views} views screened, for lack of time" if scored < views else ""
+
+
+def _far_apart(views: Sequence[View]) -> list[int]:
+    """Return the places of all views, each as far as possible from those before it in direction, roll and distance."""
+    poses = [view.world_from_sensor.matrix() for view in views]
+    reach = max(float(np.linalg.norm(pose[:3, 3])) for pose in poses)
+    rows = np.array([[*pose[:3, :3].ravel(), *(pose[:3, 3] / reach)] for pose in poses])
+    order, nearest = [0], np.linalg.norm(rows - rows[0], axis=1)
+    nearest[0] = -1.0
+    while len(order) < len(rows):
+        order.append(int(nearest.argmax()))
+        nearest = np.minimum(nearest, np.linalg.norm(rows - rows[order[-1]], axis=1))
+        nearest[order] = -1.0
+    return order
+
+
+def _not_scored(like: _ViewScore) -> _ViewScore:
+    """Return the results of a view that was not scored: no points, and no measurement."""
+    none, unknown = np.zeros_like(like.n), np.full_like(like.sigma, np.nan)
+    missing = FitError("not scored, for lack of time")
+    measurements = [
+        replace(one, uncertainty=math.nan, chance=0.0, reason=str(missing), contributions=(math.nan,) * len(one.inputs))
+        for one in like.measurements
+    ]
+    return _ViewScore(none, unknown, none, unknown, none, dict.fromkeys(like.inputs, missing), measurements)
 
 
 def screening_risk(scores: xr.Dataset) -> Floats:

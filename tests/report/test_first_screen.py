@@ -9,6 +9,7 @@ import pytest
 
 from characterisation.statements.verdict_words import Judged
 from characterisation.tasks.definitions import DEFINITIONS
+from mitsim.report.choice_page import write_choice_page
 from mitsim.report.first_rows import RowValues, measured_words, tolerance_words
 from mitsim.report.first_screen import of_choice, of_run, sensor_rows, tone_of
 from mitsim.report.page import write_report
@@ -144,6 +145,21 @@ def test_values_that_are_missing_are_told_of_a_comparison_without_tolerances(tmp
     first = of_choice(read_choice(folder), None)
     assert first.tone == "warn" and "no value in up to 29 % of the virtual measurements" in first.words
     assert not first.tolerances
+
+
+def test_screening_alone_says_nothing_of_readings_and_of_losses(tmp_path):
+    folder = write_choice(tmp_path / "choice")
+    document = json.loads((folder / "choice.json").read_text(encoding="utf-8"))
+    document["sensors"] = [document["sensors"][2]]
+    for cell in document["sensors"][0]["measurements"].values():
+        cell |= {"trials": 0, "without_value": 0.0, "accepted": None}
+    (folder / "choice.json").write_text(json.dumps(document), encoding="utf-8")
+    choice = read_choice(folder)
+    assert {(row.accepted, row.without_value) for row in sensor_rows(choice, choice.sensors[0])} == {("–", "–")}
+    with without_pictures():
+        write_choice_page(folder)
+    text = html.unescape(re.sub(r"<[^>]*>|\s+", " ", (folder / "choice.html").read_text(encoding="utf-8")))
+    assert "0 virtual measurements" not in text
 
 
 def test_a_row_names_the_largest_line_of_the_budget_only_if_the_trials_tell_it(run_folder, tmp_path):

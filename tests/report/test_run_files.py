@@ -69,6 +69,8 @@ def test_files_that_run_json_does_not_name_are_not_read(folder):
 
 
 def test_results_of_another_study_are_moved_away_whole(folder):
+    for name in ("sheet.pdf", "view_set.csv"):
+        (folder / name).write_bytes(b"of the study before")
     before = {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     (folder / "trials").mkdir()
     (folder / "trials" / "view_0001.jsonl").write_text("kept", encoding="utf-8")
@@ -85,7 +87,9 @@ def test_results_of_another_study_are_moved_away_whole(folder):
 def test_the_same_study_goes_on_where_it_was(folder):
     assert claim_folder(folder, "run", "a" * 32) is not None  # whose it was is not known
     (folder / "scores.nc").write_bytes(b"of a")
+    (folder / "run.json").write_bytes(b"of a, not finished")
     assert claim_folder(folder, "run", "a" * 32) is None
+    assert not (folder / "run.json").exists()
     assert (folder / "scores.nc").read_bytes() == b"of a"
     second = claim_folder(folder, "score", "a" * 32)
     assert second is not None and (second / "scores.nc").read_bytes() == b"of a"

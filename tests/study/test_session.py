@@ -18,6 +18,7 @@ from mitsim.study.statement_document import statement_document
 from mitsim.study.virtual import stated as state
 from mitsim.study.virtual.stated import BATCH, MOST, TrialsOfView, batches
 from mitsim.study.virtual.trials import Outcome
+from mitsim.views.view_scores import FEWEST_VIEWS, not_scored_in_words
 from tests.smaller_sensors import coarse_sensor
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
@@ -40,6 +41,25 @@ def test_to_screen_needs_neither_a_folder_nor_the_measurements(study, monkeypatc
     monkeypatch.setattr(session, "measurements_of", lambda *_: pytest.fail("measurements were prepared"))
     scores, inputs = Session(study).screen()
     assert scores.sizes["view"] == len(inputs) == len(study.views)
+
+
+def test_screening_within_a_limit_scores_views_that_lie_far_apart_and_says_how_many(study):
+    views = study.file.views.model_copy(update={"subdivisions": 1, "rolls_deg": [0.0, 90.0]})
+    many = open_study(SCENES / "study.toml", study.file.model_copy(update={"views": views}))
+    whole, _ = Session(many).screen()
+    some, inputs = Session(many).screen(limit=TimeLimit(1.0, time.monotonic() - 2.0))
+    assert some.attrs["views_scored"] == FEWEST_VIEWS < some.sizes["view"] == len(inputs) == len(many.views)
+    assert not_scored_in_words(some) == f"{FEWEST_VIEWS} of {len(many.views)} views screened, for lack of time"
+    assert not_scored_in_words(whole) == ""
+    u = some["predicted_uncertainty"].transpose("view", "measurement").values
+    scored = np.isfinite(u).any(axis=1)
+    assert 0 < scored.sum() <= FEWEST_VIEWS
+    np.testing.assert_array_equal(u[scored], whole["predicted_uncertainty"].transpose("view", "measurement")[scored])
+    assert not some["uncertainty_possible"].transpose("view", "measurement").values[~scored].any()
+    azimuths = np.sort([view.azimuth_deg % 360 for view, known in zip(many.views, scored, strict=True) if known])
+    gaps = np.diff([*azimuths, azimuths[0] + 360])
+    assert gaps.max() < 120  # from all sides of the part
+    assert {view.roll_deg for view, known in zip(many.views, scored, strict=True) if known} == {0.0, 90.0}
 
 
 def test_measurements_that_were_released_are_made_again_the_same_and_unknowns_stay(study, tmp_path):
@@ -121,9 +141,14 @@ def test_a_run_within_a_limit_says_what_it_lacks_and_goes_on_without_one(study, 
     run_within(study, tmp_path, out_of_time)
     about = read_run(tmp_path).about
     assert not about.finished and about.raced_views and any("statement" in one for one in about.lacks)
+    views = study.file.views.model_copy(update={"subdivisions": 1, "rolls_deg": [0.0, 90.0]})
+    many = open_study(SCENES / "study.toml", study.file.model_copy(update={"views": views}))
+    run_within(many, tmp_path / "many", TimeLimit(1.0, time.monotonic() - 2.0))
+    lacks = f"{FEWEST_VIEWS} of {len(many.views)} views screened, for lack of time"
+    assert lacks in read_run(tmp_path / "many").about.lacks
     rules = {"race": RaceTable(shortlist=1, trials=4), "statement": StatementTable(trials=2)}
-    keep_finished(tmp_path, False, "run.json")
-    assert not (tmp_path / "run.json").exists()
+    keep_finished(tmp_path, False, "run.json")  # no error
+    assert read_run(tmp_path).about == about  # still there, so that a run of another study moves it away with the rest
     whole = run_study(replace(study, file=study.file.model_copy(update=rules)), tmp_path / "other")
     about = read_run(tmp_path / "other").about
     assert whole[0].trials == 2 and about.finished and not about.lacks

@@ -14,12 +14,14 @@ from characterisation.files.errors import InputError
 from mitsim.report.scene_preview import preview_figure
 from mitsim.report.scene_table import as_data, as_text
 from mitsim.report.style import write_png
-from mitsim.scene.authoring.check import findings, read_features
+from mitsim.scene.authoring.check import findings
+from mitsim.scene.authoring.check_task import read_features
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
 from mitsim.scene.visible_surfaces import visible_surfaces
 from mitsim.sensor.working_volume import common_view, field_of_view, in_image, in_working_volume, pose_at, usual_place
 from tests.shell import ROOT, mitsim_here
+from tests.small_study import small_study
 from tests.smaller_sensors import binned
 
 METAL = """<bsdf type="machined_metal"><string name="metal" value="aluminium"/>
@@ -271,6 +273,23 @@ def test_text_and_data_say_the_same(scenes, n10):
     json.dumps(data, allow_nan=False)
 
 
+def test_the_wall_of_a_bore_is_noted_until_its_rim_is_a_feature(check):
+    wall = (
+        '<shape type="cylinder" id="{name}"><point name="p0" x="{x}" y="0" z="-10"/>'
+        '<point name="p1" x="{x}" y="0" z="0"/>'
+        '<float name="radius" value="20"/><boolean name="flip_normals" value="{flip}"/>' + METAL + "</shape>"
+    )
+    body = wall.format(name="bore", x=-30, flip="true") + wall.format(name="pin", x=30, flip="false")
+    task = "[features.top]\nkind='plane'\npoint_mm=[0,0,0]\ndirection=[0,0,1]\n"
+    for name, x in (("bore", -30), ("pin", 30)):
+        task += f"[features.{name}]\nkind='cylinder'\npoint_mm=[{x},0,0]\ndirection=[0,0,1]\nradius_mm=20\n"
+        task += f"[measurements.{name}_d]\nkind='diameter'\nfeatures=['{name}']\nnominal=40\nunit='mm'\n"
+    checked = check(body, task=task)
+    assert checked.says("note", "bore", "measure its rim") and not checked.says("note", "pin", "measure its rim")
+    rim = "[features.rim]\nkind='circle'\nof=['top']\npoint_mm=[-30,0,0]\nradius_mm=20\n"
+    assert not check(body, task=task + rim).says("note", "bore", "measure its rim")
+
+
 def test_the_picture_shows_every_feature_in_a_colour_of_its_own(scenes, n10, tmp_path):
     checked = Checked(scenes / "two_pillars/two_pillars.xml", n10)
     figure = preview_figure(checked.scene, checked.facts, n10, checked.pose, checked.visible, ["pillar1"])
@@ -340,6 +359,18 @@ def test_the_command_prints_writes_and_judges(tmp_path):
     (tmp_path / "other.toml").write_text((ROOT / task).read_text().replace("pillar2", "pillar3"))
     done = mitsim_here("check", scene, "--task", tmp_path / "other.toml", code=1)
     assert "error: pillar3: a feature of the task without a shape in the scene. Did you mean" in done.stdout
+
+
+def test_a_nominal_value_that_the_part_does_not_have_is_an_error_of_check_and_stops_a_study(tmp_path):
+    scene, task = "scenes/two_pillars/two_pillars.xml", tmp_path / "task.toml"
+    task.write_text((ROOT / "scenes/two_pillars/task.toml").read_text().replace("nominal = 70.0", "nominal = 35.0", 1))
+    done = mitsim_here("check", scene, "--task", task, code=1)
+    assert "error: point1_point2_distance: the nominal value is 35; allowed: 70 mm, from the geometry of" in done.stdout
+    study = tmp_path / "study.toml"
+    study.write_text(small_study("{}", task=task))
+    done = mitsim_here("study", "score", study, "-o", tmp_path / "scores", code=2)
+    assert "measurements.point1_point2_distance.nominal: found 35; allowed: 70 mm" in done.stderr
+    assert not list(tmp_path.glob("scores/*"))
 
 
 def test_bad_input_is_told_with_code_2(tmp_path):

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import time
 from functools import partial
 from pathlib import Path
 
@@ -11,6 +12,8 @@ import trimesh
 
 from mitsim.running.time_limit import TimeLimit
 from mitsim.study.choose import choose_sensor, read_candidates
+from mitsim.study.choose.table import document
+from mitsim.views.view_scores import FEWEST_VIEWS
 from tests import shell
 from tests.small_study import MEASUREMENTS, few_measurements
 from tests.smaller_sensors import coarse_sensor
@@ -147,6 +150,24 @@ def test_sensors_that_are_none_are_one_message(chosen, sensors, told):
     folder, _, _ = chosen
     done = mitsim_here("study", "choose", folder / "study.toml", "--sensors", sensors, "-o", folder / "other")
     assert done.returncode == 2 and told in done.stderr and "Traceback" not in done.stderr
+
+
+def test_screening_leaves_time_for_virtual_measurements_and_the_result_says_what_it_lacks(chosen, tmp_path):
+    folder, _, _ = chosen
+    study = (folder / "study.toml").read_text().replace("subdivisions = 0", "subdivisions = 1\nrolls_deg = [0, 90]")
+    (tmp_path / "study.toml").write_text(study.replace('"task.toml"', f'"{folder / "task.toml"}"'))
+    candidates, excluded = read_candidates(tmp_path / "study.toml", ["kinect-v2,zivid-2-plus-m60"])
+    assert [(one.name, one.reason) for one in excluded] == [
+        ("zivid-2-plus-m60", "no performance map of it comes with mitsim: make one, and give zivid-2-plus-m60=MAP")
+    ]
+    over = TimeLimit(1.0, time.monotonic() - 2.0)
+    (result,) = choose_sensor(candidates, tmp_path / "out", over, lambda *_: None)
+    views = len(candidates[0].study.views)
+    lacks = f"{FEWEST_VIEWS} of {views} views screened, for lack of time"
+    entry = document(candidates[0].study, [result], excluded, 1.0, True).sensors[0]
+    assert views > FEWEST_VIEWS and entry.lacks == lacks and lacks in entry.words
+    (whole,) = choose_sensor(candidates, tmp_path / "out", TimeLimit(60.0), lambda *_: None)
+    assert whole.scores.attrs["views_scored"] == views  # the scores of some views are not used again
 
 
 def test_another_mesh_of_the_same_size_is_measured_anew(tmp_path):

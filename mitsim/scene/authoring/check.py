@@ -1,33 +1,21 @@
 """Find problems in a scene before it is rendered, and advise on each.
 
 Signal chain: facts about the shapes (:mod:`mitsim.scene.inspect`), what a sensor sees from one pose, the nominal
-geometry of a task -> findings.
-
-- An *error* cannot work: a feature of the task without a shape, an inside-out part.
-- A *warning* gives results that the author does not expect.
-- A *note* is information.
+geometry of a task (:mod:`mitsim.scene.authoring.check_task`) -> findings.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from characterisation.files.documents import Document, read_toml
-from characterisation.files.errors import nearest
-from characterisation.tasks.decision_table import Decision
-from characterisation.tasks.task_file import Feature, Measurement
-from characterisation.tasks.task_reading import read_task
-from mitsim.scene.authoring.face import surface_distance
+from mitsim.scene.authoring.check_task import NOMINAL_MM, TaskFeatures, task_findings
+from mitsim.scene.authoring.finding import SceneFinding, Severity
 from mitsim.scene.inspect import SceneFacts, ShapeFacts
 from mitsim.scene.mesh_facts import MeshFacts
 from mitsim.scene.surface.processes import PROCESSES
@@ -37,11 +25,6 @@ from mitsim.sensor.rig_parameters import eyes
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.working_volume import depth, field_of_view, in_image, in_working_volume
-
-Severity = Literal["error", "warning", "note"]
-
-#: largest distance of nominal geometry from the shape's surface [mm]; beyond the second it is an error
-NOMINAL_MM, MISTAKE_MM = 0.05, 1.0
 
 #: a part of fewer pixels at the middle of the working range probably has another unit
 SMALL_PX = 40
@@ -63,49 +46,6 @@ _STOCK = ("rectangle", "disk", "cube", "sphere", "cylinder")
 
 #: units in which a part that looks too small may have been modelled [mm]
 _UNITS = {word: UNITS_MM[word] for word in ("inches", "metres")}
-
-
-@dataclass(frozen=True)
-class SceneFinding:
-    """One finding: its severity, the shape or feature it is about ("" for the scene), the problem and the advice."""
-
-    severity: Severity
-    about: str
-    what: str
-    advice: str
-
-    def __str__(self) -> str:
-        about = f"{self.about}: " if self.about else ""
-        return f"{self.severity}: {about}{self.what}. {self.advice}"
-
-
-class TaskFeatures(Document):
-    """A task TOML that may have no measurements yet."""
-
-    features: dict[str, Feature]
-    measurements: dict[str, Measurement] = Field(default_factory=dict)
-    decision: Decision = Decision()
-
-    def measured_shapes(self) -> tuple[str, ...]:
-        """Return the names of the shapes of the scene that measurements depend on, each once."""
-        named = [self.features[name] for one in self.measurements.values() for name in one.features]
-        of = (parent for feature in named for parent in feature.of or ())
-        all_names = [*(name for one in self.measurements.values() for name in one.features), *of]
-        return tuple(dict.fromkeys(name for name in all_names if self.features[name].shaped))
-
-
-def read_features(path: str | Path) -> TaskFeatures:
-    """Read a task, with or without measurements.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be used, or a measurement does not fit its features.
-    """
-    task = read_toml(path, TaskFeatures)
-    if task.measurements:
-        read_task(path)
-    return task
 
 
 def findings(
@@ -143,7 +83,7 @@ def findings(
             found += _placed(shape, number, sensor, pose, visible)
     found += _whole(facts, sensor, sum(len(one) for one in borders))
     if task:
-        found += _task(facts, task)
+        found += task_findings(facts, task)
     order = ("error", "warning", "note")
     return sorted(found, key=lambda one: order.index(one.severity))
 
@@ -352,37 +292,3 @@ def _size(sizes: list[float], sensor: Sensor) -> Iterator[SceneFinding]:
         what = f"the part is {part} mm, the common view at {near:g} mm is {view[0]:.0f} x {view[1]:.0f} mm"
         unit = "; or its unit is not mm" if sizes[0] > 10 * view[0] else ""
         yield SceneFinding("warning", "", what, f"Increase the distance, or plan several views{unit}")
-
-
-def _task(facts: SceneFacts, task: TaskFeatures) -> Iterator[SceneFinding]:
-    names = [shape.name for shape in facts.shapes]
-    if not task.measurements:
-        yield SceneFinding("note", "task", "it has no measurements yet", "Add a measurement before a study")
-    for name, feature in task.features.items():
-        if not feature.shaped:
-            continue  # it is derived from others
-        if name not in names:
-            hint = nearest(name, names)
-            advice = f"D{hint[1:]}" if hint else f"The shapes are: {', '.join(names)}"
-            yield SceneFinding("error", name, "a feature of the task without a shape in the scene", advice)
-        else:
-            yield from _nominal(facts.shapes[names.index(name)], feature)
-
-
-def _nominal(shape: ShapeFacts, feature: Feature) -> Iterator[SceneFinding]:
-    """Yield a finding if the nominal geometry of a task does not lie on the shape of that name."""
-    surface = feature.nominal()
-    corners = shape.points if shape.mesh is None else shape.mesh.vertices
-    worst = float(np.abs(surface_distance(surface, corners)).max(initial=0.0))
-    if worst > NOMINAL_MM:
-        severity: Severity = "error" if worst > MISTAKE_MM else "warning"
-        what = f"the shape is up to {worst:.3g} mm off the nominal {feature.kind} of the task"
-        advice = "All errors would be measured from there: correct its position, direction or radius"
-        yield SceneFinding(severity, shape.name, what, advice)
-    elif shape.mesh is not None:
-        middles = shape.mesh.vertices[shape.mesh.triangles].mean(axis=1)
-        sag = float(np.abs(surface_distance(surface, middles)).max(initial=0.0))
-        if sag > NOMINAL_MM:
-            what = f"facets deviate by up to {sag:.2g} mm from the nominal {feature.kind}"
-            advice = "Mesh the part more finely: this is an error of the part, not of the sensor"
-            yield SceneFinding("warning", shape.name, what, advice)

@@ -165,6 +165,7 @@ class _TaskBuilder:
             said = list(remarks)
             if abs(nominal - model) > _AGREE:
                 said.append(f"the drawing states {nominal:g}, the model has {model:.6g}")
+                nominal, allowed = _about(model, nominal, allowed)
             ordered = members[::-1] if kind in _FIRST and members[0].kind != _FIRST[kind] else members
             unit = "deg" if one.angular else "mm"
             self.add(
@@ -228,6 +229,20 @@ def _deviations(one: Dimension) -> float | tuple[float, float] | None:
         return None
     alike = abs(high + low) <= 1e-9 * max(abs(high), abs(low), 1.0)
     return (high - low) / 2 if alike else (low, high)
+
+
+def _about(
+    model: float, nominal: float, allowed: float | tuple[float, float] | None
+) -> tuple[float, float | tuple[float, float] | None]:
+    """Return a nominal value and its tolerance about the model's value, with the same limits.
+
+    Errors are counted from the model. A model outside the limits keeps the drawing's value, which a study rejects.
+    """
+    if allowed is None:
+        return model, None
+    low, high = (-allowed, allowed) if isinstance(allowed, float) else allowed
+    shift = nominal - model
+    return (model, (low + shift, high + shift)) if low + shift <= 0 <= high + shift else (nominal, allowed)
 
 
 def _radius(face: Face) -> float:

@@ -66,7 +66,8 @@ class Finishing:
                 raise InputError(f"--{key}", "", f"{value:g}", f"{limits[0]:g} to {limits[1]:g}")
         for option, value, known in (("--metal", self.metal, CONSTANTS), ("--process", self.process, PROCESSES)):
             if value not in known:
-                raise InputError(option, "", repr(value), ", ".join(known), nearest(value, list(known)))
+                base = "an alloy goes by its base metal" if option == "--metal" else ""
+                raise InputError(option, "", repr(value), ", ".join(known), nearest(value, list(known)) or base)
         if not 0.005 <= self.roughness <= 10:
             raise InputError("--Ra", "", f"{self.roughness:g}", "0.005 to 10 um")
 

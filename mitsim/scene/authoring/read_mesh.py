@@ -65,7 +65,8 @@ def check_part_file(path: Path, units: str | None) -> None:
         there = sorted(p.name for p in path.parent.glob("*") if p.is_file()) if path.parent.is_dir() else []
         raise InputError(path, "", "no such file", "a STEP file or a mesh", nearest(path.name, there))
     if kind not in (*STEP, *_MESHES):
-        raise InputError(path, "", f"the ending {kind!r}", ", ".join((*STEP, *_MESHES)))
+        hint = "export the part from the CAD program as STEP"
+        raise InputError(path, "", f"the ending {kind!r}", ", ".join((*STEP, *_MESHES)), hint)
     if path.stat().st_size > _LARGEST_FILE:
         raise InputError(path, "", "a file over 1 GiB", "a smaller one", "mesh the part more coarsely")
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from characterisation.files.documents import read_toml
 from characterisation.files.errors import InputError
+from characterisation.maps.shipped import shipped_maps
 from mitsim.maps.campaign.missing_finishes import Ask
 from mitsim.sensor.preset import presets
 from mitsim.study import CharacterisationTable, Study, StudyFile, open_study
@@ -106,6 +107,9 @@ def open_candidate(path: Path, file: StudyFile, given: str, ask: Ask | None) -> 
     own = sensor.endswith(".toml")
     if not own and sensor not in presets():
         raise InputError("--sensors", "", sensor, f"{', '.join(presets())}, or a sensor TOML")
+    mapped = own or map_name or sensor in shipped_maps()
+    if not mapped and (sensor != file.sensor or file.characterisation == CharacterisationTable()):
+        return Excluded(sensor, given, f"no performance map of it comes with mitsim: make one, and give {sensor}=MAP")
     tables = [file]
     if sensor != file.sensor or map_name:
         name = str(Path(sensor).resolve()) if own else sensor

@@ -7,7 +7,8 @@ round before: a short race -> a statement from the view that is best for all mea
 measurement's own best view, where the common view does not suffice -> more trials for the leader -> its folder, as of a
 run (:mod:`mitsim.study.run_record`), and ``choice.json``.
 
-The first round gives every sensor the same share of the time. Each later one keeps the sensors whose demand may still
+Screening takes at most half of the time: within its share, a sensor scores views that lie far apart. The first round
+gives every sensor the same share of the time. Each later one keeps the sensors whose demand may still
 be the least, and gives each a share of half of the time that is left (successive halving: Karnin et al., ICML 2013).
 
 Screening includes noise and calibration, but not finish, interreflections at edges and false points. It is therefore
@@ -52,7 +53,7 @@ from mitsim.study.statement_document import statement_document
 from mitsim.study.virtual.plan import map_digest, trial_digest
 from mitsim.study.virtual.race import ALL, Raced, RaceRules
 from mitsim.study.virtual.stated import StatedView
-from mitsim.views.view_scores import screening_risk
+from mitsim.views.view_scores import not_scored_in_words, screening_risk
 
 Floats = NDArray[np.float64]
 
@@ -61,6 +62,9 @@ SHORTLIST, RACE_TRIALS = 3, 8
 
 #: trials of a statement in the first round, and their factor from round to round
 FIRST_TRIALS, GROWTH = 24, 2
+
+#: largest share of the time for screening
+_SCREENING_SHARE = 0.5
 
 #: share of the time for the rounds after the first, and largest number of rounds
 _LATER_SHARE, _ROUNDS = 0.5, 6
@@ -157,8 +161,10 @@ def choose_sensor(
         Processes or cluster that make the trials; by default this process makes them.
     """
     found = list[SensorResult]()
+    screening = limit.part(_SCREENING_SHARE)
     for number, candidate in enumerate(candidates, 1):
-        found.append(_screened(candidate, Session(candidate.study, folder / candidate.name, workers)))
+        share = screening.part(1 / (len(candidates) - number + 1))
+        found.append(_screened(candidate, Session(candidate.study, folder / candidate.name, workers), share))
         _say(found, f"{number} of {len(candidates)} screened", limit)
     rivals, count = _promising(found), FIRST_TRIALS
     report_results(_ordered(found), False)
@@ -250,8 +256,8 @@ def _ordered(found: list[SensorResult]) -> list[SensorResult]:
     return [found[i] for i in order]
 
 
-def _screened(candidate: CandidateSensor, session: Session) -> SensorResult:
-    """Return the scores of all views, from the folder if they are there."""
+def _screened(candidate: CandidateSensor, session: Session, limit: TimeLimit) -> SensorResult:
+    """Return the scores of all views, from the folder if they are there, or of those that the limit allows."""
     study, path = session.study, session.folder / "scores.nc"
     session.folder.mkdir(parents=True, exist_ok=True)
     screening = f"screening {study.file.score.light_path_depth} {map_digest(study)}"
@@ -259,8 +265,11 @@ def _screened(candidate: CandidateSensor, session: Session) -> SensorResult:
     scores = _kept(path, digest)
     if scores is None:
         say(f"choose: {candidate.name}, {len(study.views)} views")
-        scores, _ = session.screen()
-        scores.attrs["digest"] = digest
+        scores, _ = session.screen(limit=limit)
+        if not_scored_in_words(scores):
+            say(f"choose: {candidate.name}: {not_scored_in_words(scores)}")
+        else:  # of all views: the next command uses them again
+            scores.attrs["digest"] = digest
         write_netcdf(scores, path)
         session.release()
         gc.collect()

@@ -36,6 +36,7 @@ from mitsim.study.choose.selection import SensorResult
 from mitsim.study.screened_errors import screened_errors
 from mitsim.study.virtual.plan import map_digest
 from mitsim.views.no_view import why_no_view
+from mitsim.views.view_scores import not_scored_in_words
 
 
 def document(
@@ -119,7 +120,7 @@ def words(one: SensorEntry, named_measurements: dict[str, ComparedMeasurement]) 
     else:
         result = "the least uncertainty of all sensors in every " + "possible " * bool(one.impossible) + "measurement"
     result = "by screening alone: " * (one.status == "screened") + result
-    return "; ".join(filter(None, [result, one.possible_in_words, _reasons(one, toleranced)]))
+    return "; ".join(filter(None, [result, one.possible_in_words, _reasons(one, toleranced), one.lacks]))
 
 
 def _expected_in_words(one: SensorEntry, named_measurements: dict[str, ComparedMeasurement]) -> str:
@@ -174,6 +175,8 @@ def as_text(choice: ChoiceDocument) -> str:
         for one in choice.sensors
         if one.status != "excluded" and one.impossible
     ]
+    if lacking := [f"{one.name} {one.lacks.partition(' views')[0]}" for one in choice.sensors if one.lacks]:
+        lines.append(f"views screened, for lack of time: {', '.join(lacking)}")
     lines += [f"{one.name} is excluded: {one.why}" for one in choice.sensors if one.status == "excluded"]
     return "\n".join(lines)
 
@@ -213,6 +216,7 @@ def _sensor(one: SensorResult) -> SensorEntry:
         capture=capture_entry(study.sensor, next(iter(stated.planned for stated in one.stated.values()), None)),
         measurements=cells,
         map_digest=map_digest(study),
+        lacks=not_scored_in_words(one.scores),
     )
 
 

@@ -360,7 +360,7 @@ def _next_round(raced: Raced, counts: dict[int, int], rules: RaceRules) -> dict[
 def _say_state(raced: Raced, counts: dict[int, int], seconds: float) -> None:
     best = raced.standings[ALL]
     say_progress(
-        f"race: {sum(counts.values())} trials of {len(counts)} views in {seconds:.0f} s; view {raced.leader(ALL)} "
+        f"race: {sum(counts.values())} trials in all, {len(counts)} views, {seconds:.0f} s; view {raced.leader(ALL)} "
         f"leads, {in_words(best, raced.margin)}"
     )
 

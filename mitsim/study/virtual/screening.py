@@ -17,6 +17,7 @@ from characterisation.tasks.measurement_model import InputQuantity
 from mitsim.maps.prediction import Effect, Predictor
 from mitsim.maps.prediction.interreflections import InterreflectionEffect
 from mitsim.maps.prediction.shared_errors import SharedErrors, independent_fields
+from mitsim.running.time_limit import TimeLimit
 from mitsim.scene.ray_casting.self_view import sees_itself
 from mitsim.sensor.rig_parameters import moved, path_error
 from mitsim.sensor.sensor import Sensor
@@ -38,7 +39,11 @@ _FOUND_AGAIN_MM = 1e-3
 
 
 def screen(
-    study: Study, predictor: Predictor, performance_map: PerformanceMap, unknowns: Unknowns | None = None
+    study: Study,
+    predictor: Predictor,
+    performance_map: PerformanceMap,
+    unknowns: Unknowns | None = None,
+    limit: TimeLimit | None = None,
 ) -> tuple[xr.Dataset, list[dict[InputQuantity, Any]]]:
     """Score all views of a study; see :func:`mitsim.views.view_scores.score_candidates`.
 
@@ -52,9 +57,13 @@ def screen(
         F and sigma of the sensor.
     unknowns
         Those of the study, if the caller has prepared them: a calibration may take seconds to simulate.
+    limit
+        Time of the scoring; by default all views are scored.
     """
     effects = effects_of(study, study_unknowns(study) if unknowns is None else unknowns)
-    return score_candidates(study.scene, study.task, study.views, predictor, performance_map, MINIMUM_POINTS, effects)
+    return score_candidates(
+        study.scene, study.task, study.views, predictor, performance_map, MINIMUM_POINTS, effects, limit
+    )
 
 
 def effects_of(study: Study, unknowns: Unknowns) -> list[Effect]:

@@ -132,6 +132,18 @@ def test_what_is_needed_fits_and_a_little_more_does_not():
         assert decide(0.999 * u * centred, asked).demand < 1 < decide(1.001 * u * centred, asked).demand
 
 
+@pytest.mark.parametrize("rule", [Decision(), SIMPLE, jcgm(0.005, 0.03, process_std=0.05)])
+def test_what_is_needed_does_not_depend_on_the_number_of_trials(rule):
+    asked = plus_minus(20.0, 0.15, rule)
+    few, many = needed(np.array([-0.01, 0.012]), asked), needed(normal_errors(0.01), asked)
+    assert few == pytest.approx(many, rel=0.01)
+
+
+def test_a_single_value_leaves_a_measurement_not_decided_and_none_undecidable():
+    assert decide(np.array([0.001]), plus_minus(20.0, 0.15)).verdict == "not decided"
+    assert decide(np.array([]), plus_minus(20.0, 0.15)).verdict == "undecidable"
+
+
 def test_where_the_uncertainty_is_as_large_as_the_tolerance_nothing_is_accepted():
     found = decide(normal_errors(0.12), plus_minus(20.0, 0.235))
     assert found.accepted is None and found.verdict == "undecidable"

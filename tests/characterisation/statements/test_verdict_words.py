@@ -32,6 +32,13 @@ def test_a_bias_that_is_all_and_values_that_are_missing_are_told():
     assert "c fits, but has no value in 13 % of the virtual measurements" in words
 
 
+def test_a_single_value_is_not_told_as_none():
+    single = Judged("b", "mm", "not decided", math.nan, math.nan, without_value=0.5, trials=2)
+    assert result_in_words([single]) == (
+        "fits 0 of 1 tolerances; b: not decided, a single virtual measurement gave a value"
+    )
+
+
 def test_without_tolerances_the_losses_are_told():
     a, b = (Judged(name, "mm", "no tolerance", 0.1, math.nan, without_value=0.25) for name in "ab")
     none = "Uncertainty given for 1 measurement. The task has no tolerances: nothing to accept or reject"

@@ -23,7 +23,7 @@ from characterisation.tasks.definitions import (
 from characterisation.tasks.evaluation import measure
 from characterisation.tasks.measurement_model import evaluate
 from characterisation.tasks.task_file import Feature
-from characterisation.tasks.task_reading import check_features, read_task
+from characterisation.tasks.task_reading import check_features, check_nominal_values, read_task
 from mitsim.sensor.transforms import Transform
 from mitsim.study import task_measurement
 
@@ -283,6 +283,18 @@ def changed(tmp_path, old, new):
         ('unit = "mm"', 'unit = "deg"', "measurements.point1_point2_distance.unit", "'mm'"),
         ("nominal = 70.0", "nominal = -70.0", "measurements.point1_point2_distance.nominal", "greater than"),
         ("nominal = 70.0", "nominal = 70.0\ntolerance = 0", "measurements.point1_point2_distance.tolerance", "greater"),
+        (
+            "nominal = 70.0",
+            'nominal = 70.0\ntolerance = "±0.3"',
+            "measurements.point1_point2_distance.tolerance",
+            "±0.1 is 0.1",
+        ),
+        (
+            "nominal = 70.0",
+            'nominal = 70.0\ntolerance = "H7"',
+            "measurements.point1_point2_distance.tolerance",
+            "H7 is its two deviations",
+        ),
         ("nominal = 70.0", "nominale = 70.0", "measurements.point1_point2_distance.nominale", "did you mean 'nominal'"),
     ],
 )
@@ -301,6 +313,35 @@ def test_an_empty_task_is_refused(tmp_path, text):
     path.write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match="features"):
         read_task(path)
+
+
+@pytest.mark.parametrize(
+    "old, new, said",
+    [
+        ("nominal = 70.0", "nominal = 35.0\ntolerance = 1", "found 35; allowed: 70 mm, from the geometry of plane, "),
+        ("nominal = 70.0", "nominal = 70.1\ntolerance = [-0.3, 0]", r"nominal = 70, tolerance = \[-0.2, 0.1\]"),
+        ("nominal = 70.0", "nominal = 70.006", "errors are counted from the model"),
+        ('kind = "radius"', 'kind = "diameter"', "measurements.pillar1_radius.nominal: found 20; allowed: 40 mm"),
+    ],
+)
+def test_a_nominal_value_is_that_of_the_geometry_from_which_simulated_errors_are_counted(tmp_path, old, new, said):
+    path = changed(tmp_path, old, new)
+    with pytest.raises(InputError, match=said):
+        check_nominal_values(read_task(path), path)
+
+
+def test_a_zone_of_features_that_do_not_have_its_place_in_the_model_is_refused(tmp_path):
+    path = tmp_path / "task.toml"
+    outlined = GOOD.replace("[features.plane]", "[features.plane]\noutline_mm = [[0, 0, 0], [50, 0, 0], [0, 50, 0]]")
+    zone = '[measurements.flat]\nkind = "parallelism"\nfeatures = ["plane", "pillar1"]\nnominal = 0\nunit = "mm"\n'
+    path.write_text(f"{outlined}\n{zone}", encoding="utf-8")
+    with pytest.raises(InputError, match=r"found 0; allowed: features whose parallelism is 0 in the model"):
+        check_nominal_values(read_task(path), path)
+
+
+def test_nominal_values_within_the_rounding_of_a_file_pass(tmp_path):
+    path = changed(tmp_path, "nominal = 70.0", "nominal = 70.004")
+    check_nominal_values(read_task(path), path)
 
 
 def test_features_must_be_shapes_of_the_scene():

@@ -10,7 +10,7 @@ import pytest
 
 from characterisation.files.errors import InputError
 from characterisation.tasks.measurement_model import measurement_model
-from characterisation.tasks.task_reading import read_task
+from characterisation.tasks.task_reading import check_nominal_values, read_task
 from mitsim.scene.authoring.part21 import Enumeration, Reference, Typed, read_step_text
 from mitsim.scene.authoring.part_folder import read_part, write_part
 from mitsim.scene.authoring.product_information import read_product_information
@@ -101,6 +101,31 @@ def test_what_a_task_knows_becomes_measurements_and_the_rest_is_listed(drawn, tm
     ):
         assert told in text
     assert "[features.bottom]  # datum A" in text
+
+
+@needs_step
+def test_limits_of_a_drawing_count_from_the_model(tmp_path, step_here):
+    """Both bores are 12 mm: a drawing that states 12.1 with limits about the model keeps these; 14 is a fault."""
+    path = write_step([("bracket", bracket(), None)], tmp_path / "bracket.step", "AP242DIS")
+    face = {one.name: one.entities[0] for one in read_part(path).faces}
+    drawing = Drawing(path.read_text())
+    mm = drawing.measure
+    within = drawing.size("diameter", face["bore_12mm_left"], items=(mm(12.1, "nominal value"),))
+    drawing.plus_minus(within, mm(-0.2), mm(0.05))
+    beside = drawing.size("diameter", face["bore_12mm_right"], items=(mm(14.0, "nominal value"),))
+    drawing.plus_minus(beside, mm(-0.1), mm(0.1))
+    drawing.size("radius", face["boss_20mm"], items=(mm(9.0, "nominal value"),))
+    path.write_text(drawing.whole())
+    write_part(path, tmp_path / "made")
+    task = read_task(tmp_path / "made/task.toml")
+    left, right = task.measurements["bore_12mm_left_diameter"], task.measurements["bore_12mm_right_diameter"]
+    assert (left.nominal, left.limits) == (12.0, pytest.approx((11.9, 12.15)))
+    assert (right.nominal, right.tolerance) == (14.0, 0.1)
+    assert task.measurements["boss_20mm_radius"].nominal == 10.0
+    text = (tmp_path / "made/task.toml").read_text()
+    assert "the drawing states 12.1, the model has 12" in text
+    with pytest.raises(InputError, match=r"bore_12mm_right_diameter.nominal: found 14; allowed: 12 mm"):
+        check_nominal_values(task, "task.toml")
 
 
 @needs_step

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from characterisation.features.surfaces import Cylinder
 from characterisation.files.errors import InputError
-from mitsim.scene.authoring.check import read_features
+from mitsim.scene.authoring.check_task import read_features
 from mitsim.scene.authoring.face import surface_distance
 from mitsim.scene.authoring.part_folder import Finishing, scene_xml, write_part
 from mitsim.scene.authoring.read_mesh import read_mesh

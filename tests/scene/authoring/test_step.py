@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from characterisation.files.documents import checked_name
-from mitsim.scene.authoring.check import read_features
+from mitsim.scene.authoring.check_task import read_features
 from mitsim.scene.authoring.fineness import fineness_for, sensor_sigma_mm
 from mitsim.scene.authoring.naming import identifier, size, with_names
 from mitsim.scene.authoring.part_folder import Finishing, finish_names, scene_xml
@@ -257,7 +257,7 @@ def test_the_sensor_chooses_how_fine_the_mesh_is(tmp_path):
 
 
 def test_nothing_is_wrong_with_a_bracket_and_its_seat(tmp_path, n10):
-    from mitsim.scene.authoring.check import findings, read_features
+    from mitsim.scene.authoring.check import findings
     from mitsim.scene.authoring.part_folder import write_part
     from mitsim.scene.visible_surfaces import visible_surfaces
     from mitsim.sensor.working_volume import pose_at, usual_place
