@@ -322,9 +322,19 @@ function measurementList() {
       element('td', { class: 'au-number' }, data.kinds[one.kind].zone ? 'zone' : `${short(one.nominal)} ${one.unit}`), element('td', {}, tolerance),
       element('td', {}, button('Remove', () => { measurements.delete(name); touched(); }, { 'aria-label': `remove ${name}` })));
   });
-  const head = ['Name', 'Kind', 'Faces', 'Nominal', 'Tolerance', ''].map((text) => element('th', { scope: 'col' }, text));
-  place('measurements').replaceChildren(element('thead', {}, element('tr', {}, ...head)),
-    element('tbody', {}, ...(rows.length ? rows : [element('tr', {}, element('td', { colspan: 6, class: 'quiet' }, 'No measurements yet.'))])));
+  const none = element('tr', {}, element('td', { colspan: 6, class: 'quiet' }, 'No measurements yet.'));
+  fillTable(place('measurements'), ['Name', 'Kind', 'Faces', 'Nominal', 'Tolerance', ''], rows.length ? rows : [none]);
+}
+
+// Show rows below their heads; a narrow page shows each row as a card, with the head beside every cell.
+function fillTable(table, heads, rows) {
+  const head = element('tr', {}, ...heads.map((text) => element('th', { scope: 'col' }, text)));
+  table.replaceChildren(element('thead', {}, head), element('tbody', {}, ...rows));
+  for (const row of rows) {
+    [...row.cells].forEach((one, k) => {
+      if (one.colSpan === 1 && one.localName === 'td' && one.hasChildNodes()) one.dataset.label = heads[k];
+    });
+  }
 }
 
 // Give a class of general tolerances to all measurements without a tolerance.
@@ -365,8 +375,7 @@ function finishList() {
         show();
       }, { 'aria-label': `choose the faces of ${one.id}` }), warning ? element('div', { class: 'au-warning' }, `▲ ${warning}`) : null));
   });
-  const head = ['Finish', 'Metal', 'Process', 'Ra [um]', 'Faces', ''].map((text) => element('th', { scope: 'col' }, text));
-  place('finishes').replaceChildren(element('thead', {}, element('tr', {}, ...head)), element('tbody', {}, ...rows));
+  fillTable(place('finishes'), ['Finish', 'Metal', 'Process', 'Ra [um]', 'Faces', ''], rows);
   const real = faces.filter((face) => face.node), sprayed = real.length > 0 && real.every((face) => face.finish === SPRAY);
   const back = real.some((face) => face.below);
   place('coat').replaceChildren(...(sprayed && !back ? [] : [button(sprayed ? 'Take the spray off' : 'Spray all faces matt white', () => {
