@@ -206,7 +206,8 @@ def _add_shot_noise(means: NDArray[np.float32], read: float, rng: np.random.Gene
     """
     z = rng.standard_normal(means.shape, np.float32)
     exact = counted_below(read)
-    faint = means < np.float32(exact) if exact > 0 else None
+    # nothing is counted where there is no light, such as beside a part
+    faint = (means < np.float32(exact)) & (means > 0) if exact > 0 else None
     some = faint is not None and bool(faint.any())
     if some:
         counts = rng.poisson(means[faint]) + np.float32(read) * z[faint]
