@@ -275,7 +275,8 @@ def test_text_and_data_say_the_same(scenes, n10):
 
 def test_the_wall_of_a_bore_is_noted_until_its_rim_is_a_feature(check):
     wall = (
-        '<shape type="cylinder" id="{name}"><point name="p0" x="{x}" y="0" z="-10"/><point name="p1" x="{x}" y="0" z="0"/>'
+        '<shape type="cylinder" id="{name}"><point name="p0" x="{x}" y="0" z="-10"/>'
+        '<point name="p1" x="{x}" y="0" z="0"/>'
         '<float name="radius" value="20"/><boolean name="flip_normals" value="{flip}"/>' + METAL + "</shape>"
     )
     body = wall.format(name="bore", x=-30, flip="true") + wall.format(name="pin", x=30, flip="false")
