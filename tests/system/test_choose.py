@@ -6,6 +6,7 @@ import shutil
 import time
 from functools import partial
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import trimesh
@@ -13,6 +14,7 @@ import trimesh
 from mitsim.running.time_limit import TimeLimit
 from mitsim.study.choose import choose_sensor, read_candidates
 from mitsim.study.choose.table import document
+from mitsim.study.session import Session
 from mitsim.views.view_scores import FEWEST_VIEWS
 from tests import shell
 from tests.small_study import MEASUREMENTS, few_measurements
@@ -166,8 +168,12 @@ def test_screening_leaves_time_for_virtual_measurements_and_the_result_says_what
     lacks = f"{FEWEST_VIEWS} of {views} views screened, for lack of time"
     entry = document(candidates[0].study, [result], excluded, 1.0, True).sensors[0]
     assert views > FEWEST_VIEWS and entry.lacks == lacks and lacks in entry.words
+    over = TimeLimit(1.0, time.monotonic() - 2.0)
+    with mock.patch.object(Session, "screen", side_effect=AssertionError):  # the same time again: the views are kept
+        (again,) = choose_sensor(candidates, tmp_path / "out", over, lambda *_: None)
+    assert again.scores.attrs["views_scored"] == FEWEST_VIEWS
     (whole,) = choose_sensor(candidates, tmp_path / "out", TimeLimit(60.0), lambda *_: None)
-    assert whole.scores.attrs["views_scored"] == views  # the scores of some views are not used again
+    assert whole.scores.attrs["views_scored"] == views  # with more time, more views
 
 
 def test_another_mesh_of_the_same_size_is_measured_anew(tmp_path):

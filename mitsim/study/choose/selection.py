@@ -66,6 +66,9 @@ FIRST_TRIALS, GROWTH = 24, 2
 #: largest share of the time for screening
 _SCREENING_SHARE = 0.5
 
+#: views that were not screened for lack of time are, if there is so many times that time
+_LONGER = 1.5
+
 #: share of the time for the rounds after the first, and largest number of rounds
 _LATER_SHARE, _ROUNDS = 0.5, 6
 
@@ -262,14 +265,14 @@ def _screened(candidate: CandidateSensor, session: Session, limit: TimeLimit) ->
     session.folder.mkdir(parents=True, exist_ok=True)
     screening = f"screening {study.file.score.light_path_depth} {map_digest(study)}"
     digest = trial_digest(study, session.unknowns, screening)
-    scores = _kept(path, digest)
+    scores, seconds = _kept(path, digest, limit), limit.left
     if scores is None:
         say(f"choose: {candidate.name}, {len(study.views)} views")
         scores, _ = session.screen(limit=limit)
         if not_scored_in_words(scores):
             say(f"choose: {candidate.name}: {not_scored_in_words(scores)}")
-        else:  # of all views: the next command uses them again
-            scores.attrs["digest"] = digest
+            scores.attrs["within_s"] = seconds
+        scores.attrs["digest"] = digest
         write_netcdf(scores, path)
         session.release()
         gc.collect()
@@ -298,12 +301,15 @@ _SCORES = Schema(
 )
 
 
-def _kept(path: Path, digest: str) -> xr.Dataset | None:
+def _kept(path: Path, digest: str, limit: TimeLimit) -> xr.Dataset | None:
+    """Return the scores of a file, if they are of the study, and of hardly fewer views than a limit allows."""
     try:
         scores = read_dataset(path, _SCORES)
     except InputError:
         return None
-    return scores if scores.attrs.get("digest") == digest else None
+    if scores.attrs.get("digest") != digest:
+        return None
+    return scores if limit.left <= _LONGER * float(scores.attrs.get("within_s", math.inf)) + 1.0 else None
 
 
 def _screened_demand(task: Task, name: str, u: float) -> float:
