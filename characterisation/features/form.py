@@ -198,6 +198,8 @@ def fit_form(points: ArrayLike, surface: Plane | Cylinder, viewpoint: ArrayLike 
     rays = rays_from(viewpoint, points)
     at = surface.meet(points, rays)
     facing = np.abs(at.cosine) > GRAZING_COSINE
+    if facing.sum() <= surface.parameter_count:
+        raise FitError(f"only {facing.sum()} of {len(points)} points are not seen at grazing incidence")
     kept, deviation = facing, at.residual
     for _ in range(CHOICES):
         chosen = np.flatnonzero(kept)

@@ -42,7 +42,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.stats import gamma, norm, t
 
-from characterisation.statements.coverage import BLOCKS, coverage_interval, share, standard_errors
+from characterisation.statements.coverage import BLOCKS, COVERAGE, coverage_interval, share, standard_errors
 from characterisation.statements.one_sided import OneSidedErrors, stated_errors, without_bias
 from characterisation.tasks.decision_table import Decision
 from characterisation.tasks.task_file import Task
@@ -66,7 +66,7 @@ GUARD_SHARE = 0.25
 UNCERTAINTY_RATIO = 4.0
 
 #: least number of trials whose order statistics give the coverage interval
-FEW = 39
+FEW = round(2 / (1 - COVERAGE)) - 1
 
 #: errors with a normal distribution, a mean of 0 and a standard deviation of 1
 _NORMAL = norm.ppf((np.arange(1000) + 0.5) / 1000)

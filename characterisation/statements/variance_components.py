@@ -33,7 +33,7 @@ Floats = NDArray[np.float64]
 #: name of the component of what no other explains: independent from trial to trial
 RESIDUAL = "residual"
 
-#: number of trials that are decomposed at once, to a half more or less: time grows with its cube
+#: about the number of trials that are decomposed at once (up to 300), since time grows with its cube
 AT_ONCE = 200
 
 #: largest number of iterations, and the change of the likelihood that ends them

@@ -252,8 +252,9 @@ def check_file(file: Path) -> None:
 def keep_finished(folder: Path, overwrite: bool, last: str) -> None:
     """Check that a folder holds no finished run; ``last`` is the file that a run writes at its end.
 
-    A run that ended for lack of time says so in the file, and goes on. Whoever writes the new run removes the file, or
-    moves it away with the other files of its run: an interrupted run must not look finished.
+    A run that ended for lack of time says so in the file, and goes on. The command that writes the new run removes the
+    file (:func:`mitsim.study.run_files.claim_folder`), or moves it away with the other files of its run: an interrupted
+    run must not look finished.
 
     Raises
     ------

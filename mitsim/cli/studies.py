@@ -51,7 +51,7 @@ def run(
         typer.Option(
             min=0.1,
             help="Time for the whole command [min], shared among screening, comparing views, statement and report; "
-            "default: until the statement is settled, or has the largest number of trials of the study.",
+            "default: until the statement is settled or known well enough ([statement] of the study).",
         ),
     ] = None,
     plan: PlanExposures = False,
@@ -186,8 +186,8 @@ def state(
         float | None,
         typer.Option(
             min=0.1,
-            help="Time for the whole command [min]; default: until every measurement is settled, or the largest number "
-            "of trials of the study is made.",
+            help="Time for the whole command [min]; default: until every measurement is settled or known well enough "
+            "([statement] of the study).",
         ),
     ] = None,
     plan: PlanExposures = False,

@@ -14,8 +14,8 @@ from markupsafe import escape
 _TABLE = re.compile(r"<table.*?</table>", re.DOTALL)
 _HEAD = re.compile(r"<thead.*?</thead>", re.DOTALL)
 _ROW = re.compile(r"<tr.*?</tr>", re.DOTALL)
-_HEADING = re.compile(r"<th\b[^>]*>(.*?)</th>", re.DOTALL)
-_CELL = re.compile(r"<(t[hd])\b([^>]*)>")
+_HEADING = re.compile(r'<th\b(?:[^>"]|"[^"]*")*>(.*?)</th>', re.DOTALL)
+_CELL = re.compile(r'<(t[hd])\b((?:[^>"]|"[^"]*")*)>')
 
 
 def with_labels(markup: str) -> str:

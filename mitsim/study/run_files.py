@@ -46,7 +46,7 @@ def claim_folder(folder: str | Path, command: str, digest: str) -> Path | None:
     folder
         Folder of the run.
     command
-        Command that writes: ``run``, ``score``, ``state``.
+        Command that writes: ``run``, ``score``, ``budget of view 3``.
     digest
         Digest of everything that decides the results.
 

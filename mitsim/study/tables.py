@@ -81,8 +81,9 @@ class RaceTable(Document):
 class StatementTable(Document):
     """How the uncertainty of the chosen view is stated.
 
-    ``trials`` are made with draws that no race uses. A study that names no number makes as many again, up to five times
-    as many, until every standard uncertainty has at most the relative standard error ``known_to``.
+    ``trials`` are made with draws that no race uses. A study that names no number goes on after the default, up to five
+    times as many, until every standard uncertainty has at most the relative standard error ``known_to``. Within a time
+    limit, ``known_to`` is not used.
     """
 
     trials: int = Field(default=200, ge=2, le=1_000_000)

@@ -163,9 +163,9 @@ def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above 
     bounded = limit is not None and limit.end is not None
     order = _far_apart(views) if bounded else list(range(len(views)))
     by_place = dict[int, _ViewScore]()
-    for place, (_, one) in zip(
-        order, track(one_ahead([views[i] for i in order], cast, score), "score views", len(views)), strict=False
-    ):
+    # the tracked scores come first, so that the last line of progress is printed when they end
+    scoring = track(one_ahead([views[i] for i in order], cast, score), "score views", len(views))
+    for (_, one), place in zip(scoring, order, strict=False):
         by_place[place] = one
         if limit is not None and limit.over() and len(by_place) >= FEWEST_VIEWS:
             break
@@ -210,7 +210,7 @@ def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above 
 def not_scored_in_words(scores: xr.Dataset) -> str:
     """Return how many views were scored within a limit of time; empty if all were."""
     scored, views = int(scores.attrs.get("views_scored", scores.sizes["view"])), scores.sizes["view"]
-    return f"{scored} of {views} views screened, for lack of time" if scored < views else ""
+    return f"only {scored} of {views} views screened, for lack of time" if scored < views else ""
 
 
 def _far_apart(views: Sequence[View]) -> list[int]:
@@ -223,7 +223,7 @@ def _far_apart(views: Sequence[View]) -> list[int]:
     while len(order) < len(rows):
         order.append(int(nearest.argmax()))
         nearest = np.minimum(nearest, np.linalg.norm(rows - rows[order[-1]], axis=1))
-        nearest[order] = -1.0
+        nearest[order[-1]] = -1.0
     return order
 
 

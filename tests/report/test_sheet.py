@@ -6,9 +6,11 @@ import shutil
 
 import numpy as np
 import pytest
+import xarray as xr
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from scipy.spatial.transform import Rotation
 
+from characterisation.files.atomic_io import write_netcdf
 from mitsim.report.declaration import pose_in_full, read_declaration
 from mitsim.report.sheet import sheet_figures, write_sheet
 from mitsim.report.sheet_layout import text_width, wrapped
@@ -41,11 +43,19 @@ def with_rows(folder, count, long=False):
     statement = json.loads((folder / "statement.json").read_text(encoding="utf-8"))
     known = next(iter(statement["measurements"].values())) | {"tolerance": 0.4, "verdict": "does not fit"}
     tail = "_to_the_far_end_of_the_guide_rail_left_of_the_bore" if long else ""
-    statement["measurements"] = {f"distance_{k}{tail}": known for k in range(count)}
+    names = [f"distance_{k}{tail}" for k in range(count)]
+    statement["measurements"] = dict.fromkeys(names, known)
     (folder / "statement.json").write_text(json.dumps(statement), encoding="utf-8")
+    about = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    about["measurements"] = dict.fromkeys(names, next(iter(about["measurements"].values())))
+    (folder / "run.json").write_text(json.dumps(about), encoding="utf-8")
+    for path in (folder / "scores.nc", folder / "checks.nc"):
+        with xr.open_dataset(path) as data:
+            of_rows = data.isel(measurement=[0] * count).assign_coords(measurement=names).load()
+        write_netcdf(of_rows, path)
 
 
-@pytest.mark.parametrize(("rows", "long", "pages"), [(2, False, 1), (9, True, 1), (45, False, 3)])
+@pytest.mark.parametrize(("rows", "long", "pages"), [(2, False, 1), (9, True, 1), (70, False, 3)])
 def test_no_text_overlaps_another_or_leaves_the_page(run_folder, tmp_path, rows, long, pages):
     folder = shutil.copytree(run_folder, tmp_path / "run")
     with_rows(folder, rows, long)

@@ -49,7 +49,7 @@ def test_screening_within_a_limit_scores_views_that_lie_far_apart_and_says_how_m
     whole, _ = Session(many).screen()
     some, inputs = Session(many).screen(limit=TimeLimit(1.0, time.monotonic() - 2.0))
     assert some.attrs["views_scored"] == FEWEST_VIEWS < some.sizes["view"] == len(inputs) == len(many.views)
-    assert not_scored_in_words(some) == f"{FEWEST_VIEWS} of {len(many.views)} views screened, for lack of time"
+    assert not_scored_in_words(some) == f"only {FEWEST_VIEWS} of {len(many.views)} views screened, for lack of time"
     assert not_scored_in_words(whole) == ""
     u = some["predicted_uncertainty"].transpose("view", "measurement").values
     scored = np.isfinite(u).any(axis=1)
@@ -144,7 +144,7 @@ def test_a_run_within_a_limit_says_what_it_lacks_and_goes_on_without_one(study, 
     views = study.file.views.model_copy(update={"subdivisions": 1, "rolls_deg": [0.0, 90.0]})
     many = open_study(SCENES / "study.toml", study.file.model_copy(update={"views": views}))
     run_within(many, tmp_path / "many", TimeLimit(1.0, time.monotonic() - 2.0))
-    lacks = f"{FEWEST_VIEWS} of {len(many.views)} views screened, for lack of time"
+    lacks = f"only {FEWEST_VIEWS} of {len(many.views)} views screened, for lack of time"
     assert lacks in read_run(tmp_path / "many").about.lacks
     rules = {"race": RaceTable(shortlist=1, trials=4), "statement": StatementTable(trials=2)}
     keep_finished(tmp_path, False, "run.json")  # no error

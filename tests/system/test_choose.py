@@ -165,7 +165,7 @@ def test_screening_leaves_time_for_virtual_measurements_and_the_result_says_what
     over = TimeLimit(1.0, time.monotonic() - 2.0)
     (result,) = choose_sensor(candidates, tmp_path / "out", over, lambda *_: None)
     views = len(candidates[0].study.views)
-    lacks = f"{FEWEST_VIEWS} of {views} views screened, for lack of time"
+    lacks = f"only {FEWEST_VIEWS} of {views} views screened, for lack of time"
     entry = document(candidates[0].study, [result], excluded, 1.0, True).sensors[0]
     assert views > FEWEST_VIEWS and entry.lacks == lacks and lacks in entry.words
     over = TimeLimit(1.0, time.monotonic() - 2.0)

@@ -318,18 +318,18 @@ def test_a_rendered_part_is_measured(n10, simulated, scenes):
     geometry = stereo_geometry(n10.rig)
     predictor = Predictor(n10.rig, geometry.grid, geometry.seen_left, n10.name)
     pose = look_at([0, -400, 290], [0, 0, 30], [0, 0, 1])
-    capture = simulated.capture(scene, pose, rendering=Rendering(samples=16), seed=4)
     searched = narrow_search(n10, 380, 620).matcher
     labels = predictor.labels(scene, pose, predictor.surfaces(scene, pose))
-    decoded = capture_cloud(capture, searched, geometry)
-    cloud = replace(decoded, feature=labels, feature_names=scene.names)
-    task = read_task(scenes / "two_pillars/task.toml")
-    result = measure(cloud, task, pose.inverse().matrix())
-    for name, measured in result.items():
-        print(f"{name}: error {measured.error:.3f}")
-        assert measured.possible, measured.reason
-        limit = 1.5 if task.measurements[name].unit == "mm" else 2.0
-        assert abs(measured.error) < limit
+    task, errors = read_task(scenes / "two_pillars/task.toml"), dict[str, list[float]]()
+    for seed in range(4, 7):
+        capture = simulated.capture(scene, pose, rendering=Rendering(samples=16), seed=seed)
+        cloud = replace(capture_cloud(capture, searched, geometry), feature=labels, feature_names=scene.names)
+        for name, measured in measure(cloud, task, pose.inverse().matrix()).items():
+            assert measured.possible, measured.reason
+            errors.setdefault(name, []).append(measured.error)
+    # of ten captures a root mean square of up to 0.9 mm and deg: the middle one of three is hardly ever beyond twice that
+    for name, several in errors.items():
+        assert abs(np.median(several)) < (1.5 if task.measurements[name].unit == "mm" else 2.0), name
 
 
 def test_impossible_campaigns_are_told(tmp_path, scenes, n10):

@@ -66,7 +66,7 @@ FIRST_TRIALS, GROWTH = 24, 2
 #: largest share of the time for screening
 _SCREENING_SHARE = 0.5
 
-#: views that were not screened for lack of time are, if there is so many times that time
+#: a sensor with views left out is screened again if its share of the time is longer than before by this factor
 _LONGER = 1.5
 
 #: share of the time for the rounds after the first, and largest number of rounds
@@ -165,9 +165,10 @@ def choose_sensor(
     """
     found = list[SensorResult]()
     screening = limit.part(_SCREENING_SHARE)
+    equal = screening.left / len(candidates)
     for number, candidate in enumerate(candidates, 1):
         share = screening.part(1 / (len(candidates) - number + 1))
-        found.append(_screened(candidate, Session(candidate.study, folder / candidate.name, workers), share))
+        found.append(_screened(candidate, Session(candidate.study, folder / candidate.name, workers), share, equal))
         _say(found, f"{number} of {len(candidates)} screened", limit)
     rivals, count = _promising(found), FIRST_TRIALS
     report_results(_ordered(found), False)
@@ -259,19 +260,22 @@ def _ordered(found: list[SensorResult]) -> list[SensorResult]:
     return [found[i] for i in order]
 
 
-def _screened(candidate: CandidateSensor, session: Session, limit: TimeLimit) -> SensorResult:
-    """Return the scores of all views, from the folder if they are there, or of those that the limit allows."""
+def _screened(candidate: CandidateSensor, session: Session, limit: TimeLimit, equal: float) -> SensorResult:
+    """Return the scores of all views, from the folder if they are there, or of those that the limit allows.
+
+    ``equal`` is the sensor's share [s] of the time for screening, before sensors leave some of theirs.
+    """
     study, path = session.study, session.folder / "scores.nc"
     session.folder.mkdir(parents=True, exist_ok=True)
     screening = f"screening {study.file.score.light_path_depth} {map_digest(study)}"
     digest = trial_digest(study, session.unknowns, screening)
-    scores, seconds = _kept(path, digest, limit), limit.left
+    scores = _kept(path, digest, equal)
     if scores is None:
         say(f"choose: {candidate.name}, {len(study.views)} views")
         scores, _ = session.screen(limit=limit)
         if not_scored_in_words(scores):
             say(f"choose: {candidate.name}: {not_scored_in_words(scores)}")
-            scores.attrs["within_s"] = seconds
+            scores.attrs["within_s"] = limit.elapsed
         scores.attrs["digest"] = digest
         write_netcdf(scores, path)
         session.release()
@@ -301,15 +305,15 @@ _SCORES = Schema(
 )
 
 
-def _kept(path: Path, digest: str, limit: TimeLimit) -> xr.Dataset | None:
-    """Return the scores of a file, if they are of the study, and of hardly fewer views than a limit allows."""
+def _kept(path: Path, digest: str, seconds: float) -> xr.Dataset | None:
+    """Return the scores of a file, if they are of the study, and of hardly fewer views than some seconds allow."""
     try:
         scores = read_dataset(path, _SCORES)
     except InputError:
         return None
     if scores.attrs.get("digest") != digest:
         return None
-    return scores if limit.left <= _LONGER * float(scores.attrs.get("within_s", math.inf)) + 1.0 else None
+    return scores if seconds <= _LONGER * float(scores.attrs.get("within_s", math.inf)) + 1.0 else None
 
 
 def _screened_demand(task: Task, name: str, u: float) -> float:

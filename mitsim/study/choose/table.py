@@ -176,7 +176,7 @@ def as_text(choice: ChoiceDocument) -> str:
         if one.status != "excluded" and one.impossible
     ]
     if lacking := [f"{one.name} {one.lacks.partition(' views')[0]}" for one in choice.sensors if one.lacks]:
-        lines.append(f"views screened, for lack of time: {', '.join(lacking)}")
+        lines.append(f"not all views were screened, for lack of time: {', '.join(lacking)}")
     lines += [f"{one.name} is excluded: {one.why}" for one in choice.sensors if one.status == "excluded"]
     return "\n".join(lines)
 

@@ -32,6 +32,9 @@ Floats = NDArray[np.float64]
 #: directions in which another sensor is screened, and sensors that are proposed
 _DIRECTIONS, _MOST = 6, 2
 
+#: share of the time that is left, for the screening of a sensor
+_SCREENING_SHARE = 0.5
+
 
 def other_sensors(now: Shortfall, limit: TimeLimit) -> Iterator[Change]:
     """Yield the most promising other sensors, the one with which most measurements can fit first."""
@@ -50,7 +53,7 @@ def other_sensors(now: Shortfall, limit: TimeLimit) -> Iterator[Change]:
         if study is None or not (some := _in_best_directions(now, study)).views:
             continue
         say(f"remedies: screening {name}, {len(some.views)} views")
-        scores, _ = Session(some).screen()
+        scores, _ = Session(some).screen(limit=limit.part(_SCREENING_SHARE))
         risks = _risks(scores, names)
         least = risks.min(axis=1)
         expected = {}

@@ -8,11 +8,12 @@ The model is linear in the amplitudes a_s and a_w. A diffuse sheet has one ampli
 of a room adds another. Source of L and S: :mod:`mitsim.scene.differentiable`.
 
 **Grain** C is the relative standard deviation of a pixel that the imager's noise does not explain. It comes from
-speckle and from dots of an unknown pattern, and is estimated from the scatter inside the blocks. The variance of a
-block's mean over n pixels is the sum of independent contributions, with v the imager's noise
-(:mod:`mitsim.twin.finish.electrons`):
+speckle and from dots of an unknown pattern, and is estimated from the scatter inside the blocks. So is the correlation
+rho of neighbouring pixels in it; at distance d it is rho^(d^2), as of speckle. The variance of a block's mean over n
+pixels is the sum of independent contributions, with v the imager's noise (:mod:`mitsim.twin.finish.electrons`):
 
-    V = sum(v + C^2 mu^2) / n^2 + row / rows + column / columns
+    V = sum(v + k C^2 mu^2) / n^2 + row / rows + column / columns
+    k = product over both axes of (1 + 2 sum over d of rho^(d^2) (1 - d / width))
 """
 
 from __future__ import annotations
@@ -26,6 +27,9 @@ from numpy.typing import NDArray
 from mitsim.scene.differentiable import Directions, SpecularLobe
 from mitsim.twin.finish.finish import MetalFinish
 from mitsim.twin.finish.observation import CouponView, Floats
+
+#: largest correlation of neighbouring pixels in the grain, which falls to 1 / e at 4.4 px then
+_MOST_CORRELATED = 0.95
 
 #: grain for the initial weights
 FIRST_GRAIN = 0.1
@@ -66,6 +70,13 @@ class Residual:
         return float(np.sqrt(np.mean(self.in_noise**2))) if self.view.size else float("nan")
 
 
+def _sum_of_correlations(neighbours: float, widths: NDArray[np.int64]) -> Floats:
+    """Return the sums of the correlations rho^(d^2) of a pixel with those of its row in blocks of some ``widths``."""
+    steps = np.arange(1, int(widths.max()))
+    shares = np.maximum(1 - steps / widths[:, None], 0.0)
+    return np.asarray(1 + 2 * shares @ neighbours ** (steps.astype(float) ** 2))
+
+
 class Problem:
     """The blocks of all views, one view after the other, and their model.
 
@@ -87,6 +98,8 @@ class Problem:
         self.unit, self.electrons = joined("unit"), joined("electrons")
         self.block = np.concatenate([view.block + at for view, at in zip(self.views, self.starts, strict=False)])
         self.counts = np.bincount(self.block, minlength=self.count).astype(float)
+        #: pixels that have a neighbour in their block, along the columns and along the rows, and these neighbours
+        self.pairs = self._neighbours_in_blocks()
         self.measured = self.means(self.electrons)
         self.wide = self.unit * (1.0 if finish is None else finish.normal_reflectance)
         ambient = joined("ambient")
@@ -163,10 +176,33 @@ class Problem:
         known = square > 0
         ratio = np.sum((trust * spread)[known] / square[known]) / max(float(np.sum(trust[known])), 1e-300)
         grain = float(np.sqrt(max(ratio, 0.0)))
+        sums = np.ones(self.count)
+        widths = np.repeat([view.width for view in self.views], [view.size for view in self.views])
+        for first, second in self.pairs if grain > 0 else ():
+            block = self.block[first]
+            count = np.bincount(block, minlength=self.count)
+            weight = np.where(known & (count > 0), trust, 0.0)
+            product = np.bincount(block, off[first] * off[second], self.count) / np.maximum(count, 1)
+            share = float(np.sum(weight * product / np.where(known, square, 1.0)) / max(weight.sum(), 1e-300)) / ratio
+            sums *= _sum_of_correlations(min(max(share, 0.0), _MOST_CORRELATED), widths)
         shared = np.concatenate(
             [np.full(view.size, (view.noise.row + view.noise.column) / view.width) for view in self.views]
         )
-        return (noise_mean + grain**2 * square) / self.counts + shared, grain
+        return (noise_mean + sums * grain**2 * square) / self.counts + shared, grain
+
+    def _neighbours_in_blocks(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+        """Return the indices of pixels and of their neighbours in the same block, for both axes."""
+        rows, columns = (np.concatenate([getattr(view, name) for view in self.views]) for name in ("rows", "columns"))
+        steps = (1, int(columns.max()) + 2)
+        place = (self.block * (int(rows.max()) + 2) + rows) * steps[1] + columns
+        order = np.argsort(place)
+        ordered = place[order]
+        out = []
+        for step in steps:
+            at = np.minimum(np.searchsorted(ordered, place + step), len(ordered) - 1)
+            first = np.flatnonzero(ordered[at] == place + step)
+            out.append((first, order[at[first]]))
+        return out
 
     def neighbours(self, residual: Floats) -> float:
         """Return the correlation of the residuals of neighbouring blocks in a view, NaN without neighbours."""
