@@ -327,7 +327,7 @@ def test_a_rendered_part_is_measured(n10, simulated, scenes):
         for name, measured in measure(cloud, task, pose.inverse().matrix()).items():
             assert measured.possible, measured.reason
             errors.setdefault(name, []).append(measured.error)
-    # of ten captures a root mean square of up to 0.9 mm and deg: the middle one of three is hardly ever beyond twice that
+    # of ten captures a root mean square of up to 0.9 mm and deg: the middle one of three is hardly ever twice that
     for name, several in errors.items():
         assert abs(np.median(several)) < (1.5 if task.measurements[name].unit == "mm" else 2.0), name
 

@@ -246,8 +246,8 @@ def test_the_uncertainty_covers_the_truth(plain_views, ground, size_px):
 
     Beyond 2 u: with 5 % each, more than 3 of 14 happen once in 240 times (binomial). Root mean square of z by
     covariance: sqrt(chi^2_14 / 14) lies within 0.47 and 1.61 in 99.8 %; the low end says that the uncertainty is not
-    simply too large. Grain as long as two pixels is found by the correlation of neighbours; without it chi-square is over
-    1.5.
+    simply too large. Grain as long as two pixels is found by the correlation of neighbours; without it chi-square is
+    over 1.5.
     """
     results = [fit_views(noisy(plain_views, size_px, seed), ground) for seed in range(14)]
     for name, true in (
