@@ -44,8 +44,8 @@ _SMOOTHING_PX = 1.5
 _KEPT_MATCHER, _KEPT = KeptSettings(49, 4.0, 40, 1.5), KeptSettings(16, 4.0, 8, 2.5)
 
 #: rays per pixel of direct light: for fringes, and for others, whose patterns and pixels are coarse. Root mean square
-#: error 0.05 (PhoXi), 0.15 (David), 0.12 (Zivid) of the sensor's noise with 4, 0.06 (N10) with 16 and 0.18 with 4:
-#: tests/benchmarks/direct_samples.py
+#: error 0.03 (PhoXi), 0.09 (David), 0.08 (Zivid) of the sensor's noise with 4, 0.04 (N10) with 16 and 0.15 with 4, but
+#: for the hundredth of the pixels at edges: tests/benchmarks/direct_samples.py
 _FRINGE_SAMPLES, _SAMPLES = 4, 16
 
 
