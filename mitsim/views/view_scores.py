@@ -160,8 +160,7 @@ def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above 
         return _score_view(cast, view, scene, task, performance_map, minimum_points, looking)
 
     # the rays of the next view are cast while this view is evaluated
-    bounded = limit is not None and limit.end is not None
-    order = _far_apart(views) if bounded else list(range(len(views)))
+    order = scoring_order(views, limit)
     by_place = dict[int, _ViewScore]()
     # the tracked scores come first, so that the last line of progress is printed when they end
     scoring = track(one_ahead([views[i] for i in order], cast, score), "score views", len(views))
@@ -211,6 +210,11 @@ def not_scored_in_words(scores: xr.Dataset) -> str:
     """Return how many views were scored within a limit of time; empty if all were."""
     scored, views = int(scores.attrs.get("views_scored", scores.sizes["view"])), scores.sizes["view"]
     return f"only {scored} of {views} views screened, for lack of time" if scored < views else ""
+
+
+def scoring_order(views: Sequence[View], limit: TimeLimit | None) -> list[int]:
+    """Return the places of views in the order in which they are scored: far apart if time may not suffice for all."""
+    return list(range(len(views))) if limit is None or limit.end is None else _far_apart(views)
 
 
 def _far_apart(views: Sequence[View]) -> list[int]:

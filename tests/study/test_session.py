@@ -9,6 +9,7 @@ import pytest
 
 from characterisation.files.errors import InputError
 from mitsim.cli.options import keep_finished
+from mitsim.maps.prediction.interreflections import TOGETHER, InterreflectionEffect, InterreflectionImage
 from mitsim.running.time_limit import TimeLimit
 from mitsim.study import RaceTable, StatementTable, StudyFile, open_study, session
 from mitsim.study.run import run_study, run_within
@@ -16,6 +17,7 @@ from mitsim.study.run_folder import read_run
 from mitsim.study.session import Session
 from mitsim.study.statement_document import statement_document
 from mitsim.study.virtual import stated as state
+from mitsim.study.virtual.screening import effects_of
 from mitsim.study.virtual.stated import BATCH, MOST, TrialsOfView, batches
 from mitsim.study.virtual.trials import Outcome
 from mitsim.views.view_scores import FEWEST_VIEWS, not_scored_in_words
@@ -82,6 +84,27 @@ def test_a_view_that_the_study_lacks_is_one_message(study):
     assert study.view(2) is study.views[2]
     with pytest.raises(InputError, match=f"--view.*99.*0 to {len(study.views) - 1}"):
         study.view(99, "--view")
+
+
+@pytest.mark.parametrize("limit", [None, TimeLimit(60.0)])
+def test_interreflections_of_a_view_are_rendered_once(study, limit, monkeypatch):
+    """The views of a render follow one another as they are scored, in any order."""
+    rendered = []
+
+    def images(_, scene, poses):
+        rendered.extend(pose.matrix().tobytes() for pose in poses)
+        return [InterreflectionImage(effect.coarse, np.zeros((4, effect.coarse.height, effect.coarse.width)))] * len(
+            poses
+        )
+
+    monkeypatch.setattr(InterreflectionEffect, "render_views", images)
+    views = study.file.views.model_copy(update={"subdivisions": 1, "rolls_deg": [0.0, 90.0]})
+    score = study.file.score.model_copy(update={"light_path_depth": 2})
+    many = open_study(SCENES / "study.toml", study.file.model_copy(update={"views": views, "score": score}))
+    here = Session(many)
+    effect = next(one for one in effects_of(many, here.unknowns, limit) if isinstance(one, InterreflectionEffect))
+    here.screen(limit=limit)
+    assert len(rendered) == len(set(rendered)) == len(many.views) > TOGETHER
 
 
 def test_a_statement_ends_when_time_is_over_and_continues_where_it_ended(study, tmp_path):

@@ -26,7 +26,7 @@ from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.study.calibration.accuracy import measured_points
 from mitsim.study.virtual.study_unknowns import study_unknowns
 from mitsim.study.virtual.world import Unknowns, scaled_baseline, scaled_focal
-from mitsim.views.view_scores import score_candidates
+from mitsim.views.view_scores import score_candidates, scoring_order
 
 Floats = NDArray[np.float64]
 
@@ -60,18 +60,18 @@ def screen(
     limit
         Time of the scoring; by default all views are scored.
     """
-    effects = effects_of(study, study_unknowns(study) if unknowns is None else unknowns)
+    effects = effects_of(study, study_unknowns(study) if unknowns is None else unknowns, limit)
     return score_candidates(
         study.scene, study.task, study.views, predictor, performance_map, MINIMUM_POINTS, effects, limit
     )
 
 
-def effects_of(study: Study, unknowns: Unknowns) -> list[Effect]:
-    """Return the effects that screening includes beyond the map."""
+def effects_of(study: Study, unknowns: Unknowns, limit: TimeLimit | None = None) -> list[Effect]:
+    """Return the effects that screening includes beyond the map; views follow one another as within the ``limit``."""
     effects: list[Effect] = [shared_errors(study, unknowns)]
     depth = study.file.score.light_path_depth
     if depth > 1 and sees_itself(study.scene):
-        poses = [view.world_from_sensor for view in study.views]
+        poses = [study.views[place].world_from_sensor for place in scoring_order(study.views, limit)]
         effects.append(InterreflectionEffect(study.sensor, depth, poses=poses))
     return effects
 
