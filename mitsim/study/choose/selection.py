@@ -183,6 +183,11 @@ def choose_sensor(
             _measure_sensor(one, count, work.part(1 / (len(rivals) - place)))
             _say(found, f"round {turn + 1}: {place + 1} of {len(rivals)} sensors measured", limit)
             report_results(_ordered(found), False)
+        if not any(one.stated for one in found):  # their shares were too short: the rest goes to the best of them
+            rivals = [one for one in _ordered(found) if any(one is rival for rival in rivals)][:1]
+            if limit.over():
+                break
+            continue
         rivals, count = _able_to_win(found, rivals), GROWTH * count
         if limit.over() or len(rivals) < 2:
             break
