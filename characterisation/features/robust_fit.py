@@ -205,7 +205,8 @@ def covariance_of(residual: Array, jacobian: Array, kind: str) -> tuple[Array, f
     normal = jacobian.T @ jacobian
     _check_normal(normal, jacobian, count, kind)
     variance = float(residual @ residual) / (count - parameters)
-    scales = np.outer(*2 * [np.sqrt(np.diagonal(normal))])
+    norms = np.sqrt(np.diagonal(normal))
+    scales = np.outer(norms, norms)
     inverse = np.linalg.inv(normal / scales) / scales
     return variance * inverse, float(np.sqrt(variance)), count
 

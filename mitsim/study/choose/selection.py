@@ -183,13 +183,13 @@ def choose_sensor(
             _measure_sensor(one, count, work.part(1 / (len(rivals) - place)))
             _say(found, f"round {turn + 1}: {place + 1} of {len(rivals)} sensors measured", limit)
             report_results(_ordered(found), False)
-        if not any(one.stated for one in found):  # their shares were too short: the rest goes to the best of them
-            rivals = [one for one in _ordered(found) if any(one is rival for rival in rivals)][:1]
-            if limit.over():
+        if any(one.stated for one in found):
+            rivals, count = _able_to_win(found, rivals), GROWTH * count
+            if len(rivals) < 2:
                 break
-            continue
-        rivals, count = _able_to_win(found, rivals), GROWTH * count
-        if limit.over() or len(rivals) < 2:
+        else:  # every share was too short for a statement: the first rival, best by screening, gets what is left
+            rivals = rivals[:1]
+        if limit.over() or not rivals:
             break
     leader = _ordered(found)[0]
     if leader.stated and not limit.over():
@@ -207,13 +207,12 @@ def _reserve(limit: TimeLimit) -> float:
 def _able_to_win(found: list[SensorResult], rivals: list[SensorResult]) -> list[SensorResult]:
     """Return the measured sensors that more trials may show to be the best, and that have not all of theirs.
 
-    A sensor that lacks more measurements than the best cannot win. Of the others, one can if its worst demand may be as
-    small as that of the best may be large: of n trials the demand has a relative standard error of about
-    sqrt((k - 1) / (4 n)), as a standard deviation has, with the usual kurtosis k of errors.
+    At least one of the sensors found is measured. A sensor that lacks more measurements than the best cannot win. Of the
+    others, one can if its worst demand may be as small as that of the best may be large: of n trials the demand has a
+    relative standard error of about sqrt((k - 1) / (4 n)), as a standard deviation has, with the usual kurtosis k of
+    errors.
     """
     stated = [one for one in _ordered(found) if one.stated]
-    if not stated:
-        return []
     keys = rank_keys([one.demands() for one in stated], stated[0].has_tolerance, [True] * len(stated))
     first = keys[0]
     highest = max(first[1], default=math.inf) * math.exp(_STANDARD_ERRORS * _relative_error(stated[0]))
