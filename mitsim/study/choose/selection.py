@@ -207,9 +207,9 @@ def _reserve(limit: TimeLimit) -> float:
 def _able_to_win(found: list[SensorResult], rivals: list[SensorResult]) -> list[SensorResult]:
     """Return the measured sensors that more trials may show to be the best, and that have not all of theirs.
 
-    At least one of the sensors found is measured. A sensor that lacks more measurements than the best cannot win. Of the
-    others, one can if its worst demand may be as small as that of the best may be large: of n trials the demand has a
-    relative standard error of about sqrt((k - 1) / (4 n)), as a standard deviation has, with the usual kurtosis k of
+    At least one of the sensors found is measured. A sensor that lacks more measurements than the best cannot win. Of
+    the others, one can if its worst demand may be as small as that of the best may be large: of n trials the demand has
+    a relative standard error of about sqrt((k - 1) / (4 n)), as a standard deviation has, with the usual kurtosis k of
     errors.
     """
     stated = [one for one in _ordered(found) if one.stated]
