@@ -139,7 +139,7 @@ def choose(
     from mitsim.study import report_lays, with_plan
     from mitsim.study.choice_document import CHOICE, judged, read_choice
     from mitsim.study.choose import choose_sensor, read_candidates
-    from mitsim.study.choose.selection import SensorResult
+    from mitsim.study.choose.sensor_result import SensorResult
     from mitsim.study.choose.table import as_text, document
     from mitsim.study.scene_geometry import write_scene_geometry
 

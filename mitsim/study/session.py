@@ -31,7 +31,14 @@ from mitsim.study.exposures.exposure_plan import PlanRules
 from mitsim.study.exposures.planned import kept_plan, rendered, stated_exposures, with_exposure
 from mitsim.study.run_files import claim_folder
 from mitsim.study.virtual.mapped import MappedMeasurements
-from mitsim.study.virtual.plan import measured_by, measurements_of, race_rules, study_digest, trial_digest
+from mitsim.study.virtual.plan import (
+    measured_by,
+    measurements_of,
+    race_rendering,
+    race_rules,
+    study_digest,
+    trial_digest,
+)
 from mitsim.study.virtual.race import Raced, RaceRules, run_race
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.screening import screen
@@ -115,6 +122,19 @@ class Session:
         return TrialFolder.of(self.folder / "trials", self.digest, self.study.task)
 
     @cached_property
+    def race_trials(self) -> TrialFolder:
+        """Return the finished trials of the race, which have fewer light paths."""
+        rendering = race_rendering(self.study)
+        digest = trial_digest(self.study, self.unknowns, self.source, self.separate_light, rendering)
+        return TrialFolder.of(self.folder / "race_trials", digest, self.study.task)
+
+    @property
+    def race_runner(self) -> RenderedMeasurements | MappedMeasurements | SpreadMeasurements:
+        """Return the maker of the trials of the race."""
+        runner = self.runner
+        return runner if isinstance(runner, MappedMeasurements) else runner.rendered_as(race_rendering(self.study))
+
+    @cached_property
     def predictor(self) -> Predictor:
         """Return the predictor of the sensor: that of the measurements, if they are prepared."""
         if "measurements" in vars(self):
@@ -163,7 +183,7 @@ class Session:
         """
         rules = race_rules(self.study.file.race) if rules is None else rules
         limit = TimeLimit() if limit is None else limit
-        return run_race(self.study.views, scores, self.runner, self.trials, rules, limit.over, after_round)
+        return run_race(self.study.views, scores, self.race_runner, self.race_trials, rules, limit.over, after_round)
 
     def exposures(self, view: View) -> PlannedExposure | None:
         """Return the exposures of a view: those of the study, or planned ones; None for the sensor's own rule.

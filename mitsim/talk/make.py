@@ -19,6 +19,7 @@ from mitsim.running.numbers import time_in_words
 from mitsim.running.progress import say_progress, track
 from mitsim.running.time_limit import TimeLimit
 from mitsim.study.session import Session
+from mitsim.study.virtual.plan import rendering_of
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.spread_out import TrialOrder, make_trials
 from mitsim.study.virtual.world import Trial
@@ -142,7 +143,8 @@ def _trial_orders(talk: Talk, found: _Unfinished) -> Iterator[TrialOrder]:
     session = found.session
     for jobs in found.missing.values():
         path = str(talk.path.absolute())
-        yield TrialOrder(path, session.study.file, session.unknowns, False, session.digest, jobs)
+        rendering = rendering_of(session.study)
+        yield TrialOrder(path, session.study.file, session.unknowns, False, session.digest, jobs, rendering)
 
 
 def _finish(talk: Talk, results: Results, found: _Unfinished) -> None:

@@ -32,7 +32,7 @@ from mitsim.study.choice_document import (
 )
 from mitsim.study.choose.candidates import Excluded
 from mitsim.study.choose.ranking import LARGEST_DEMAND, relative_to_least
-from mitsim.study.choose.selection import SensorResult
+from mitsim.study.choose.sensor_result import SensorResult
 from mitsim.study.screened_errors import screened_errors
 from mitsim.study.virtual.plan import map_digest
 from mitsim.views.no_view import why_no_view

@@ -243,9 +243,10 @@ def run_race(
             if trial not in trials.known(number)
         ]
         done = 0
-        # the most promising views come first, so that they have trials when time is over
+        # the most promising views come first, so that they have trials when time is over, and the trials of each
+        # follow each other, so that they share its light paths
         for first in range(0, len(jobs), _AT_ONCE):
-            for job, outcome in runner.run(runner.in_order(jobs[first : first + _AT_ONCE])):
+            for job, outcome in runner.run(jobs[first : first + _AT_ONCE]):
                 trials.add(job.view.number, job.trial, outcome)
                 done += 1
                 if time.monotonic() - last > _SAY_EVERY_S:

@@ -145,6 +145,12 @@ class RenderedMeasurements:
         other.planned = planned
         return other
 
+    def rendered_as(self, rendering: Rendering) -> RenderedMeasurements:
+        """Return the same measurements with other light paths; prepared data is shared, but for those of views."""
+        other = copy.copy(self)
+        other.rendering, other._views = rendering, {}
+        return other
+
     def in_order(self, jobs: Iterable[Job]) -> list[Job]:
         """Return the jobs sorted by view: paths are traced once for each view."""
         return sorted(jobs, key=lambda job: job.view.number)

@@ -16,10 +16,10 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 
+from mitsim.capture.simulated.rendering import Rendering
 from mitsim.running.executor import Executor
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import StudyFile, open_study
-from mitsim.study.virtual.plan import rendering_of
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.trials import Outcome
@@ -39,6 +39,7 @@ class TrialOrder:
     separate_light: bool
     digest: str
     jobs: tuple[Job, ...]
+    rendering: Rendering
     planned: PlannedExposure | None = None
 
 
@@ -53,12 +54,20 @@ class SpreadMeasurements:
     def __init__(self, workers: Executor, renderer: RenderedMeasurements, digest: str) -> None:
         self.workers, self.renderer = workers, renderer
         path = str(Path(renderer.study.path).absolute())
-        self._order = TrialOrder(path, renderer.study.file, renderer.unknowns, renderer.separate_light, digest, ())
+        self._order = TrialOrder(
+            path, renderer.study.file, renderer.unknowns, renderer.separate_light, digest, (), renderer.rendering
+        )
 
     def exposed_as(self, planned: PlannedExposure | None) -> SpreadMeasurements:
         """Return the same measurements with other exposures than the sensor's own."""
         other = copy.copy(self)
         other._order = replace(self._order, planned=planned)
+        return other
+
+    def rendered_as(self, rendering: Rendering) -> SpreadMeasurements:
+        """Return the same measurements with other light paths."""
+        other = copy.copy(self)
+        other._order = replace(self._order, rendering=rendering)
         return other
 
     def in_order(self, jobs: Iterable[Job]) -> list[Job]:
@@ -79,6 +88,7 @@ class SpreadMeasurements:
                 yield row[first : first + _IN_A_ROW]
 
 
+#: digest of a study, and its measurements with the light paths of the last order
 _prepared: dict[str, RenderedMeasurements] = {}
 
 
@@ -90,6 +100,8 @@ def make_trials(order: TrialOrder) -> list[Outcome]:
         backend.activate(None)
         _prepared.clear()
         study = open_study(order.path, order.file, mapped=False)  # trials are rendered
-        _prepared[order.digest] = RenderedMeasurements(study, order.unknowns, rendering_of(study), order.separate_light)
+        _prepared[order.digest] = RenderedMeasurements(study, order.unknowns, order.rendering, order.separate_light)
+    if order.rendering != _prepared[order.digest].rendering:
+        _prepared[order.digest] = _prepared[order.digest].rendered_as(order.rendering)
     renderer = _prepared[order.digest].exposed_as(order.planned)
     return [outcome for _, outcome in renderer.run(order.jobs)]

@@ -14,9 +14,9 @@ from characterisation.statements.statement import statement
 from mitsim.report.choice_page import page_content, write_choice_page
 from mitsim.report.first_screen import of_choice
 from mitsim.study.choice_document import ChoiceDocument
-from mitsim.study.choose import read_candidates, selection
+from mitsim.study.choose import read_candidates, rounds, selection
 from mitsim.study.choose.ranking import rank_key, rank_keys, relative_to_least, unpromising
-from mitsim.study.choose.selection import SensorResult
+from mitsim.study.choose.sensor_result import SensorResult, ordered
 from mitsim.study.choose.table import as_text, document
 from mitsim.study.virtual.race import combined_cost, first_of_each, possible_measurements
 from mitsim.study.virtual.stated import StatedView
@@ -75,7 +75,7 @@ def measured(candidate, spreads, trials=24, tolerance=None):
 
 
 def documented(found) -> ChoiceDocument:
-    return document(found[0].candidate.study, selection._ordered(found), [], 1.0, True)
+    return document(found[0].candidate.study, ordered(found), [], 1.0, True)
 
 
 def test_possible_measurements_count_first_then_the_worst_then_the_next_worst():
@@ -199,9 +199,9 @@ def test_a_measurement_without_a_value_is_tried_from_its_own_best_view(candidate
     standings = {name: SimpleNamespace(leader=place, risk=np.array([1.0, 0.9])) for name, place in leaders.items()}
     views = np.array([view, view + 1])
     one.raced = SimpleNamespace(views=views, standings=standings, leader=lambda name: int(views[leaders[name]]))
-    assert selection._own_views(one, list(MEASUREMENTS), view) == [view + 1]
+    assert rounds._own_views(one, view) == [view + 1]
     leaders[MEASUREMENTS[0]] = standings[MEASUREMENTS[0]].leader = 0
-    assert selection._own_views(one, list(MEASUREMENTS), view) == []
+    assert rounds._own_views(one, view) == []
 
 
 def test_sensors_that_can_measure_nothing_are_last_and_none_is_named_best(candidates):

@@ -108,6 +108,12 @@ def test_time_that_is_over_ends_a_race_undecided(tmp_path):
     assert not raced.decided and raced.trials == 3
 
 
+def test_time_that_is_over_has_gone_to_the_most_promising_views(tmp_path):
+    maker = KnownMaker(np.ones((2, 6)))
+    raced = race(maker, scores_of(np.array([[3, 1, 6, 2, 5, 4]] * 2)), tmp_path, over=lambda: maker.made >= 3)
+    assert raced.views[np.isfinite(raced.errors[0]).any(axis=1)].tolist() == [1, 3, 0]
+
+
 def test_the_first_round_tells_its_state_while_it_lasts(tmp_path, monkeypatch):
     monkeypatch.setattr("mitsim.study.virtual.race._SAY_EVERY_S", -1.0)
     scores, states = scores_of(np.array(SPREADS) * 1.3), []

@@ -1,0 +1,57 @@
+"""Workers make the trials of an order with the light paths that it names; called here as a worker calls it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.study import StudyFile, open_study
+from mitsim.study.session import Session
+from mitsim.study.virtual import spread_out
+from mitsim.study.virtual.plan import race_rendering
+from mitsim.study.virtual.race import Job
+from mitsim.study.virtual.spread_out import SpreadMeasurements
+from mitsim.study.virtual.world import Trial
+from tests.smaller_sensors import coarse_sensor
+
+SCENES = Path(__file__).parents[3] / "scenes" / "two_pillars"
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    table = {
+        "scene": "matt_white.xml",
+        "task": "task.toml",
+        "sensor": str(coarse_sensor("ensenso-n10", 2, tmp_path_factory.mktemp("sensor"))),
+        "views": {"subdivisions": 0, "rolls_deg": [0], "lowest_elevation_deg": 20},
+        "measure": {"light_path_depth": 2, "samples_per_pixel": 1},
+    }
+    return open_study(SCENES / "study.toml", StudyFile.model_validate(table))
+
+
+class _Here:
+    """Workers that make each order in this process."""
+
+    def distribute(self, orders, _, make):
+        return ((order, make(order)) for order in orders)
+
+
+def test_the_race_has_fewer_paths_and_trials_of_its_own(study, tmp_path, monkeypatch):
+    monkeypatch.setattr(spread_out, "_prepared", {})
+    session = Session(study, tmp_path)
+    here = session.renderer
+    spread = SpreadMeasurements(_Here(), here, session.digest)
+    jobs = [Job(study.views[1], Trial(day)) for day in range(2)]
+    race = race_rendering(study)
+    assert race.kept.samples < here.rendering.kept.samples and race.kept.kept < here.rendering.kept.kept
+    errors = []
+    for maker, worker in ((here, spread), (here.rendered_as(race), spread.rendered_as(race)), (here, spread)):
+        expected = [list(outcome.errors.values()) for _, outcome in maker.run(jobs)]
+        np.testing.assert_array_equal([list(outcome.errors.values()) for _, outcome in worker.run(jobs)], expected)
+        errors.append(np.array(expected))
+    known = np.isfinite(errors[0]) & np.isfinite(errors[1])
+    assert known.any() and (errors[0][known] != errors[1][known]).all()
+    np.testing.assert_array_equal(errors[0], errors[2])
+    assert len(spread_out._prepared) == 1
+    assert session.race_trials.digest != session.trials.digest
+    assert session.race_trials.folder != session.trials.folder
