@@ -45,10 +45,16 @@ _RACE_SHARE = 0.4
 _MORE = 40
 
 
-def state_by_screening(one: SensorResult, count: int, limit: TimeLimit) -> None:
-    """State a sensor from ``count`` trials of the view that screening finds best for all measurements."""
+def state_by_screening(one: SensorResult, count: int, limit: TimeLimit, whole: TimeLimit) -> None:
+    """State a sensor from ``count`` trials of the view that screening finds best for all measurements.
+
+    A sensor whose share ends before it has a few trials gets these within the ``whole`` limit: the light paths of its
+    view are traced by then.
+    """
     for view in shortlist(one.scores, 1):
         _state(one, view, count, limit)
+        if view not in one.stated:
+            _state(one, view, min(_FEWEST, count), whole)
         if view in one.stated:
             _finish(one, view)
 

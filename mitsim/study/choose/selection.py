@@ -101,8 +101,11 @@ def _measure_in_rounds(
                 if unmeasured:
                     say(f"choose: time is over; {unmeasured} sensors are judged by screening alone")
                 break
-            measure = race_and_state if raced else state_by_screening
-            measure(one, count, work.part(1 / (len(rivals) - place)))
+            share = work.part(1 / (len(rivals) - place))
+            if raced:
+                race_and_state(one, count, share)
+            else:
+                state_by_screening(one, count, share, limit)
             _say(found, f"round {turn + 1}: {place + 1} of {len(rivals)} sensors measured", limit)
             report_results(ordered(found), False)
         if any(one.stated for one in found):

@@ -89,7 +89,7 @@ class _Session:
 
     def state(self, view, table, limit):
         self.asked.append((view.number, table.trials))
-        return stated_view(view, self.spreads[view.number], table.trials)
+        return stated_view(view, self.spreads[view.number], 2 if limit.over() else table.trials)
 
     def release(self):
         pass
@@ -103,9 +103,18 @@ def test_the_view_of_the_race_replaces_that_of_the_screening_if_its_statement_is
     monkeypatch.setattr(rounds, "_finish", lambda *_: None)
     one = result(candidates[0], 1.0, raced=False)
     one.stated, one.session = {}, _Session(candidates[0], tmp_path, {0: 0.1, 1: won}, leader=1)
-    state_by_screening(one, 24, LIMIT)
+    state_by_screening(one, 24, LIMIT, LIMIT)
     assert list(one.stated) == [0] and one.raced is None
     race_and_state(one, 48, LIMIT)
     assert next(iter(one.stated)) == better and one.raced is one.session.raced
     race_and_state(one, 96, LIMIT)
     assert one.session.asked == [(0, 24), (1, 48), (better, 96)]
+
+
+def test_a_sensor_whose_share_ends_early_gets_a_few_trials(candidates, tmp_path, monkeypatch):
+    monkeypatch.setattr(rounds, "shortlist", lambda *_: [0])
+    monkeypatch.setattr(rounds, "_finish", lambda *_: None)
+    one, short = result(candidates[0], 1.0, raced=False), SimpleNamespace(over=lambda: True)
+    one.stated, one.session = {}, _Session(candidates[0], tmp_path, {0: 0.1, 1: 0.1}, leader=1)
+    state_by_screening(one, 24, short, LIMIT)
+    assert one.session.asked == [(0, 24), (0, 4)] and one.trials == 4
