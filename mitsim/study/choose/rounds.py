@@ -48,8 +48,21 @@ _MORE = 40
 def state_by_screening(one: SensorResult, count: int, limit: TimeLimit, whole: TimeLimit) -> None:
     """State a sensor from ``count`` trials of the view that screening finds best for all measurements.
 
-    A sensor whose share ends before it has a few trials gets these within the ``whole`` limit: the light paths of its
-    view are traced by then.
+    Parameters
+    ----------
+    one
+        Results of the sensor so far, which get the statement.
+    count
+        Number of trials.
+    limit
+        Time of the sensor. If it ends before there are a few trials, the sensor gets these within ``whole``: the light
+        paths of its view are traced by then.
+    whole
+        Time of the comparison.
+
+    See Also
+    --------
+    race_and_state : from the best view by a race
     """
     for view in shortlist(one.scores, 1):
         _state(one, view, count, limit)
