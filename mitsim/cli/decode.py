@@ -41,6 +41,8 @@ def decode(
 ) -> None:
     """Compute the point cloud of a capture; print how many pixels have a point, and why the others have none.
 
+    Exit code 1 if no pixel has a point.
+
     Example: mitsim decode captures/real -o cloud.ply
     """
     from characterisation.cloud_files import write_cloud
@@ -63,5 +65,7 @@ def decode(
     check_file(output)
     write_cloud(decoded.cloud, output, written)
     print_reasons(decoded.cloud)
-    if decoded.cloud.valid.any():
-        say(f"cloud: {output}; next: mitsim measure {shlex.quote(str(output))} --picture look.png")
+    if not decoded.cloud.valid.any():
+        say(f"no pixel has a point, for the reasons above; {output} is empty")
+        raise typer.Exit(1)
+    say(f"cloud: {output}; next: mitsim measure {shlex.quote(str(output))} --picture look.png")

@@ -265,7 +265,8 @@ def test_a_rendering_that_shows_nothing_of_the_part_says_so(tmp_path):
     assert "no pixel is lit" in done.stderr
     assert "nan" not in done.stderr
     pixels = read_capture(tmp_path / "away").images["left"][0].size
-    decoded = mitsim("decode", tmp_path / "away", "-o", tmp_path / "away.ply")
+    decoded = mitsim_here("decode", tmp_path / "away", "-o", tmp_path / "away.ply", code=1)
+    assert decoded.stderr.splitlines()[-1].startswith("no pixel has a point")
     assert decoded.stdout.splitlines()[0] == f"valid\t0 of {pixels}"
     assert "shows the part" in decoded.stderr
     seen = mitsim("render", scene, "--position", 0, -400, 300, *view, "-o", tmp_path / "seen")
