@@ -260,7 +260,12 @@ def seeds(
     output: Out,
     view: Annotated[int, typer.Option(min=0, help="Number of the candidate view to state.")],
     seeds: Annotated[int, typer.Option(min=2, max=100, help="Number of seeds, from 1 on.")] = 5,
-    trials: Annotated[int, typer.Option(min=2, max=1_000_000, help="Trials of each statement.")] = 200,
+    trials: Annotated[
+        int | None,
+        typer.Option(
+            min=2, max=1_000_000, help="Trials of each statement; default: as many as the study makes by its own rule."
+        ),
+    ] = None,
     processes: Processes = 1,
     variant: Variant = None,
 ) -> None:

@@ -26,14 +26,17 @@ SAME_U, SAME_INTERVAL = 0.15, 0.20
 
 
 def statements_of_seeds(
-    study: Study, view: View, seeds: Sequence[int], trials: int, folder: Path, workers: Executor | None = None
+    study: Study, view: View, seeds: Sequence[int], trials: int | None, folder: Path, workers: Executor | None = None
 ) -> dict[int, list[Statement]]:
-    """Return the statements of a view by seed; trials in the folder are reused."""
+    """Return the statements of a view by seed; trials in the folder are reused.
+
+    ``trials`` is the number of each statement; None for as many as the study makes by its own rule.
+    """
     out = {}
     for seed in seeds:
         one = replace(study, file=study.file.model_copy(update={"seed": seed}))
         session = Session(one, folder / f"seed_{seed}", workers)
-        out[seed] = session.state(view, StatementTable(trials=trials)).statements
+        out[seed] = session.state(view, None if trials is None else StatementTable(trials=trials)).statements
     return out
 
 
@@ -44,12 +47,17 @@ def spread(values: Sequence[float]) -> float:
 
 
 def seeds_table(stated: Mapping[int, Sequence[Statement]]) -> str:
-    """Return u of every measurement by seed, and the spread of u and of the widths of the intervals, in Markdown."""
+    """Return u of every measurement by seed, the spread of u and of the widths of the intervals, and the trials.
+
+    The table is Markdown.
+    """
     body = []
     for same in zip(*stated.values(), strict=True):
         u = [one.standard_uncertainty for one in same]
         widths = [one.interval[1] - one.interval[0] for one in same]
         ends = (f"{100 * spread(values):.0f} %" for values in (u, widths))
         body.append([same[0].measurement, same[0].unit, *map(number, u), *ends])
+    made = [str(max(one.trials for one in same)) for same in stated.values()]
+    body.append(["trials", "", *made, "", ""])
     head = ["measurement", "unit", *(f"u, seed {seed}" for seed in stated), "largest u over least", "of the widths"]
     return markdown(head, body)

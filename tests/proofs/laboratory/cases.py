@@ -55,14 +55,14 @@ class LaboratoryFile(Document):
     """Cases of the laboratory; paths are relative to the file.
 
     - ``worlds`` of every case, view, family and mask.
-    - ``trials`` of the statements that are judged.
+    - ``trials`` of the statements that are judged; without them, as many as a study makes by its own rule.
     - ``paths``: light paths for each pixel and pattern.
     - ``grid``: the candidate views that ``views`` of a case number, as in a study.
     """
 
     seed: Annotated[int, Field(ge=0)] = 1
     worlds: Annotated[int, Field(ge=1, le=100_000)] = 20
-    trials: Annotated[int, Field(ge=2, le=100_000)] = 200
+    trials: Annotated[int, Field(ge=2, le=100_000)] | None = None
     paths: Annotated[int, Field(ge=1, le=1_000_000)] = 252
     grid: ViewsTable
     cases: Annotated[list[LaboratoryCase], Field(min_length=1)]

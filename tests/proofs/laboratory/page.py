@@ -104,10 +104,11 @@ def write_laboratory_page(found: Sequence[Found], folder: Path, source: Path) ->
     """Write ``laboratory.md`` and ``laboratory.csv``; return the page's path, and its first table."""
     table = share_table(found)
     file = found[0].row.file
+    of_trials = "of as many trials as a study makes" if file.trials is None else f"of {file.trials} trials"
     text = (
         "# Statements in worlds of an independent laboratory\n\n"
         f"Made by `python -m tests.proofs laboratory {source} -o FOLDER`. Every cell has {file.worlds} worlds, judged "
-        f"by a statement of {file.trials} trials at seed {file.seed}. Asked is that {100 * ASKED[0]:.0f} to "
+        f"by a statement {of_trials} at seed {file.seed}. Asked is that {100 * ASKED[0]:.0f} to "
         f"{100 * ASKED[1]:.0f} % of the errors lie inside the stated 95 % intervals in every row. Brackets are 95 % "
         "intervals over independent worlds (Wilson).\n\n"
         f"{table}\n## Measurement by measurement\n\n{measurement_table(found)}"

@@ -94,7 +94,8 @@ def statement_of(row: Judged, folder: Path, workers: Executor | None = None) -> 
     """Return the tool's statement of a row's view in its scene, and reuse trials in the folder."""
     study = row.study()
     session = Session(study, folder / f"{row.case.name}__{row.name[2]}", workers)
-    return session.state(row.view_of(study), StatementTable(trials=row.file.trials)).statements
+    table = None if row.file.trials is None else StatementTable(trials=row.file.trials)
+    return session.state(row.view_of(study), table).statements
 
 
 def run_rows(rows: Sequence[Judged], folder: Path, workers: Executor | None = None) -> list[Found]:

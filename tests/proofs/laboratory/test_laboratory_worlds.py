@@ -255,5 +255,6 @@ def test_seeds_are_compared_by_the_largest_u_over_the_least():
         seed: [statement("length", "mm", factor * errors, None, (), factor * errors)]
         for seed, factor in ((1, 1), (2, 3))
     }
-    line = seeds_table(stated).splitlines()[2]
+    line, trials = seeds_table(stated).splitlines()[2:]
     assert line.startswith("| length | mm |") and line.count("200 %") == 2
+    assert trials.split("|")[1:5] == [" trials ", "  ", " 200 ", " 200 "]
