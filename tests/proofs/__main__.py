@@ -255,6 +255,28 @@ def laboratory(
     say(f"page: {page}")
 
 
+def pairs(
+    cases: Annotated[Path, typer.Argument(help="TOML file that lists parts, sensors, finishes, masks and decoders.")],
+    only: Annotated[
+        list[str] | None,
+        typer.Option(help="Evaluate only rows whose name CASE__FAMILY contains this text. Repeatable."),
+    ] = None,
+    variant: Variant = None,
+) -> None:
+    """Measure the same worlds with the light of mitsim and with that of the laboratory; print how far they differ.
+
+    Rows of the family "mitsim" with the preset's mask are evaluated.
+
+    Example: python -m tests.proofs pairs tests/proofs/laboratory/cases.toml --only david
+    """
+    start(variant)
+    from tests.proofs.laboratory.cases import read_cases
+    from tests.proofs.laboratory.pairs import pairs_of, pairs_table
+
+    rows = [row for row in read_cases(cases, only or ()) if (row.family, row.mask) == ("mitsim", "preset")]
+    print(pairs_table([pairs_of(row) for row in rows]), end="")
+
+
 def seeds(
     study: Annotated[Path, typer.Argument(help="Study TOML file.")],
     output: Out,
@@ -321,7 +343,7 @@ def faces(
     print(fractions_table(fractions_of_cases(read_part_cases(cases, only or ()), views)), end="")
 
 
-for command in (maps, scores, statements, budgets, losses, laboratory, seeds, finishes, faces):
+for command in (maps, scores, statements, budgets, losses, laboratory, pairs, seeds, finishes, faces):
     app.command(name=command.__name__)(command)
 
 if __name__ == "__main__":

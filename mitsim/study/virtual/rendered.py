@@ -175,7 +175,14 @@ class RenderedMeasurements:
         captured = self._captured(view, drawn)
         return self._cloud(captured), captured.assumed
 
-    def _finish(self, captured: _Captured, job: Job) -> Outcome:
+    def outcome(self, capture: Capture, lit: TracedLight) -> Outcome:
+        """Return the outcome of a capture of traced light, decoded and measured as in a trial."""
+        return self._measured(self._with_labels(capture, lit.drawn, lit.assumed))
+
+    def _finish(self, captured: _Captured, _: Job) -> Outcome:
+        return self._measured(captured)
+
+    def _measured(self, captured: _Captured) -> Outcome:
         part_from_world = captured.assumed.inverse().matrix()
         decoded = self.unlabelled_cloud(captured.capture, captured.drawn.decoder)
 
@@ -188,10 +195,13 @@ class RenderedMeasurements:
 
     def _captured(self, view: View, drawn: DrawnValues) -> _Captured:
         lit = self.lit(view, drawn)
-        capture = self.exposed(lit, self.planned, drawn.seed)
-        labels = self.predictor.quick_labels(self.study.scene, lit.assumed)
-        surfaces = self.predictor.surfaces(self.study.scene, lit.assumed) if self._moves_faces(drawn) else None
-        return _Captured(capture, drawn, lit.assumed, surfaces, labels)
+        return self._with_labels(self.exposed(lit, self.planned, drawn.seed), drawn, lit.assumed)
+
+    def _with_labels(self, capture: Capture, drawn: DrawnValues, assumed: Transform) -> _Captured:
+        """Return a capture with the labels of its pixels and, if faces have moved, their nominal surfaces."""
+        labels = self.predictor.quick_labels(self.study.scene, assumed)
+        surfaces = self.predictor.surfaces(self.study.scene, assumed) if self._moves_faces(drawn) else None
+        return _Captured(capture, drawn, assumed, surfaces, labels)
 
     def _moves_faces(self, drawn: DrawnValues) -> bool:
         """Return whether the faces of a draw lie off their nominal places, by form or coat."""

@@ -18,6 +18,7 @@ from mitsim.study.virtual.world import STATEMENT_DAYS, Trial
 from tests.proofs.laboratory.cases import Judged, read_cases
 from tests.proofs.laboratory.decoders import decoded
 from tests.proofs.laboratory.page import inside_of, share_inside, write_laboratory_page
+from tests.proofs.laboratory.pairs import size_ratio
 from tests.proofs.laboratory.worlds import Laboratory
 from tests.proofs.seeds import seeds_table, spread
 from tests.smaller_sensors import coarse_sensor
@@ -258,3 +259,13 @@ def test_seeds_are_compared_by_the_largest_u_over_the_least():
     line, trials = seeds_table(stated).splitlines()[2:]
     assert line.startswith("| length | mm |") and line.count("200 %") == 2
     assert trials.split("|")[1:5] == [" trials ", "  ", " 200 ", " 200 "]
+
+
+def test_sizes_of_errors_are_compared_with_an_interval_over_worlds():
+    rng = np.random.default_rng(4)
+    first, second = rng.standard_normal((2, 400))
+    ratio, low, high = size_ratio(first, 2 * second)
+    assert low < 2 < high and low < ratio < high and high / low < 1.4
+    first[:10] = np.nan
+    assert size_ratio(first, 3 * first) == pytest.approx((3, 3, 3))
+    assert np.isnan(size_ratio(first[:11], second[:11])).all()
