@@ -5,8 +5,9 @@ of the same world by mitsim, as a trial traces it -> both on mitsim's imager wit
 in the same way -> differences of the errors.
 
 Unknowns that the laboratory does not share are not drawn: mask and pattern of the unit, decoder, room, form, tail and
-lay of a finish. There is no speckle. Errors on bare metal react to a few per cent of light as to another finish, so those
-of one world differ. A statement is about their size: a renderer adds to it only as far as the sizes of both sides differ.
+lay of a finish. There is no speckle. Errors on bare metal react to a few per cent of light as to another finish, so
+those of one world differ. A statement is about their size: a renderer adds to it only as far as the sizes of both sides
+differ.
 """
 
 from __future__ import annotations
