@@ -6,11 +6,11 @@ light, power, exposure, noise -> cloud, decoded with the *nominal* calibration -
 temperature and form of the part -> measurement at the assumed pose -> error of every measurement.
 
 The paths of interreflections are those of the nominal pose and calibration of the view
-(:mod:`mitsim.capture.simulated.kept_light`). That light is smooth, and the random pose and calibration shift it by
-about a pixel. Trials sorted by view (:func:`in_order`) trace the paths once for each view. With ``separate_light``,
-every trial renders all of its light at its own pose and calibration. That takes several times as long, and is the
-reference for this approximation. The interreflections of scenes with emitters, or with finishes inside other BSDFs, are
-rendered anew for every finish.
+(:mod:`mitsim.capture.simulated.kept_light`). Their images, and those of the room light, move to where the random pose
+and calibration show the part (:mod:`mitsim.capture.simulated.image_motion`). Trials sorted by view (:func:`in_order`)
+trace the paths once for each view. With ``separate_light``, every trial renders all of its light at its own pose and
+calibration. That takes several times as long, and is the reference for this approximation. The interreflections of
+scenes with emitters, or with finishes inside other BSDFs, are rendered anew for every finish.
 
 Temperature and form displace the decoded points together with the surface, to first order. At 50 um on 500 mm, the
 change of the image position is far below a pixel, and that of the brightness far below a grey level.
@@ -33,6 +33,7 @@ from characterisation.tasks.result import Result
 from characterisation.tasks.task_file import Task
 from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.exposing import LightOnImagers
+from mitsim.capture.simulated.image_motion import image_motion, moved
 from mitsim.capture.simulated.kept_light import KeptLight, can_be_kept, keep_light
 from mitsim.capture.simulated.rendering import IndirectImages, Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
@@ -130,7 +131,7 @@ class RenderedMeasurements:
         self.simulated = SimulatedSensor(study.sensor)
         self.geometry = sensor_geometry(study.sensor)
         self.predictor = Predictor.of_sensor(study.sensor, self.geometry)
-        corners = hull_corners(study.scene)
+        self.hull = corners = hull_corners(study.scene)
         reach = _PLACEMENTS * unknowns.table.pose.placement_mm if "pose" in unknowns.varied else 0.0
         self.corners = np.concatenate([corners + step for step in reach * _CUBE_CORNERS])
         self._finished: tuple[int, Scene, list[Floats]] | None = None
@@ -216,11 +217,19 @@ class RenderedMeasurements:
         else:
             pose, shared = view.world_from_sensor, self._view_light(view)
         scene, albedos = self._scene(drawn.finish)
-        indirect = self._indirect(sensor, scene, pose, view, drawn, shared)
-        room = {
-            name: sensor.apply_lens(one.room_radiance(albedos), name, shared.rois[name])
-            for name, one in shared.seen.items()
+        motions = {
+            name: image_motion(self.simulated.rays[name].camera, pose, sensor.rays[name].camera, true, self.hull, roi)
+            for name, roi in (() if self.separate_light else shared.rois.items())
         }
+        images = self._indirect(sensor, scene, pose, view, drawn, shared)
+        images = {name: moved(stack, motions.get(name)) for name, stack in images.items()}
+        how = self.rendering.indirect_settings
+        assert how is not None  # rendering_of a study
+        indirect = IndirectImages(images, shared.rois, how, self.rendering.depth)
+        room = {}
+        for name, one in shared.seen.items():
+            image = moved(one.room_radiance(albedos)[None], motions.get(name))[0]
+            room[name] = sensor.apply_lens(image, name, shared.rois[name])
         light = sensor.light(scene, true, seed=drawn.seed, rendering=replace(self.rendering, indirect=indirect))
         return TracedLight(sensor, light, room, drawn, assumed)
 
@@ -343,8 +352,8 @@ class RenderedMeasurements:
         view: View,
         drawn: DrawnValues,
         shared: _ViewLight,
-    ) -> IndirectImages:
-        """Return the interreflections of a draw: on the kept paths, or rendered from a pose."""
+    ) -> dict[str, NDArray[np.float32]]:
+        """Return the interreflections (P, h, w) of a draw by camera: on the kept paths, or rendered from a pose."""
         how = self.rendering.indirect_settings
         assert how is not None  # rendering_of a study
         images = {}
@@ -359,7 +368,7 @@ class RenderedMeasurements:
                 images[name] = simulated.indirect_radiance(
                     scene, pose, name, how, seed=seed, depth=self.rendering.depth, roi=roi
                 )
-        return IndirectImages(images, shared.rois, how, self.rendering.depth)
+        return images
 
 
 def _seed_of(*numbers: int) -> int:

@@ -25,6 +25,7 @@ from mitsim.sensor.transforms import Transform, look_at
 from mitsim.study import StudyFile, open_study
 from mitsim.study.session import Session
 from mitsim.study.statement_document import statement_document
+from mitsim.study.virtual import rendered
 from mitsim.study.virtual.drawn_finish import finish_deviation
 from mitsim.study.virtual.plan import measurements_of, trial_digest
 from mitsim.study.virtual.race import Job
@@ -378,9 +379,9 @@ def test_interreflections_of_a_trial_are_those_of_its_finish(coarse_n10):
         drawn = maker.unknowns.draw(Trial(day))
         scene = maker._scene(drawn.finish)[0]
         kept = maker._indirect(maker.simulated, scene, view.world_from_sensor, view, drawn, shared)
-        for name, images in kept.images.items():
+        for name, images in kept.items():
             rendered = maker.simulated.indirect_radiance(
-                scene, view.world_from_sensor, name, IndirectLight(256, 1.5), seed=day, depth=2, roi=kept.rois[name]
+                scene, view.world_from_sensor, name, IndirectLight(256, 1.5), seed=day, depth=2, roi=shared.rois[name]
             )
             assert images.sum() == pytest.approx(rendered.sum(), rel=0.03)
 
@@ -416,3 +417,29 @@ def test_unknowns_of_a_study_are_checked(tmp_path):
     file.write_text('scene = "a.xml"\ntask = "t.toml"\nsensor = "ensenso-n10"\n[views]\n[unknowns.pose]\ntold_m = 1\n')
     with pytest.raises(InputError, match="told_m"):
         read_toml(file, StudyFile)
+
+
+def test_shared_interreflections_follow_the_part(coarse_n10, monkeypatch):
+    """Against interreflections that are rendered at the drawn pose; direct light is the same in both."""
+    given = {"measure": {"light_path_depth": 2, "samples_per_pixel": 1}, "unknowns": {"pose": {"placement_mm": 4.0}}}
+    study = study_of(coarse_n10, scene="two_pillars.xml", **given)
+    unknowns = replace(study_unknowns(study), varied=("pose",))
+    view = study.views[1]
+    together, apart = measurements_of(study, unknowns), measurements_of(study, unknowns, separate_light=True)
+    errors = {}
+    for follows in (True, False):
+        if not follows:
+            monkeypatch.setattr(rendered, "moved", lambda images, _: images)
+        squares = []
+        for day in range(4):
+            drawn = unknowns.draw(Trial(day))
+            one, other = (maker.lit(view, drawn).light for maker in (together, apart))
+            for name in one.radiance:
+                camera = study.sensor.rig.cameras[name]
+                whole = np.zeros((2, camera.height, camera.width))
+                for image, light in zip(whole, (one, other), strict=True):
+                    image[light.rois[name].slices] = light.radiance[name][0]
+                both = (whole > 0).all(axis=0)
+                squares.append(((whole[0] - whole[1])[both] ** 2).mean())
+        errors[follows] = np.sqrt(np.mean(squares))
+    assert errors[True] < 0.6 * errors[False]
