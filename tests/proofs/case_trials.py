@@ -1,6 +1,6 @@
 """Trials of a case, of four kinds, each in its own worlds.
 
-- *tool*: the trials of race and statement;
+- *tool*: the trials of statements, and beside them those of the *race*;
 - *truth*: trials of every candidate, for the risks, in the worlds of the race;
 - *choice*: trials of the candidates of a race, for the regret of its choices, in other worlds;
 - *apart*: trials of the stated views, for the coverage. Nothing is shared: every world renders all of its light at its
@@ -22,6 +22,7 @@ from mitsim.running.executor import Executor
 from mitsim.study import Study
 from mitsim.study.session import Session
 from mitsim.study.virtual.race import Job, complete
+from mitsim.study.virtual.trials import TrialFolder
 from mitsim.study.virtual.world import JUDGING_DAYS, Trial
 from mitsim.views import View
 from tests.proofs.kept_trials import take_up_trials, write_trials
@@ -38,7 +39,7 @@ def trials_by_kind(case: PartCase, study: Study, folder: Path, workers: Executor
         for kind in KINDS
     }
     if case.measured is not None:
-        take_up_trials(case.measured / f"{case.name}.nc", {kind: one.trials for kind, one in found.items()})
+        take_up_trials(case.measured / f"{case.name}.nc", _folders(found))
     return found
 
 
@@ -62,9 +63,13 @@ def measure_worlds(
 
 def keep_trials(case: PartCase, folder: Path, found: dict[str, Session]) -> None:
     """Write all trials of a case to one file in the folder."""
-    trials = {kind: one.trials for kind, one in found.items()}
     views = [view.number for view in found["truth"].study.views]
-    write_trials(folder / f"{case.name}.nc", trials, views)
+    write_trials(folder / f"{case.name}.nc", _folders(found), views)
+
+
+def _folders(found: dict[str, Session]) -> dict[str, TrialFolder]:
+    """Return the folders of all trials by kind."""
+    return {kind: one.trials for kind, one in found.items()} | {"race": found["tool"].race_trials}
 
 
 def measured_truth(case: PartCase, session: Session) -> NDArray[np.float64]:

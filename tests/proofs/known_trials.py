@@ -36,6 +36,9 @@ class KnownMaker:
     def __init__(self, study, unknowns, apart=False, wider=1.0):
         self.seed, self.wider = unknowns.seed, wider if apart else 1.0
 
+    def rendered_as(self, _):
+        return self
+
     def in_order(self, jobs):
         return list(jobs)
 
