@@ -65,7 +65,7 @@ def rows(name: str, number: int, worlds: int):
         drawn = unknowns.draw(Trial(world))
         true = interreflections(apart, drawn)
         moved = interreflections(together, drawn)
-        with mock.patch.object(rendered, "moved", lambda images, _: images):
+        with mock.patch.object(rendered, "moved_images", lambda images, _: images):
             unmoved = interreflections(together, drawn)
         seen = (true > 0) & (moved > 0) & (unmoved > 0)
         size = true[seen].std()

@@ -49,7 +49,7 @@ def image_motion(
 
     See Also
     --------
-    moved : apply it to images
+    moved_images : apply it to images
     """
     first = before.project(world_from_sensor.inverse().points(points))
     second = after.project(other_world_from_sensor.inverse().points(points))
@@ -62,7 +62,7 @@ def image_motion(
     return np.asarray(solved.T) if rank == known.shape[1] else None
 
 
-def moved(images: NDArray[np.float32], motion: NDArray[np.float64] | None) -> NDArray[np.float32]:
+def moved_images(images: NDArray[np.float32], motion: NDArray[np.float64] | None) -> NDArray[np.float32]:
     """Return images (P, h, w) after a motion of :func:`image_motion`; None leaves them as they are."""
     if motion is None or not images.size:
         return images

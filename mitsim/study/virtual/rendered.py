@@ -33,7 +33,7 @@ from characterisation.tasks.result import Result
 from characterisation.tasks.task_file import Task
 from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.exposing import LightOnImagers
-from mitsim.capture.simulated.image_motion import image_motion, moved
+from mitsim.capture.simulated.image_motion import image_motion, moved_images
 from mitsim.capture.simulated.kept_light import KeptLight, can_be_kept, keep_light
 from mitsim.capture.simulated.rendering import IndirectImages, Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
@@ -178,12 +178,9 @@ class RenderedMeasurements:
 
     def outcome(self, capture: Capture, lit: TracedLight) -> Outcome:
         """Return the outcome of a capture of traced light, decoded and measured as in a trial."""
-        return self._measured(self._with_labels(capture, lit.drawn, lit.assumed))
+        return self._finish(self._with_labels(capture, lit.drawn, lit.assumed))
 
-    def _finish(self, captured: _Captured, _: Job) -> Outcome:
-        return self._measured(captured)
-
-    def _measured(self, captured: _Captured) -> Outcome:
+    def _finish(self, captured: _Captured, _: Job | None = None) -> Outcome:
         part_from_world = captured.assumed.inverse().matrix()
         decoded = self.unlabelled_cloud(captured.capture, captured.drawn.decoder)
 
@@ -222,13 +219,13 @@ class RenderedMeasurements:
             for name, roi in (() if self.separate_light else shared.rois.items())
         }
         images = self._indirect(sensor, scene, pose, view, drawn, shared)
-        images = {name: moved(stack, motions.get(name)) for name, stack in images.items()}
+        images = {name: moved_images(stack, motions.get(name)) for name, stack in images.items()}
         how = self.rendering.indirect_settings
         assert how is not None  # rendering_of a study
         indirect = IndirectImages(images, shared.rois, how, self.rendering.depth)
         room = {}
         for name, one in shared.seen.items():
-            image = moved(one.room_radiance(albedos)[None], motions.get(name))[0]
+            image = moved_images(one.room_radiance(albedos)[None], motions.get(name))[0]
             room[name] = sensor.apply_lens(image, name, shared.rois[name])
         light = sensor.light(scene, true, seed=drawn.seed, rendering=replace(self.rendering, indirect=indirect))
         return TracedLight(sensor, light, room, drawn, assumed)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from characterisation.region_of_interest import Roi
-from mitsim.capture.simulated.image_motion import image_motion, moved
+from mitsim.capture.simulated.image_motion import image_motion, moved_images
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import Transform, look_at
 
@@ -34,7 +34,7 @@ def test_a_bright_spot_moves_with_its_point_of_the_part(camera, step_mm, angle_d
     for point in POINTS:
         column, row = camera.project(POSE.inverse().points(point[None]))[0] - [roi.left, roi.top]
         spot = np.exp(-((columns - column) ** 2 + (rows - row) ** 2) / 18).astype(np.float32)
-        image = moved(spot[None], motion)[0]
+        image = moved_images(spot[None], motion)[0]
         found = np.array([(columns * image).sum(), (rows * image).sum()]) / image.sum()
         expected = camera.project(other.inverse().points(point[None]))[0] - [roi.left, roi.top]
         assert np.abs(expected - (column, row)).max() > 0.5
@@ -53,5 +53,5 @@ def test_no_motion_without_points_in_sight(camera):
     points = POSE.points(behind)
     images = np.random.default_rng(1).random((2, 5, 6), np.float32)
     motion = image_motion(camera, POSE, camera, POSE, points, Roi(0, 0, 6, 5))
-    assert motion is None and moved(images, motion) is images
-    assert moved(images[:0], np.eye(2, 3)).shape == (0, 5, 6)
+    assert motion is None and moved_images(images, motion) is images
+    assert moved_images(images[:0], np.eye(2, 3)).shape == (0, 5, 6)

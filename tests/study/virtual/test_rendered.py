@@ -429,7 +429,7 @@ def test_shared_interreflections_follow_the_part(coarse_n10, monkeypatch):
     errors = {}
     for follows in (True, False):
         if not follows:
-            monkeypatch.setattr(rendered, "moved", lambda images, _: images)
+            monkeypatch.setattr(rendered, "moved_images", lambda images, _: images)
         squares = []
         for day in range(4):
             drawn = unknowns.draw(Trial(day))
