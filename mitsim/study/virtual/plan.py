@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,7 @@ _FRINGE_SAMPLES, _SAMPLES = 4, 16
 
 
 #: factor by which the race has fewer paths of interreflections: most of its views get one or two trials, and tracing
-#: all paths of a view takes as long as six to ten trials. With this factor, errors of trials change by 0.02 to 0.35 of
+#: all paths of a view takes as long as six to ten trials. With this factor, errors of trials change by 0.02 to 0.41 of
 #: their root mean square, and the smallest, of the angle between pillars with fringes, by 0.3 to 0.8; the root mean
 #: square of 12 trials is 0.7 to 1.46 of that with all paths, median 1.0: tests/benchmarks/race_paths.py
 _FEWER_IN_RACE = 4
@@ -82,8 +83,8 @@ def race_rendering(study: Study) -> Rendering:
     rendering = rendering_of(study)
     kept = rendering.kept
     assert kept is not None  # of every study
-    fewer = KeptSettings(kept.samples // _FEWER_IN_RACE, kept.photons, kept.kept // _FEWER_IN_RACE, kept.smoothing_px)
-    return replace(rendering, kept=fewer)
+    side = math.isqrt(kept.samples // _FEWER_IN_RACE)  # of the square of samples in a pixel
+    return replace(rendering, kept=replace(kept, samples=side**2, kept=kept.kept // _FEWER_IN_RACE))
 
 
 def measured_by(study: Study) -> str:

@@ -1,5 +1,6 @@
 """Workers make the trials of an order with the light paths that it names; called here as a worker calls it."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,7 @@ def test_the_race_has_fewer_paths_and_trials_of_its_own(study, tmp_path, monkeyp
     jobs = [Job(study.views[1], Trial(day)) for day in range(2)]
     race = race_rendering(study)
     assert race.kept.samples < here.rendering.kept.samples and race.kept.kept < here.rendering.kept.kept
+    assert math.isqrt(race.kept.samples) ** 2 == race.kept.samples  # stratified over the square of a pixel
     errors = []
     for maker, worker in ((here, spread), (here.rendered_as(race), spread.rendered_as(race)), (here, spread)):
         expected = [list(outcome.errors.values()) for _, outcome in maker.run(jobs)]
