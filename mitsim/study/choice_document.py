@@ -138,8 +138,9 @@ class SensorEntry(PartialDocument):
 
     @property
     def fits_all(self) -> bool:
-        """Return whether all measurements are possible, and no demand exceeds its limit."""
-        return not self.impossible and self.ratio is not None and self.ratio <= 1
+        """Return whether all measurements are possible, and every tolerance is decided to fit."""
+        verdicts = {cell.verdict for cell in self.measurements.values()}
+        return not self.impossible and "fits" in verdicts and verdicts <= {"fits", "no tolerance"}
 
 
 class ChoiceDocument(PartialDocument):

@@ -17,7 +17,7 @@ from mitsim.study.choice_document import ChoiceDocument
 from mitsim.study.choose import read_candidates, rounds, selection
 from mitsim.study.choose.ranking import rank_key, rank_keys, relative_to_least, unpromising
 from mitsim.study.choose.sensor_result import SensorResult, ordered
-from mitsim.study.choose.table import as_text, document
+from mitsim.study.choose.table import as_text, document, sentence
 from mitsim.study.virtual.race import combined_cost, first_of_each, possible_measurements
 from mitsim.study.virtual.stated import StatedView
 from tests.small_study import MEASUREMENTS, few_measurements, small_study
@@ -218,6 +218,18 @@ def test_no_sensor_fits_all_where_one_measurement_is_impossible(candidates):
     one, other = (with_tolerances(each, 1.0) for each in candidates)
     choice = documented([measured(one, (0.01, 0.01, 0.01), tolerance=1.0), measured(other, (INF, 0.01, 0.01), 24, 1.0)])
     assert choice.words == f"{one.name}: fits 3 of 3 tolerances"
+
+
+def test_a_sensor_with_a_tolerance_that_is_not_decided_does_not_fit_all(candidates):
+    """Its demand is below the limit, but more trials may put it above."""
+    one, other = (with_tolerances(each, 1.0) for each in candidates)
+    sensors = documented([measured(each, (0.01, 0.01, 0.01), tolerance=1.0) for each in (one, other)]).sensors
+    assert sentence(sensors).endswith("; so does 1 other")
+    cells = dict(sensors[1].measurements)
+    cells[MEASUREMENTS[1]] = cells[MEASUREMENTS[1]].model_copy(update={"verdict": "not decided"})
+    open_one = sensors[1].model_copy(update={"measurements": cells})
+    assert open_one.ratio < 1 and not open_one.fits_all
+    assert sentence([sensors[0], open_one]) == f"{sensors[0].name}: fits 3 of 3 tolerances"
 
 
 def test_views_are_raced_for_the_measurements_that_are_possible():
