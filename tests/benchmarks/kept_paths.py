@@ -53,7 +53,7 @@ def rows(name: str, number: int):
     simulated, sensor, view = maker.simulated, study.sensor, study.view(number, "--view")
     pose, rois, rendering = view.world_from_sensor, maker._view_light(view).rois, maker.rendering
     drawn = [partial(finish_deviation, maker.unknowns, k) for k in (-1, 101, 102, 103, 104)]
-    finishes = [distinct_bsdfs(maker._part(one)) for one in drawn]
+    finishes = [distinct_bsdfs(maker.part.deviated(one)) for one in drawn]
     plain = replace(rendering, kept=replace(rendering.kept, smoothing_px=0.0))
     kept, unsmoothed = (
         [keep_light(simulated, study.scene, pose, rois, how, finishes, seed) for seed in (1, 2)]
@@ -62,7 +62,7 @@ def rows(name: str, number: int):
     electrons = sensor.electrons()
     for day in (None, 0, 1, 2):
         finish = -1 if day is None else maker.unknowns.draw(Trial(day)).finish
-        scene = maker._part(partial(finish_deviation, maker.unknowns, finish))
+        scene = maker.part.deviated(partial(finish_deviation, maker.unknowns, finish))
         for camera, roi in rois.items():
             some = np.unique(np.linspace(0, simulated.patterns.count - 1, 4).astype(int))
             on_paths = [one[camera].images(scene, simulated)[some] * electrons for one in kept]

@@ -40,6 +40,7 @@ def row(name: str, count: int) -> str:
     from mitsim.study.virtual.plan import measurements_of
     from mitsim.study.virtual.race import Job
     from mitsim.study.virtual.study_unknowns import study_unknowns
+    from mitsim.study.virtual.view_light import LightOfViews
     from mitsim.study.virtual.world import Trial
 
     study = open_study(
@@ -72,12 +73,12 @@ def row(name: str, count: int) -> str:
         return owner, attribute, original
 
     list(maker.run(maker.in_order([Job(view, Trial(day)) for day in range(2)])))  # compiles
-    maker._views.clear()
+    maker.views = LightOfViews()
     began = time.perf_counter()
     maker._view_light(view)
     paths = time.perf_counter() - began
     places = [
-        timed(maker, "_scene", "finish"),
+        timed(maker.part, "in_finish", "finish"),
         timed(maker, "_indirect", "indirect"),
         timed(SimulatedSensor, "light", "light"),
         timed(SimulatedSensor, "expose", "expose"),

@@ -38,9 +38,9 @@ from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.study.calibration.accuracy import measured_points
 from mitsim.study.virtual.beyond_map import beyond_map
 from mitsim.study.virtual.coat import coated, coated_shapes
+from mitsim.study.virtual.displacement import displaced
 from mitsim.study.virtual.form import form_deviation, measured_with_form
 from mitsim.study.virtual.race import Job
-from mitsim.study.virtual.rendered import displaced
 from mitsim.study.virtual.screening import screen
 from mitsim.study.virtual.trials import Outcome
 from mitsim.study.virtual.world import BEYOND, DrawnValues, Unknowns
@@ -214,7 +214,7 @@ def _map_draws(
 def moved_by_calibration(cloud: PointCloud, sensor: Sensor, drawn: DrawnValues) -> NDArray[np.float32]:
     """Return points (H, W, 3) [mm] as the nominal calibration places them if the drawn rig is the true one.
 
-    Parameters of a time-of-flight path are excluded; :func:`mitsim.study.virtual.rendered.displaced` applies them.
+    Parameters of a time-of-flight path are excluded; :func:`mitsim.study.virtual.displacement.displaced` applies them.
     """
     known = cloud.valid
     points = cloud.points[known].astype(float)

@@ -19,7 +19,7 @@ change of the image position is far below a pixel, and that of the brightness fa
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -27,73 +27,46 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.point_cloud import PointCloud
-from characterisation.region_of_interest import Roi
 from characterisation.tasks.evaluation import measure
 from characterisation.tasks.result import Result
 from characterisation.tasks.task_file import Task
 from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.exposing import LightOnImagers
 from mitsim.capture.simulated.image_motion import image_motion, moved_images
-from mitsim.capture.simulated.kept_light import KeptLight, can_be_kept, keep_light
+from mitsim.capture.simulated.kept_light import can_be_kept, keep_light
 from mitsim.capture.simulated.rendering import IndirectImages, Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decoding.cloud import capture_cloud, sensor_geometry
 from mitsim.maps.campaign.acquire import one_ahead
 from mitsim.maps.prediction import Predictor
-from mitsim.running.executor import available_memory
-from mitsim.scene.light_transport.plain_scene import distinct_bsdfs
-from mitsim.scene.light_transport.room_light import SeenSurfaces, directional_albedos
-from mitsim.scene.load import Scene, load_scene
+from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.raycast import Surfaces
 from mitsim.scene.ray_casting.triangles import hull_corners
-from mitsim.scene.surface.scatter import Deviation
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.pattern import DotPattern, another_mask
-from mitsim.sensor.roi import roi_around
 from mitsim.sensor.transforms import Transform
 from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.study.virtual.coat import coated, coated_shapes
+from mitsim.study.virtual.displacement import displaced
 from mitsim.study.virtual.drawn_decoder import drawn_decoder
-from mitsim.study.virtual.drawn_finish import finish_deviation
+from mitsim.study.virtual.drawn_part import DrawnPart
 from mitsim.study.virtual.form import form_deviation, measured_with_form
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.trials import Outcome
+from mitsim.study.virtual.view_light import LightOfViews, ViewLight, regions, seen_surfaces
 from mitsim.study.virtual.world import DrawnValues, Trial, Unknowns
 from mitsim.views import View
 
 Floats = NDArray[np.float64]
 
-#: pixels traced around the part, for the blur of the lens and the blocks of the matcher
-_MARGIN_PX = 12
-
 #: number of standard deviations of its placement by which the part may be displaced and still be inside the window
 _PLACEMENTS = 3.0
-
-
-#: memory of the paths of views that are kept for later trials [bytes]: at least, and at most
-_LEAST_KEPT, _MOST_KEPT = 1 << 29, 1 << 32
-
-#: share of the available memory that they may take beyond the least
-_KEPT_SHARE = 0.25
 
 #: finishes in whose light the paths to keep are chosen, beside the best estimate: numbers of draws
 _PROBING_FINISHES = (101, 102, 103, 104)
 
-
-@dataclass(frozen=True)
-class _ViewLight:
-    """What all draws of a view share, by camera: regions, surfaces that are seen, paths of interreflections."""
-
-    rois: dict[str, Roi]
-    seen: dict[str, SeenSurfaces]
-    kept: dict[str, KeptLight]
-
-    @property
-    def bytes(self) -> int:
-        """Memory that it needs."""
-        return sum(one.bytes for one in self.kept.values()) + sum(
-            one.shape.nbytes + one.cosine.nbytes for one in self.seen.values()
-        )
+#: corners of a cube, which widen the box of a part by a shift in any direction
+_CUBE_CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 
 
 @dataclass(frozen=True)
@@ -134,9 +107,7 @@ class RenderedMeasurements:
         self.hull = corners = hull_corners(study.scene)
         reach = _PLACEMENTS * unknowns.table.pose.placement_mm if "pose" in unknowns.varied else 0.0
         self.corners = np.concatenate([corners + step for step in reach * _CUBE_CORNERS])
-        self._finished: tuple[int, Scene, list[Floats]] | None = None
-        self._own_scene: Scene | None = None
-        self._views: dict[int, _ViewLight] = {}
+        self.part, self.views = DrawnPart(study, unknowns), LightOfViews()
         self._has_form = any(unknowns.table.form.features.values())
         self._has_coat = bool(coated_shapes(study.scene, unknowns.table.coat))
 
@@ -149,7 +120,7 @@ class RenderedMeasurements:
     def rendered_as(self, rendering: Rendering) -> RenderedMeasurements:
         """Return the same measurements with other light paths; prepared data is shared, but for those of views."""
         other = copy.copy(self)
-        other.rendering, other._views = rendering, {}
+        other.rendering, other.views = rendering, LightOfViews()
         return other
 
     def in_order(self, jobs: Iterable[Job]) -> list[Job]:
@@ -213,7 +184,7 @@ class RenderedMeasurements:
             pose, shared = true, self._shared(sensor, true, view, False)
         else:
             pose, shared = view.world_from_sensor, self._view_light(view)
-        scene, albedos = self._scene(drawn.finish)
+        scene, albedos = self.part.in_finish(drawn.finish)
         motions = {
             name: image_motion(self.simulated.rays[name].camera, pose, sensor.rays[name].camera, true, self.hull, roi)
             for name, roi in (() if self.separate_light else shared.rois.items())
@@ -290,56 +261,26 @@ class RenderedMeasurements:
                 points = coated(points, captured.surfaces, scene, table.coat, pose, cloud.grid, drawn.coat)
         return replace(cloud, points=points, feature=captured.labels, feature_names=scene.names)
 
-    def _scene(self, finish: int) -> tuple[Scene, list[Floats]]:
-        """Return the part in the finishes of a number, and the directional albedos of its shapes."""
-        if self._finished is None or self._finished[0] != finish:
-            self._finished = None  # Dr.Jit compiles a material call for the materials of every scene in memory
-            scene = self._part(partial(finish_deviation, self.unknowns, finish))
-            self._finished = finish, scene, directional_albedos(scene)
-        return self._finished[1:]
-
-    def _part(self, deviation: Callable[[str], Deviation]) -> Scene:
-        """Return the part with finishes that deviate, in a scene of its own; a later call changes an earlier scene."""
-        if self._own_scene is None or not self._own_scene.changeable:
-            file, scene = self.study.file, self.study.scene
-            parameters = {name: str(value) for name, value in file.parameters.items()}
-            wavelength_nm = self.study.sensor.wavelength_nm
-            self._own_scene = load_scene(scene.where, wavelength_nm, parameters, deviation, file.sprayed)
-        return self._own_scene.deviated(deviation) if self._own_scene.changeable else self._own_scene
-
-    def _view_light(self, view: View) -> _ViewLight:
+    def _view_light(self, view: View) -> ViewLight:
         """Return what all draws of a view share, made at its nominal pose and calibration on first use."""
-        if view.number not in self._views:
-            made = self._shared(self.simulated, view.world_from_sensor, view, self._keeps_paths)
-            kept = sum(one.bytes for one in self._views.values())
-            allowed = min(max(_LEAST_KEPT, kept + int(_KEPT_SHARE * available_memory())), _MOST_KEPT)
-            while self._views and made.bytes + sum(one.bytes for one in self._views.values()) > allowed:
-                self._views.pop(next(iter(self._views)))  # that was not used for the longest time
-            self._views[view.number] = made
-        used = self._views.pop(view.number)
-        self._views[view.number] = used
-        return used
+        make = partial(self._shared, self.simulated, view.world_from_sensor, view, self._keeps_paths)
+        return self.views.of(view.number, make)
 
     @property
     def _keeps_paths(self) -> bool:
         return self.rendering.depth > 1 and self.rendering.kept is not None and can_be_kept(self.study.scene)
 
-    def _shared(self, simulated: SimulatedSensor, pose: Transform, view: View, keeps_paths: bool) -> _ViewLight:
+    def _shared(self, simulated: SimulatedSensor, pose: Transform, view: View, keeps_paths: bool) -> ViewLight:
         """Return regions and seen surfaces from a pose of a view, and the paths of interreflections."""
         scene = self.study.scene
-        around = view.world_from_sensor.inverse().points(self.corners)
-        rois, seen, kept = {}, {}, {}
-        for name, camera in simulated.sensor.rig.cameras.items():
-            roi = rois[name] = roi_around(camera, around, _MARGIN_PX) or simulated.rays[name].whole
-            seen[name] = SeenSurfaces.of(scene, simulated.pixel_rays(name), pose, roi)
+        rois = regions(simulated, view.world_from_sensor.inverse(), self.corners)
+        kept = {}
         if keeps_paths:
             numbers = (-1, *_PROBING_FINISHES) if "finish" in self.unknowns.varied else (-1,)
-            some = (partial(finish_deviation, self.unknowns, number) for number in numbers)
-            finishes = [distinct_bsdfs(self._part(deviation)) or [] for deviation in some]
-            self._finished = None
+            finishes = [self.part.bsdfs(number) for number in numbers]
             seed = _seed_of(self.unknowns.seed, view.number)
             kept = keep_light(simulated, scene, pose, rois, self.rendering, finishes, seed)
-        return _ViewLight(rois, seen, kept)
+        return ViewLight(rois, seen_surfaces(simulated, scene, pose, rois), kept)
 
     def _indirect(
         self,
@@ -348,7 +289,7 @@ class RenderedMeasurements:
         pose: Transform,
         view: View,
         drawn: DrawnValues,
-        shared: _ViewLight,
+        shared: ViewLight,
     ) -> dict[str, NDArray[np.float32]]:
         """Return the interreflections (P, h, w) of a draw by camera: on the kept paths, or rendered from a pose."""
         how = self.rendering.indirect_settings
@@ -370,40 +311,3 @@ class RenderedMeasurements:
 
 def _seed_of(*numbers: int) -> int:
     return int(np.random.SeedSequence(numbers).generate_state(1)[0])
-
-
-#: corners of a cube, which widen the box of a part by a shift in any direction
-_CUBE_CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
-
-
-def displaced(
-    cloud: PointCloud, drawn: DrawnValues, world_from_sensor: Transform, centre: Sequence[float] | Floats
-) -> NDArray[np.float32]:
-    """Return points (H, W, 3) [mm] of a cloud with the errors of the path length and the expansion of the part.
-
-    The part expands about its middle.
-
-    Parameters
-    ----------
-    cloud
-        Organised cloud, sensor frame.
-    drawn
-        Drawn errors of a trial: of the path length (offset [mm] and scale) and of the expansion of the part.
-    world_from_sensor
-        Pose of the sensor that the evaluation assumes.
-    centre
-        Middle (3,) of the part [mm], part frame.
-    """
-    known = cloud.valid
-    points = cloud.points[known].astype(float)
-    offset, scale = drawn.path
-    if offset or scale:
-        away = points - cloud.grid.origin
-        length = np.linalg.norm(away, axis=-1, keepdims=True)
-        points = cloud.grid.origin + away * (1 + scale + offset / length)
-    if drawn.expansion:
-        middle = world_from_sensor.inverse().points(np.asarray(centre, float))
-        points = middle + (1 + drawn.expansion) * (points - middle)
-    out = cloud.points.copy()
-    out[known] = points
-    return out

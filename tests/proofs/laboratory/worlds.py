@@ -32,7 +32,7 @@ from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.projector_images import described
 from mitsim.sensor.transforms import Transform
 from mitsim.study import MINIMUM_POINTS
-from mitsim.study.virtual.rendered import displaced
+from mitsim.study.virtual.displacement import displaced
 from mitsim.study.virtual.study_unknowns import study_unknowns
 from mitsim.study.virtual.trials import Outcome
 from mitsim.study.virtual.world import DrawnValues, Trial

@@ -26,10 +26,11 @@ from mitsim.study import StudyFile, open_study
 from mitsim.study.session import Session
 from mitsim.study.statement_document import statement_document
 from mitsim.study.virtual import rendered
+from mitsim.study.virtual.displacement import displaced
 from mitsim.study.virtual.drawn_finish import finish_deviation
-from mitsim.study.virtual.plan import measurements_of, trial_digest
+from mitsim.study.virtual.plan import measurements_of, race_rendering, trial_digest
 from mitsim.study.virtual.race import Job
-from mitsim.study.virtual.rendered import displaced
+from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.stated import budget_groups
 from mitsim.study.virtual.study_unknowns import study_unknowns
 from mitsim.study.virtual.world import Trial
@@ -377,13 +378,26 @@ def test_interreflections_of_a_trial_are_those_of_its_finish(coarse_n10):
     shared = maker._view_light(view)
     for day in range(3):
         drawn = maker.unknowns.draw(Trial(day))
-        scene = maker._scene(drawn.finish)[0]
+        scene = maker.part.in_finish(drawn.finish)[0]
         kept = maker._indirect(maker.simulated, scene, view.world_from_sensor, view, drawn, shared)
         for name, images in kept.items():
             rendered = maker.simulated.indirect_radiance(
                 scene, view.world_from_sensor, name, IndirectLight(256, 1.5), seed=day, depth=2, roi=shared.rois[name]
             )
             assert images.sum() == pytest.approx(rendered.sum(), rel=0.03)
+
+
+def test_the_finish_of_a_trial_holds_after_trials_with_other_light_paths(coarse_n10):
+    study = metal_study(coarse_n10)
+    statement, view = measurements_of(study, study_unknowns(study)), study.views[0]
+
+    def images(maker: RenderedMeasurements, day: int) -> list[np.ndarray]:
+        return list(maker.lit(view, maker.unknowns.draw(Trial(day))).light.radiance.values())
+
+    images(statement, 1)
+    race = statement.rendered_as(race_rendering(study))
+    before, _, after = images(statement, 0), images(race, 1), images(statement, 0)
+    assert all(np.array_equal(one, other) for one, other in zip(after, before, strict=True))
 
 
 @pytest.mark.parametrize(

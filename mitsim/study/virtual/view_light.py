@@ -1,0 +1,100 @@
+"""What all trials of a view share: regions of the images, surfaces that are seen, paths of interreflections.
+
+Signal chain: view at its nominal pose and calibration -> regions of the part in each image -> surfaces that the pixels
+see, and the paths of light between surfaces (:mod:`mitsim.capture.simulated.kept_light`), for any finish -> kept while
+memory allows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.region_of_interest import Roi
+from mitsim.capture.simulated.kept_light import KeptLight
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.running.executor import available_memory
+from mitsim.scene.light_transport.room_light import SeenSurfaces
+from mitsim.scene.load import Scene
+from mitsim.sensor.roi import roi_around
+from mitsim.sensor.transforms import Transform
+
+Floats = NDArray[np.float64]
+
+#: pixels traced around the part, for the blur of the lens and the blocks of the matcher
+_MARGIN_PX = 12
+
+#: memory of the paths of views that are kept for later trials [bytes]: at least, and at most
+_LEAST_KEPT, _MOST_KEPT = 1 << 29, 1 << 32
+
+#: share of the available memory that they may take beyond the least
+_KEPT_SHARE = 0.25
+
+
+@dataclass(frozen=True)
+class ViewLight:
+    """What all draws of a view share, by camera: regions, surfaces that are seen, paths of interreflections."""
+
+    rois: dict[str, Roi]
+    seen: dict[str, SeenSurfaces]
+    kept: dict[str, KeptLight]
+
+    @property
+    def bytes(self) -> int:
+        """Memory that it needs."""
+        return sum(one.bytes for one in self.kept.values()) + sum(
+            one.shape.nbytes + one.cosine.nbytes for one in self.seen.values()
+        )
+
+
+def regions(simulated: SimulatedSensor, sensor_from_world: Transform, corners: Floats) -> dict[str, Roi]:
+    """Return the region of each camera's image around the corners (n, 3) [mm] of a part, world frame."""
+    around = sensor_from_world.points(corners)
+    cameras = simulated.sensor.rig.cameras
+    return {
+        name: roi_around(camera, around, _MARGIN_PX) or simulated.rays[name].whole for name, camera in cameras.items()
+    }
+
+
+def seen_surfaces(
+    simulated: SimulatedSensor, scene: Scene, pose: Transform, rois: dict[str, Roi]
+) -> dict[str, SeenSurfaces]:
+    """Return the surfaces that the pixels of each camera's region see, from a pose of the sensor.
+
+    Parameters
+    ----------
+    simulated, scene
+        Sensor and part.
+    pose
+        Sensor to world.
+    rois
+        Region of each camera's image.
+
+    See Also
+    --------
+    regions : the regions
+    """
+    return {name: SeenSurfaces.of(scene, simulated.pixel_rays(name), pose, roi) for name, roi in rois.items()}
+
+
+class LightOfViews:
+    """The shared light of views by their numbers; that which was not used for the longest time goes first."""
+
+    def __init__(self) -> None:
+        self._views: dict[int, ViewLight] = {}
+
+    def of(self, number: int, make: Callable[[], ViewLight]) -> ViewLight:
+        """Return the light of a view, made on first use."""
+        if number not in self._views:
+            made = make()
+            kept = sum(one.bytes for one in self._views.values())
+            allowed = min(max(_LEAST_KEPT, kept + int(_KEPT_SHARE * available_memory())), _MOST_KEPT)
+            while self._views and made.bytes + sum(one.bytes for one in self._views.values()) > allowed:
+                self._views.pop(next(iter(self._views)))
+            self._views[number] = made
+        used = self._views.pop(number)
+        self._views[number] = used
+        return used
