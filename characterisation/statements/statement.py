@@ -32,6 +32,7 @@ from characterisation.statements.coverage import BLOCKS, coverage_interval, stan
 from characterisation.statements.decision import Decided, Tolerance, Verdict, decide
 from characterisation.statements.losses import Loss
 from characterisation.statements.one_sided import OneSidedErrors
+from characterisation.statements.size_dependence import SizeDependence
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -96,6 +97,8 @@ class Statement:
     errors_of
         Parts whose errors are stated: ``any part``; or where errors depend on the deviation of the part, ``part at the
         limit of the tolerance``, or without a tolerance ``part far from nominal``.
+    size_depends_on
+        Drawn number on which the size of the error depends most; None if there is none, or it was not looked for.
     """
 
     measurement: str
@@ -119,6 +122,7 @@ class Statement:
     verdict: Verdict
     losses: tuple[Loss, ...] = ()
     errors_of: Part = ANY_PART
+    size_depends_on: SizeDependence | None = None
 
     @property
     def root_mean_square(self) -> float:

@@ -14,6 +14,7 @@ from characterisation.statements.losses import Loss, lost_features
 from characterisation.statements.statement import AT_THE_LIMIT, FAR_FROM_NOMINAL
 from mitsim.report.unknowns_words import unknowns_in_words
 from mitsim.running.numbers import NONE, SPACE, listed, percent, quantity, rounded
+from mitsim.study.dependence_words import dependences_in_words, remedies_in_words
 from mitsim.study.statement_file import BudgetEntry, ExposureEntry, StatedMeasurement, StatementDocument
 
 
@@ -39,6 +40,10 @@ def statement_section(document: StatementDocument) -> dict[str, Any]:
         "budget_rows": [_budget_row(name, one, shown) for name, one in document.measurements.items() if one.budget],
         "included": [one.model_dump() for one in document.influences if one.included],
         "open_lines": any(not line.settled for one in document.measurements.values() for line in one.budget),
+        "depends": dependences_in_words(
+            (name, one.unit, one.size_depends_on) for name, one in document.measurements.items()
+        ),
+        "find_out": remedies_in_words(one.size_depends_on for one in document.measurements.values()),
         "undrawn": [
             {"name": GROUPS.get(group, ("", group))[1], "source": source}
             for group, source in {

@@ -54,6 +54,16 @@ class LossEntry(PartialDocument):
     count: int = Field(ge=0)
 
 
+class SizeDependenceEntry(PartialDocument):
+    """Drawn number on which the size of an error depends most, with pairs for its low and its high values."""
+
+    group: str
+    name: str
+    of: str
+    uncertainty: tuple[float, float]
+    inside: tuple[float, float]
+
+
 class StatedMeasurement(PartialDocument):
     """One measurement of ``statement.json``."""
 
@@ -77,6 +87,7 @@ class StatedMeasurement(PartialDocument):
     losses: list[LossEntry] = Field(default_factory=list)
     errors_of: str = ANY_PART
     maker_sigma: float | None = None
+    size_depends_on: SizeDependenceEntry | None = None
 
     @property
     def expanded_uncertainty(self) -> float | None:

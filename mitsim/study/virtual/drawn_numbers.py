@@ -3,6 +3,9 @@
 Signal chain: number of trials -> trials, of which some repeat a day -> numbers that each group of unknowns drew, and
 the seeds of groups that drew only a seed -> :func:`characterisation.statements.budget.budget`.
 
+Those numbers that a user could find out have names (:func:`named_numbers`), for
+:func:`characterisation.statements.size_dependence.size_dependence`.
+
 Every draw is known: it follows from the trial alone (:mod:`mitsim.study.virtual.world`). The numbers are those behind
 the draw, of mean 0 and variance 1; of a decoder, its settings, which the budget standardises. Effects of calibration
 and pose are small, and linear in them. The errors may also depend on the squares of the numbers of finish, light and
@@ -18,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from characterisation.statements.budget import INTERACTION
+from characterisation.statements.size_dependence import DrawnNumber
 from mitsim.study import Study
 from mitsim.study.virtual.coat import coat_numbers
 from mitsim.study.virtual.drawn_decoder import decoder_numbers, drawn_decoder
@@ -102,6 +106,48 @@ def drawn_numbers(
     return out
 
 
+def named_numbers(
+    study: Study, unknowns: Unknowns, trials: Sequence[Trial], groups: Sequence[str]
+) -> list[DrawnNumber]:
+    """Return the numbers of rendered trials that a user could find out: of finishes, decoder and light.
+
+    Parameters
+    ----------
+    study, unknowns
+        The study, and its unknowns prepared for drawing.
+    trials
+        Trials of a rendered view.
+    groups
+        Groups of unknowns that are drawn.
+
+    See Also
+    --------
+    drawn_numbers : all numbers, without names
+    """
+    values: dict[tuple[str, str, str], list[float]] = {}
+    for trial in trials:
+        drawn = unknowns.draw(trial)
+        if "finish" in groups:
+            for finish in _finish_ids(study):
+                for name, value in finish_numbers(unknowns, drawn.finish, finish).items():
+                    if name != "lay_direction":  # no order
+                        values.setdefault(("finish", name, finish), []).append(value)
+        if "decoder" in groups:
+            settings = drawn_decoder(study.sensor, unknowns.table.decoder, drawn.decoder)
+            for name, value in decoder_numbers(settings).items():
+                values.setdefault(("decoder", name, ""), []).append(value)
+        if "light" in groups:
+            for name, value in (("room", drawn.room), ("power", drawn.power)):
+                values.setdefault(("light", name, ""), []).append(value)
+    return [DrawnNumber(*key, np.array(row)) for key, row in values.items()]
+
+
+def _finish_ids(study: Study) -> list[str]:
+    """Return the ids of the BSDFs whose finish can be drawn."""
+    scene = study.scene
+    return sorted({shape.bsdf().id() for shape, known in zip(scene.shapes, scene.finishes, strict=True) if known})
+
+
 def _numbers(study: Study, unknowns: Unknowns, source: str, group: str, trial: Trial) -> Floats:
     """Return the numbers (p,) that a group drew in a trial."""
     stream, table = unknowns.stream(group, trial), unknowns.table
@@ -127,9 +173,9 @@ def _numbers(study: Study, unknowns: Unknowns, source: str, group: str, trial: T
         return np.array(list(decoder_numbers(drawn_decoder(study.sensor, table.decoder, drawn.decoder)).values()))
     if source == "map":
         return drawn_spread(study, unknowns, drawn.finish)
-    scene = study.scene
-    ids = sorted({shape.bsdf().id() for shape, known in zip(scene.shapes, scene.finishes, strict=True) if known})
-    return np.array([value for one in ids for value in _finish(finish_numbers(unknowns, drawn.finish, one))])
+    return np.array(
+        [value for one in _finish_ids(study) for value in _finish(finish_numbers(unknowns, drawn.finish, one))]
+    )
 
 
 def _finish(numbers: Mapping[str, float]) -> list[float]:

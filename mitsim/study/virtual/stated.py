@@ -17,6 +17,8 @@ from numpy.typing import ArrayLike
 from characterisation.statements.budget import budget, largest_line
 from characterisation.statements.decision import tolerance_of
 from characterisation.statements.losses import losses, lost_features
+from characterisation.statements.one_sided import stated_errors
+from characterisation.statements.size_dependence import DrawnNumber, size_dependence
 from characterisation.statements.statement import Statement, statement
 from characterisation.statements.verdict_words import Judged
 from mitsim.running.text_table import aligned
@@ -24,8 +26,9 @@ from mitsim.running.time_limit import TimeLimit
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.sensor import Sensor
 from mitsim.study import StatementTable, Study
+from mitsim.study.dependence_words import dependences_in_words
 from mitsim.study.virtual.drawn_decoder import decoder_is_drawn
-from mitsim.study.virtual.drawn_numbers import drawn_numbers, related, seeds, statement_trials
+from mitsim.study.virtual.drawn_numbers import drawn_numbers, named_numbers, related, seeds, statement_trials
 from mitsim.study.virtual.race import Job, TrialRunner, complete
 from mitsim.study.virtual.trials import TrialFolder
 from mitsim.study.virtual.world import BEYOND, GROUPS, SET_DAYS, STATEMENT_DAYS, Trial, Unknowns
@@ -63,6 +66,15 @@ class StatedView:
     view: View
     statements: list[Statement]
     planned: PlannedExposure | None
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """What trials drew: numbers (n, p) by group, seeds (n,) by group, and the numbers that have names."""
+
+    numbers: Mapping[str, ArrayLike]
+    seeds: Mapping[str, ArrayLike]
+    named: Sequence[DrawnNumber]
 
 
 def state_view(
@@ -111,7 +123,10 @@ def state_view(
             after_batch(so_far)
     groups = budget_groups(unknowns, runner.source, study.sensor)
     numbers = drawn_numbers(study, unknowns, runner.source, made, groups)
-    return StatedView(view, _statements(study, trials, view, made, (numbers, seeds(made, groups))), planned)
+    named = named_numbers(study, unknowns, made, groups) if runner.source == "render" else []
+    return StatedView(
+        view, _statements(study, trials, view, made, _Drawn(numbers, seeds(made, groups), named)), planned
+    )
 
 
 def compared(study: Study, trials: TrialFolder, view: int, other: int) -> float | None:
@@ -159,15 +174,17 @@ def _statements(
     trials: TrialFolder,
     view: View,
     made: list[Trial],
-    drawn: tuple[Mapping[str, ArrayLike], Mapping[str, ArrayLike]] | None = None,
+    drawn: _Drawn | None = None,
 ) -> list[Statement]:
-    """Return the statement of every measurement from finished trials; with ``drawn`` numbers and seeds, its budget."""
+    """Return the statement of every measurement from finished trials; with what they drew, its budget."""
     days, common, errors = [trial.day for trial in made], related(made), trials.errors_of_parts(view.number, made)
     out = []
     for m, (name, asked) in enumerate(study.task.measurements.items()):
-        lines = budget(errors[m], *drawn) if drawn is not None else ()
+        lines = budget(errors[m], drawn.numbers, drawn.seeds) if drawn is not None else ()
         stated = statement(name, asked.unit, errors[m], tolerance_of(study.task, name), lines, days, common)
-        out.append(replace(stated, losses=losses(trials.reasons(view.number, made, name))))
+        named = [] if drawn is None else drawn.named
+        depends = size_dependence(stated_errors(errors[m]), stated.interval, named, days)
+        out.append(replace(stated, losses=losses(trials.reasons(view.number, made, name)), size_depends_on=depends))
     return out
 
 
@@ -217,6 +234,7 @@ def statement_table(stated: Sequence[Statement]) -> str:
         )
     lost = lost_features((one.measurement, one.trials, one.losses) for one in stated)
     lines = [f"no value in {one.in_words()}" for one in lost]
+    lines += dependences_in_words((one.measurement, one.unit, one.size_depends_on) for one in stated)
     return "\n".join([*aligned(rows), *lines])
 
 

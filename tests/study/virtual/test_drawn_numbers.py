@@ -12,8 +12,9 @@ from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_parameters import parameter_values
 from mitsim.sensor.unknowns import UnknownsTable
+from mitsim.study.dependence_words import _PHRASES
 from mitsim.study.virtual.drawn_finish import finish_deviation, finish_numbers
-from mitsim.study.virtual.drawn_numbers import drawn_numbers, related, seeds, statement_trials
+from mitsim.study.virtual.drawn_numbers import drawn_numbers, named_numbers, related, seeds, statement_trials
 from mitsim.study.virtual.world import STATEMENT_DAYS, Trial, Unknowns
 
 GROUPS = ("calibration", "finish", "form", "light", "temperature", "unit", "pose", "noise")
@@ -132,3 +133,17 @@ def test_a_group_has_as_many_numbers_as_its_draw_takes(unknowns, monkeypatch, gr
     drawn_numbers(STUDY, unknowns, "render", [Trial(3)], [group])
     draw, numbers = (stream.bit_generator.state for stream in streams)
     assert draw == numbers
+
+
+@pytest.mark.parametrize("sensor", ["ensenso-n10", "david-sls-3"])
+def test_the_numbers_with_names_are_those_of_a_day_and_have_words(unknowns, sensor):
+    study = SimpleNamespace(scene=STUDY.scene, sensor=load_sensor(sensor))
+    trials = statement_trials(5)
+    assert trials[0].day == trials[4].day
+    named = named_numbers(study, unknowns, trials, (*GROUPS, "decoder"))
+    assert {(one.group, one.name) for one in named} <= set(_PHRASES)
+    assert {(one.group, one.of) for one in named} == {("finish", "plate"), ("decoder", ""), ("light", "")}
+    assert all(one.values.shape == (5,) and one.values[0] == one.values[4] for one in named)
+    alpha = next(one.values for one in named if one.name == "alpha")
+    assert alpha[1] == finish_numbers(unknowns, unknowns.draw(trials[1]).finish, "plate")["alpha"]
+    assert named_numbers(study, unknowns, trials, ("calibration", "pose")) == []
