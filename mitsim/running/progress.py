@@ -12,6 +12,9 @@ Item = TypeVar("Item")
 #: time between lines without a terminal [s]
 _LINE_EVERY_S = 10.0
 
+#: items that were finished within this time of one another count as finished together [s]
+_TOGETHER_S = 0.2
+
 _quiet = False
 
 
@@ -58,16 +61,31 @@ def _bar(items: Iterable[Item], label: str, total: int | None) -> Iterator[Item]
         yield from progress.track(items, total=total, description=label)
 
 
+def time_left(finished_s: Sequence[float], total: int) -> str:
+    """Return the time that the rest of ``total`` items will take, in words, from the times when others were finished.
+
+    ``finished_s`` (n,) are sorted, from the start [s]. The time to the first items contains what is prepared once, such
+    as kernels and light paths, and workers return several items at once. Therefore the first items that came together
+    only bound the time.
+    """
+    rest, done = total - len(finished_s), len(finished_s)
+    first = sum(one - finished_s[0] <= _TOGETHER_S for one in finished_s)
+    if done == first:
+        return f"at most {finished_s[-1] / done * rest:.0f} s left"
+    return f"{(finished_s[-1] - finished_s[0]) / (done - first) * rest:.0f} s left"
+
+
 def _lines(items: Iterable[Item], label: str, total: int | None, report: Callable[[str], None] = say) -> Iterator[Item]:
     start = last = time.monotonic()
-    done = 0
+    finished: list[float] = []
     for item in items:
         yield item
-        done += 1
         now = time.monotonic()
-        if now - last >= _LINE_EVERY_S and done != total:
-            left = f", {(now - start) / done * (total - done):.0f} s left" if total else ""
-            report(f"{label}: {done}/{total or '?'}{left}")
+        finished.append(now - start)
+        if now - last >= _LINE_EVERY_S and len(finished) != total:
+            left = f", {time_left(finished, total)}" if total else ""
+            report(f"{label}: {len(finished)}/{total or '?'}{left}")
             last = now
+    done = len(finished)
     if report is say:
         say(f"{label}: {done} done in {time.monotonic() - start:.1f} s")
