@@ -33,7 +33,7 @@ Plain = TypeVar("Plain")
 Result = TypeVar("Result")
 
 #: memory of a worker [bytes]: the largest value in docs/explanation/scale.md
-MEMORY = 2 << 30
+MEMORY = 7 << 29
 
 #: orders that wait for each process, so that none is idle
 AHEAD = 2

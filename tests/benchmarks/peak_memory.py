@@ -1,17 +1,20 @@
 """Peak memory of every preset: one capture of a part and its decoding, and a validation of its map.
 
     python tests/benchmarks/peak_memory.py [--sensors NAME ...] [--poses N]
+    python tests/benchmarks/peak_memory.py --trials [--sensors NAME ...]
 
 Each command runs alone, in a process of its own, and its largest resident size is told, as the system counts it
 (Linux; children included). The capture is of the two pillars in ground aluminium, the whole image, light of three
 surfaces, 16 samples per pixel, from the middle of the working range. The validation is ``mitsim map validate`` of matt
-white with so many poses at each distance. How large a worker must be is the largest number of its row.
+white with so many poses at each distance. With ``--trials``, six virtual measurements of each of two views of
+``scenes/two_pillars/study.toml`` instead. How large a worker must be is the largest number of its row.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import resource
 import subprocess
 import sys
 import tempfile
@@ -22,6 +25,9 @@ from mitsim.sensor.preset import load_sensor, presets
 
 ROOT = Path(__file__).parents[2]
 SCENE = ROOT / "scenes/two_pillars/two_pillars.xml"
+
+#: views whose trials are made
+VIEWS = (99, 85)
 
 
 def peak(*arguments: object) -> tuple[float, float]:
@@ -37,12 +43,42 @@ def peak(*arguments: object) -> tuple[float, float]:
     return usage.ru_maxrss / 2**20, time.perf_counter() - began
 
 
+def print_trials(name: str) -> None:
+    """Print the largest resident size [GiB] of this process after trials of one view, and of two."""
+    from characterisation.files.documents import read_toml
+    from mitsim.scene import backend
+    from mitsim.study import StudyFile, open_study
+    from mitsim.study.virtual.plan import measurements_of
+    from mitsim.study.virtual.race import Job
+    from mitsim.study.virtual.study_unknowns import study_unknowns
+    from mitsim.study.virtual.world import Trial
+
+    backend.activate(None)
+    path, sizes = ROOT / "scenes/two_pillars/study.toml", []
+    study = open_study(path, read_toml(path, StudyFile).model_copy(update={"sensor": name}))
+    maker = measurements_of(study, study_unknowns(study))
+    for number in VIEWS:
+        list(maker.run(Job(study.view(number), Trial(day)) for day in range(6)))
+        sizes.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)
+    print(f"| `{name}` | {' | '.join(f'{size:.2f} GiB' for size in sizes)} |", flush=True)
+
+
 def main() -> None:
     """Print a row for each sensor."""
     asked = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     asked.add_argument("--sensors", nargs="+", default=presets())
     asked.add_argument("--poses", type=int, default=1)
+    asked.add_argument("--trials", action="store_true", help="virtual measurements instead")
+    asked.add_argument("--of", help=argparse.SUPPRESS)
     given = asked.parse_args()
+    if given.of:
+        print_trials(given.of)
+        return
+    if given.trials:
+        print("| sensor | one view | two views |\n|---|---|---|", flush=True)
+        for name in given.sensors:
+            subprocess.run([sys.executable, __file__, "--of", name], check=True, stderr=subprocess.DEVNULL)
+        return
     print("| sensor | capture | decode | map validate | time |\n|---|---|---|---|---|", flush=True)
     for name in given.sensors:
         near, far = load_sensor(name).working_range_mm

@@ -118,7 +118,6 @@ def keep_light(
         if len(pixels):
             candidates += camera_paths(scene, rays, projector, world_from_sensor, roi, pixels, tracing)
             candidates += photon_paths(scene, rays, projector, world_from_sensor, roi, tracing)
-        joined = Candidates.joined(candidates, rendering.depth)
-        paths = KeptPaths(mattering(joined, finishes, roi, settings.kept * len(pixels), own), roi)
+        paths = KeptPaths(mattering(candidates, finishes, roi, settings.kept * len(pixels), own), roi)
         out[camera] = KeptLight(paths, Smoothing.of(shape, settings.smoothing_px), simulated.sensor.ambient_image)
     return out

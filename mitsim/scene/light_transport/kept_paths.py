@@ -41,6 +41,9 @@ from mitsim.scene.light_transport.projector_light import ProjectedLight
 
 Floats = NDArray[np.float32]
 
+#: number of candidates whose light is found together
+_AT_ONCE = 1 << 19
+
 
 @dataclass(frozen=True)
 class Candidates:
@@ -60,7 +63,9 @@ class Candidates:
     def __len__(self) -> int:
         return len(self.pixel)
 
-    def chosen(self, index: NDArray[np.integer] | NDArray[np.bool_], weight: Floats | None = None) -> Candidates:
+    def chosen(
+        self, index: NDArray[np.integer] | NDArray[np.bool_] | slice, weight: Floats | None = None
+    ) -> Candidates:
         """Return some of the paths, with other weights if given."""
         kept = self.weight[index] if weight is None else weight
         return Candidates(self.pixel[index], kept, self.code[index], self.material[index], self.toward[index])
@@ -184,13 +189,15 @@ def light_of(paths: Candidates, finishes: Sequence[Sequence[Any]]) -> Iterator[N
         yield np.asarray(paths.weight * factors[vertices.places].prod(axis=0))
 
 
-def mattering(paths: Candidates, finishes: Sequence[Sequence[Any]], roi: Roi, count: int, seed: int) -> Candidates:
+def mattering(
+    parts: Sequence[Candidates], finishes: Sequence[Sequence[Any]], roi: Roi, count: int, seed: int
+) -> Candidates:
     """Return about ``count`` of the paths, chosen by their light in some finishes, in the order of their pixels.
 
     Parameters
     ----------
-    paths
-        Candidates.
+    parts
+        Candidates in several parts; whole numbers of surfaces may differ.
     finishes
         For each finish that may be drawn, the BSDFs of the drawn materials.
     roi
@@ -200,16 +207,38 @@ def mattering(paths: Candidates, finishes: Sequence[Sequence[Any]], roi: Roi, co
     seed
         Of the choice.
     """
-    size = np.zeros(len(paths))
-    for light in light_of(paths, finishes):
-        size += light**2
-    size = np.sqrt(size / max(len(finishes), 1))
-    order = np.argsort(z_positions(paths.pixel % roi.width, paths.pixel // roi.width), kind="stable")
+    dr.flush_malloc_cache()  # Dr.Jit keeps what it needed to trace the paths, as much as all else together
+    surfaces = max((part.material.shape[1] for part in parts), default=1)
+    if not any(len(part) for part in parts):
+        return Candidates.joined(parts, surfaces)
+    size = np.concatenate([_sizes(part, finishes) for part in parts])
+    pixel = np.concatenate([part.pixel for part in parts])
+    order = np.argsort(z_positions(pixel % roi.width, pixel // roi.width), kind="stable")
     probability = np.minimum(size[order] / _threshold(size, count), 1.0)
     reached = np.cumsum(probability) + np.random.default_rng(seed).random()
     kept = np.flatnonzero(np.floor(reached) > np.floor(np.concatenate([[0.0], reached[:-1]])))
-    index = order[kept]
-    return paths.chosen(index, (paths.weight[index] / probability[kept]).astype(np.float32))
+    index, probability = order[kept], probability[kept]
+    del size, pixel, order, reached
+    places, chosen, first = list[NDArray[np.integer]](), list[Candidates](), 0
+    for part in parts:  # never all candidates together, which are many times as large as what is kept
+        of_part = np.flatnonzero((index >= first) & (index < first + len(part)))
+        places.append(of_part)
+        chosen.append(part.chosen(index[of_part] - first))
+        first += len(part)
+    paths = Candidates.joined(chosen, surfaces)
+    del chosen
+    sequence = np.argsort(np.concatenate(places))
+    return paths.chosen(sequence, (paths.weight[sequence] / probability).astype(np.float32))
+
+
+def _sizes(paths: Candidates, finishes: Sequence[Sequence[Any]]) -> NDArray[np.float64]:
+    """Return the root mean square light (n,) of paths over some finishes."""
+    size = np.zeros(len(paths))
+    for first in range(0, len(paths), _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        for light in light_of(paths.chosen(some), finishes):
+            size[some] += light**2
+    return np.sqrt(size / max(len(finishes), 1))
 
 
 def _threshold(size: NDArray[np.float64], count: int) -> float:

@@ -97,7 +97,7 @@ def test_what_a_worker_refuses_is_told_as_it_said_it(pool):
 
 def test_processes_follow_cores_and_memory(monkeypatch):
     monkeypatch.setattr(executor, "usable_cores", lambda: 16)
-    monkeypatch.setattr(executor, "available_memory", lambda: 9 << 30)
+    monkeypatch.setattr(executor, "available_memory", lambda: 15 << 30)
     assert fitting_processes() == 4
     monkeypatch.setattr(executor, "available_memory", lambda: 1 << 20)
     assert fitting_processes() == 1

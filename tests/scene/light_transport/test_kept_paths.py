@@ -124,7 +124,7 @@ def test_kept_paths_have_the_mean_of_a_rendering_in_every_finish(corner, eyes):
     images = [[] for _ in finishes]
     for seed in range(repeats):
         every, roi = candidates(corner, rays, light, seed)
-        kept = mattering(every, finishes, roi, len(every) // 5, seed)
+        kept = mattering([every], finishes, roi, len(every) // 5, seed)
         assert abs(len(kept) - len(every) // 5) <= 1
         paths = KeptPaths(kept, roi)
         for found, bsdfs in zip(images, finishes, strict=True):
@@ -157,7 +157,7 @@ def test_the_same_seed_keeps_the_same_light_on_any_threads(corner):
     def seen(seed):
         every, roi = candidates(corner, rays, light, seed)
         bsdfs = distinct_bsdfs(corner)
-        return KeptPaths(mattering(every, [bsdfs], roi, 4000, seed), roi).codes(bsdfs, light)
+        return KeptPaths(mattering([every], [bsdfs], roi, 4000, seed), roi).codes(bsdfs, light)
 
     first = seen(3)
     with threads(1):
@@ -174,10 +174,10 @@ def test_paths_are_kept_in_proportion_to_their_light_and_weigh_what_was_left_out
     every, roi = candidates(corner, rays, light, 1, depth=2)
     bsdfs = distinct_bsdfs(corner)
     (whole,) = light_of(every, [bsdfs])
-    assert len(mattering(every, [bsdfs], roi, 10 * len(every), 1)) == (whole > 0).sum()
+    assert len(mattering([every], [bsdfs], roi, 10 * len(every), 1)) == (whole > 0).sum()
     count, sums = len(every) // 8, []
     for seed in range(20):
-        kept = mattering(every, [bsdfs], roi, count, seed)
+        kept = mattering([every], [bsdfs], roi, count, seed)
         (carried,) = light_of(kept, [bsdfs])
         sums.append(carried.sum())
         assert abs(len(kept) - count) <= 1
@@ -194,5 +194,5 @@ def test_a_scene_that_does_not_light_itself_keeps_nothing():
     rays, light = dots()
     every, roi = candidates(scene, rays, light, 1)
     bsdfs = distinct_bsdfs(scene)
-    kept = mattering(every, [bsdfs], roi, 100, 1)
+    kept = mattering([every], [bsdfs], roi, 100, 1)
     assert len(kept) == 0 and not KeptPaths(kept, roi).codes(bsdfs, light).any()
