@@ -11,6 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from scipy.spatial.transform import Rotation
 
 from characterisation.files.atomic_io import write_netcdf
+from mitsim.report.choice_page import write_choice_page
 from mitsim.report.declaration import pose_in_full, read_declaration
 from mitsim.report.sheet import sheet_figures, write_sheet
 from mitsim.report.sheet_layout import text_width, wrapped
@@ -119,6 +120,18 @@ def test_the_sheet_of_a_comparison_has_the_statement_of_the_best_sensor(tmp_path
     assert [row.result.verdict for row in declaration.rows] == ["fits"] * 3
     (figure,) = sheet_figures(declaration, read_scene_geometry(folder))
     assert [text for text, box in boxes_of(figure) if box.x0 < 0.5 * figure.dpi] == []
+
+
+def test_a_statement_far_below_the_maker_says_so_on_sheet_and_page_of_a_comparison(tmp_path):
+    folder = write_choice(tmp_path / "choice")
+    path = folder / "sensor-a-of-a-long-name" / "statement.json"
+    statement = json.loads(path.read_text(encoding="utf-8"))
+    for one in statement["measurements"].values():
+        one["maker_sigma"] = 100.0
+    path.write_text(json.dumps(statement), encoding="utf-8")
+    notes = read_declaration(folder, None).notes
+    assert "below a tenth of the accuracy that the maker" in notes[-1] and "the influences listed below" in notes[-1]
+    assert "below a tenth of the accuracy that the maker" in write_choice_page(folder).read_text(encoding="utf-8")
 
 
 def test_a_pose_in_full_gives_the_pose_back(run_folder):

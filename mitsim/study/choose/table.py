@@ -152,7 +152,7 @@ def as_text(choice: ChoiceDocument) -> str:
     for one in choice.sensors:
         if one.status == "excluded":
             continue
-        toleranced = sum(choice.measurements[name].tolerance is not None for name in names)
+        toleranced = choice.toleranced
         rows.append(
             (
                 one.name + ("" if one.status == "stated" else " *"),
@@ -163,11 +163,12 @@ def as_text(choice: ChoiceDocument) -> str:
             )
         )
     legend = (
-        "cells: standard uncertainty, view, verdict; worst: demand of the decision rule, at most 1 if everything fits"
+        "cells: standard uncertainty, view, verdict; worst: demand of the decision rule, at most 1 if everything fits\n"
+        "order: sensors with virtual measurements, then the most possible measurements, then the smallest worst"
     )
-    lines = [*aligned(rows), "", legend]
+    lines = [*aligned(rows), "", legend, *choice.fit_more]
     if any(one.status == "screened" for one in choice.sensors):
-        least = "" if any(one.tolerance is not None for one in choice.measurements.values()) else " times the best"
+        least = "" if choice.toleranced else " times the best"
         reasons = f"fewer measurements are possible there, its demand there is above {LARGEST_DEMAND:g}{least}"
         lines.append(f"* by screening alone, (n of m) expected to fit: {reasons}, or time was over")
     lines += [
