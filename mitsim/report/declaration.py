@@ -28,6 +28,9 @@ from mitsim.study.run_folder import Run, read_run
 from mitsim.study.scene_geometry import SceneGeometry
 from mitsim.study.statement_file import InfluenceEntry, StatedMeasurement, StatementDocument
 
+#: how the software was verified (ISO/TS 15530-4), in words; docs/explanation/validity.md, criteria 10 and 11
+VERIFIED = "closed forms, examples of JCGM 101 and 106, another renderer; not by a metal part with calibrated values"
+
 #: hexadecimal digits of a digest that are printed
 _DIGITS = 16
 
@@ -191,6 +194,7 @@ def _of_statement(document: StatementDocument, exposures: str) -> list[tuple[str
         ("Method", f"{count(trials)} virtual measurements, {how}: a virtual experiment, “simulate and analyse”"),
         ("Calibration", document.calibration.split("; drift:")[0]),
         ("Exposure", exposed or exposures),
+        ("Verified by", VERIFIED),
     ]
 
 
