@@ -138,8 +138,8 @@ def measured_words(kind: str, features: Sequence[str]) -> str:
 
 
 def breakable(name: str) -> Markup:
-    """Return a name as safe markup that a browser may break after underscores."""
-    return Markup(escape(name).replace("_", Markup("_<wbr>")))
+    """Return a name or a path as safe markup that a browser may break after underscores and slashes."""
+    return Markup(escape(name).replace("_", Markup("_<wbr>")).replace("/", Markup("/<wbr>")))
 
 
 def exact(value: float, unit: str) -> str:

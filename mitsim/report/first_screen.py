@@ -279,5 +279,7 @@ def _picture(
         by_verdict.setdefault(verdict, []).append(name)
     faces = (f"{verdict}: {', '.join(names)}" for verdict, names in by_verdict.items())
     alt = "The part and the sensor. " + "; ".join(faces)
-    drawn = f"{caption}. Drawn to scale; on the right, the part enlarged, from the same viewpoint."
-    return Picture(Markup(as_svg(placement_figure(geometry, poses, verdicts), alt)), drawn)
+    drawn = f"{caption}. Drawn to scale; beside it or below, the part enlarged, from the same viewpoint."
+    # a narrow window shows the second: text would shrink to 4 px in the first
+    both = [as_svg(placement_figure(geometry, poses, verdicts, stacked), alt) for stacked in (False, True)]
+    return Picture(Markup('<div class="wide">{}</div><div class="narrow">{}</div>').format(*map(Markup, both)), drawn)
