@@ -395,3 +395,17 @@ def test_a_bad_task_is_told(tmp_path, text, says):
     (tmp_path / "task.toml").write_text(text)
     with pytest.raises(InputError, match=says):
         read_features(tmp_path / "task.toml")
+
+
+def test_the_pose_of_a_run_is_that_of_the_picture(tmp_path):
+    (tmp_path / "scene.xml").write_text(
+        f'<scene version="3.0.0"><shape type="sphere" id="s">{BALL}{METAL}</shape></scene>', encoding="utf-8"
+    )
+    wanted = np.diag([1.0, -1.0, -1.0, 1.0])
+    wanted[:3, 3] = [5.0, -10.0, 500.0]
+    (tmp_path / "statement.json").write_text(json.dumps({"world_from_sensor": wanted.tolist()}), encoding="utf-8")
+    asked = ["check", tmp_path / "scene.xml", "--pose", tmp_path / "statement.json", "--json"]
+    said = mitsim_here(*asked)
+    assert json.loads(said.stdout)["world_from_sensor"] == wanted.tolist() and "no position" not in said.stderr
+    both = mitsim_here(*asked, "--position", "0", "0", "500", code=2)
+    assert both.stderr.startswith("mitsim: --pose: found --position too")

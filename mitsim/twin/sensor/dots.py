@@ -54,6 +54,7 @@ class DotsFit:
     - ``patches``: number of patches seen.
     - ``uneven``: standard deviation of the field's terms that no parameter explains [1].
     - ``undetermined``: parameters that the capture does not determine; they keep the sensor's own values.
+    - ``worst``: the feature of the dots that differs most from the simulation.
     """
 
     sensor: Sensor
@@ -62,6 +63,7 @@ class DotsFit:
     patches: int
     uneven: float
     undetermined: tuple[Parameter, ...] = ()
+    worst: str = ""
 
     def with_values(self, theta: Floats) -> Sensor:
         """Return the sensor with the varied numbers (k,) inserted."""
@@ -204,7 +206,9 @@ def fit_dots(
         settled = True
     if _misses(found):
         found = replace(found, covariance=found.covariance * found.chi_square / max(found.freedom, 1))
-    return DotsFit(sensor, tuple(own), found, len(field.corners), uneven, tuple(undetermined))
+    figure, term = names[int(np.argmax(np.abs(found.off)))]
+    worst = figure if term == "1" else f"{figure} over the field"
+    return DotsFit(sensor, tuple(own), found, len(field.corners), uneven, tuple(undetermined), worst)
 
 
 def _misses(found: MomentFit) -> bool:

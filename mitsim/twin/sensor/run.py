@@ -134,8 +134,11 @@ def fit_sensor(
         for key, pair in turns.items():
             turned.append(FittedKey(f"misalignment.{key}", *pair, "mrad", (source.name,), method))
     estimates += pooled(turned)
-    fits = {name: found.moment_fit for name, found in dots.items()}
-    agreements = tuple(Agreement(name, fit.chi_square, fit.freedom) for name, fit in fits.items())
+    agreements = tuple(
+        Agreement(name, fit.chi_square, fit.freedom, float(np.abs(fit.off).max()), found.worst)
+        for name, found in dots.items()
+        for fit in (found.moment_fit,)
+    )
     return SensorFit(base, tuple(input_captures), tuple(estimates), tuple(undetermined), agreements)
 
 
