@@ -135,9 +135,8 @@ def fit_sensor(
             turned.append(FittedKey(f"misalignment.{key}", *pair, "mrad", (source.name,), method))
     estimates += pooled(turned)
     agreements = tuple(
-        Agreement(name, fit.chi_square, fit.freedom, float(np.abs(fit.off).max()), found.worst)
+        Agreement(name, found.moment_fit.chi_square, found.moment_fit.freedom, found.misfit, found.worst)
         for name, found in dots.items()
-        for fit in (found.moment_fit,)
     )
     return SensorFit(base, tuple(input_captures), tuple(estimates), tuple(undetermined), agreements)
 

@@ -37,13 +37,14 @@ FAIR = 3.0
 class Agreement:
     """The dots of a ``capture`` against the best simulation: chi-square and its degrees of freedom.
 
-    ``largest`` is the largest |logarithm| of the ratio of a feature, recorded over simulated, and ``feature`` its name.
+    ``misfit`` is the root mean square, over the field, of the logarithm of recorded over simulated, of the ``feature``
+    that differs most.
     """
 
     capture: str
     chi_square: float
     freedom: int
-    largest: float
+    misfit: float
     feature: str
 
     @property
@@ -54,7 +55,7 @@ class Agreement:
     @property
     def within_margin(self) -> bool:
         """Return whether every feature lies within the margin of ``mitsim compare``."""
-        return self.largest <= math.log(NOISE_FACTOR)
+        return self.misfit <= math.log(NOISE_FACTOR)
 
     @property
     def word(self) -> Word:
@@ -78,7 +79,7 @@ def verdict_of(agreements: tuple[Agreement, ...]) -> Verdict:
         return Verdict("not tested", "no capture shows dots, so nothing tests the fitted numbers against an image")
     worst = max(agreements, key=lambda one: (("good", "fair", "bad").index(one.word), one.reduced))
     numbers = f"chi-square {worst.chi_square:.1f} of {worst.freedom} for {worst.capture}"
-    most = f"{worst.feature} by {percent(math.expm1(worst.largest))}"
+    most = f"{worst.feature} by {percent(math.expm1(worst.misfit))}"
     why = {
         "good": "the simulated dots agree with the recorded ones",
         "fair": f"the dots differ a little, most their {most}; the intervals contain it",

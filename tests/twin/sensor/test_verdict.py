@@ -21,7 +21,7 @@ ENTRIES = {
 
 
 @pytest.mark.parametrize(
-    ("chi_square", "freedom", "largest", "word"),
+    ("chi_square", "freedom", "misfit", "word"),
     [
         (14.0, 14, 0.3, "good"),
         (chi2.isf(0.011, 14), 14, 0.3, "good"),
@@ -31,8 +31,8 @@ ENTRIES = {
         (83.7, 14, 0.1, "fair"),  # within the margin of mitsim compare, which says agrees
     ],
 )
-def test_the_verdict_follows_from_chance_and_ratio_or_the_margin_of_compare(chi_square, freedom, largest, word):
-    found = verdict_of((Agreement("sheet", chi_square, freedom, largest, "sharpness"),))
+def test_the_verdict_follows_from_chance_and_ratio_or_the_margin_of_compare(chi_square, freedom, misfit, word):
+    found = verdict_of((Agreement("sheet", chi_square, freedom, misfit, "sharpness"),))
     assert found.word == word
     assert ("sharpness by " in found.why) == (word != "good")
 
