@@ -59,7 +59,7 @@ def test_names_the_next_best_views_what_is_missing_and_the_expected_loss(text):
 
 def test_has_every_picture_each_with_a_text_and_a_caption(text):
     tags = Tags(text)
-    # the sensor before the part, wide and narrow; fraction, noise, patches; two for each measurement; two views of clouds
+    # the sensor before the part, twice; fraction, noise, patches; two for each measurement; two views of clouds
     pictures = [a for a in tags.all("svg") if a.get("role") == "img"]
     assert len(pictures) == 2 + 3 + 2 * len(MEASUREMENTS) + 2
     images = tags.all("img")
