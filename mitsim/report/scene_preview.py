@@ -150,8 +150,8 @@ def _from_sensor(
     nearest = tuple(np.clip(np.rint(one).astype(int), 0, end - 1) for one, end in ((rows, height), (columns, width)))
     clear = (visible.seen_by_all & np.where(seen, _within(sensor, visible), False))[nearest]
     source = without_leaks(hits.shape.reshape(size), hits.front.reshape(size))
-    shape, front, lit = (one.reshape(-1)[source] for one in (hits.shape, hits.front, lit))
-    image = _painted(shape, front, lit, colours, clear)
+    shape, front = hits.shape.reshape(-1)[source], hits.front.reshape(-1)[source]
+    image = _painted(shape, front, lit.reshape(-1)[source], colours, clear)
     axes.imshow(image, extent=(left, right, bottom, top), interpolation="antialiased", zorder=0)
     _frames(axes, sensor)
     axes.set(xlim=(left, right), ylim=(bottom, top))
