@@ -80,9 +80,18 @@ def placement_figure(
     verdicts: Mapping[str, str],
     stacked: bool = False,
 ) -> Figure:
-    """Draw a part with a sensor at each of ``poses`` (label, (4, 4) part_from_sensor) and its verdicts.
+    """Draw a part with a sensor at each pose and its verdicts, as a figure of its own.
 
-    The first sensor is drawn in full. The enlarged part is on the right, or below if ``stacked``, for narrow windows.
+    Parameters
+    ----------
+    geometry, poses, verdicts
+        As of :func:`draw_placement`.
+    stacked
+        Whether the enlarged part is below, for narrow windows, not on the right.
+
+    See Also
+    --------
+    draw_placement : into a figure that exists
     """
     with drawing():
         figure = Figure(_STACKED_IN if stacked else _SIZE_IN)
