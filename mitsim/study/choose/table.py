@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from characterisation.files.atomic_io import json_values
-from characterisation.statements.decision import WORDS, decide, needed, tolerance_of
+from characterisation.statements.decision import WORDS, Verdict, decide, mostly_lost, needed, tolerance_of
 from characterisation.statements.statement import Statement
 from characterisation.statements.verdict_words import result_in_words
 from mitsim.running.text_table import aligned
@@ -234,8 +234,9 @@ def _impossible(one: SensorResult, m: int, name: str) -> CellEntry:
     lost = sum(each.trials * each.without_value for each in statements) / trials
     toleranced = tolerance_of(one.candidate.study.task, name) is not None
     reasons = [loss for each in statements for loss in each.losses]
+    lost_verdict: Verdict = "undecidable" if mostly_lost(trials) else "not decided"
     return CellEntry(
-        verdict="undecidable" if toleranced else "no tolerance",
+        verdict=lost_verdict if toleranced else "no tolerance",
         trials=trials,
         without_value=min(lost, 1.0),
         reason=max(reasons, key=lambda loss: loss.count).reason if reasons else "",
