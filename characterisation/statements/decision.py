@@ -148,7 +148,7 @@ class Decided:
         - ``does not fit``: some readings are accepted, but the demand is not met.
         - ``undecidable``: no reading can be accepted, because the expanded uncertainty is as large as the tolerance, or
           no value was measured.
-        - ``not decided``: too few trials to decide, such as a single one with a value.
+        - ``not decided``: too few trials to decide, such as a single one with a value, or less than five without one.
     fits_corrected
         Whether it fits if the bias is subtracted.
     needed
@@ -178,12 +178,21 @@ class Decided:
     producer_risk: float | None
 
 
-def decide(errors: Errors, tolerance: Tolerance) -> Decided:
-    """Decide from the errors (n,) of trials with a value whether a measurement fits its tolerance."""
+def mostly_lost(trials: int) -> bool:
+    """Return whether so many trials, all without a value, show that at least half of all have none, with 95 %."""
+    return 0.5**trials <= 0.05
+
+
+def decide(errors: Errors, tolerance: Tolerance, lost: int | None = None) -> Decided:
+    """Decide from the errors (n,) of trials with a value whether a measurement fits its tolerance.
+
+    ``lost`` is the number of trials without a value; by default enough to call a measurement without any undecidable.
+    """
     rule = tolerance.rule
     if len(errors) < 2:
         nan = math.nan
-        unsure: Verdict = "not decided" if len(errors) else "undecidable"
+        few = len(errors) > 0 or (lost is not None and not mostly_lost(lost))
+        unsure: Verdict = "not decided" if few else "undecidable"
         return Decided(
             WORDS[rule.rule], None, nan, (nan, nan), unsure, False, nan, nan, (nan, nan), nan, nan, None, None
         )

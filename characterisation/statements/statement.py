@@ -264,7 +264,8 @@ def statement(
     repeatability = _within(known, day)
     decided = None
     if tolerance is not None:
-        decided = decide(errors.part(errors.known) if isinstance(errors, OneSidedErrors) else known, tolerance)
+        used = errors.part(errors.known) if isinstance(errors, OneSidedErrors) else known
+        decided = decide(used, tolerance, len(every) - count)
     nan = math.nan
     bias = spread = bias_uncertainty = delta = low = high = nan
     moved, share, shares = np.full(4, nan), None, None

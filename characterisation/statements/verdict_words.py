@@ -47,8 +47,10 @@ def result_in_words(judged: Sequence[Judged]) -> str:
     unsure = [one for one in asked if one.verdict == "not decided"]
     if valued := [one.name for one in unsure if math.isfinite(one.uncertainty)]:
         lines.append(f"{', '.join(valued)}: not decided, more virtual measurements are needed")
-    if single := [one.name for one in unsure if not math.isfinite(one.uncertainty)]:
+    if single := [one.name for one in unsure if not math.isfinite(one.uncertainty) and one.without_value < 1]:
         lines.append(f"{', '.join(single)}: not decided, a single virtual measurement gave a value")
+    if none := [one.name for one in unsure if one.without_value == 1]:
+        lines.append(f"{', '.join(none)}: not decided, no value in the few virtual measurements")
     lines += [
         f"{one.name} fits, but has no value in {_percent(one.without_value)} of the virtual measurements"
         for one in fitting

@@ -98,6 +98,7 @@ def run(
     from mitsim.report.export.ros_bag import Stamped, write_mcap
     from mitsim.report.export.run_scene import read_run_scene
     from mitsim.report.export.usd import write_usd
+    from mitsim.running.numbers import how_many
     from mitsim.running.progress import say
 
     suffix = _suffix(output, RUN_SUFFIXES)
@@ -121,7 +122,9 @@ def run(
         write_mcap(stamped, output)
     else:
         write_usd(scene, output)
-    say(f"run: {output}: {len(scene.views)} views, {len(scans)} clouds")
+    written = [how_many(len(scene.views), "view")]
+    written += [how_many(len(scans), "cloud")] if suffix in (".rrd", ".mcap", ".e57") else []
+    say(f"run: {output}: {', '.join(written)}")
 
 
 @app.command()
@@ -147,6 +150,7 @@ def results(
     from mitsim.report.export.dcc import Issuer, write_dcc
     from mitsim.report.export.qif import write_qif
     from mitsim.report.export.results import read_results, write_results_csv, write_results_json
+    from mitsim.running.numbers import how_many
     from mitsim.running.progress import say
 
     suffix = _suffix(output, RESULT_SUFFIXES)
@@ -160,7 +164,7 @@ def results(
         write = {".qif": write_qif, ".csv": write_results_csv, ".json": write_results_json}
         write[suffix](found, output)
     views = ", ".join(str(number) for number, *_ in found.plan)
-    say(f"results: {output}: {len(found.results)} measurements, planned from view {views}")
+    say(f"results: {output}: {how_many(len(found.results), 'measurement')}, planned from view {views}")
 
 
 @app.command()
@@ -182,6 +186,7 @@ def targets(
     """
     from characterisation.files.atomic_io import write_text
     from mitsim.report.export.robot_targets import ROBOT_FORMATS, read_targets
+    from mitsim.running.numbers import how_many
     from mitsim.running.progress import say
 
     if robot not in ROBOT_FORMATS:
@@ -194,7 +199,7 @@ def targets(
     check_file(output)
     write_text(output, target_format.write(found, tool))
     hint = "" if tool == "flange" else "; make the tool frame the sensor frame, or give [views.flange_from_sensor]"
-    say(f"targets: {output}: {len(found)} poses of the {tool} in the part frame{hint}")
+    say(f"targets: {output}: {how_many(len(found), 'pose')} of the {tool} in the part frame{hint}")
 
 
 @app.command("map")

@@ -17,6 +17,7 @@ from mitsim.cli.options import (
     SensorOption,
     Target,
     Variant,
+    ViewOfPoses,
     check_file,
     definitions,
     pose_of,
@@ -38,6 +39,14 @@ def check(
     ] = None,
     target: Target = (0.0, 0.0, 0.0),
     roll: Roll = 0.0,
+    pose: Annotated[
+        Path | None,
+        typer.Option(
+            help="File with the pose of the sensor, in place of --position: pose.json, statement.json, or poses.json "
+            "with --view."
+        ),
+    ] = None,
+    view: ViewOfPoses = None,
     sensor: SensorOption = "ensenso-n10",
     task: Annotated[Path | None, typer.Option(help="Task TOML file; check that the scene has its features.")] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="PNG picture to write.")] = None,
@@ -69,9 +78,15 @@ def check(
 
     chosen = load_sensor(sensor)
     stand = None if position is None else pose_of(position, target, roll, chosen)
-    checked, visible, pose = _inspected(scene, chosen, definitions(define), task, stand, roll)
+    if pose is not None:
+        from mitsim.study.task_measurement import read_pose
+
+        if position is not None:
+            raise InputError("--pose", "", "--position too", "one of them")
+        stand = read_pose(pose, view)
+    checked, visible, placed = _inspected(scene, chosen, definitions(define), task, stand, roll)
     facts, found, centre = checked.facts, checked.found, checked.scene.centre
-    if position is None:
+    if stand is None:
         ends = [" ".join(f"{round(float(v), 1) + 0.0:g}" for v in end) for end in (usual_place(chosen, centre), centre)]
         say(f"no position was given: using --position {ends[0]} --target {ends[1]}")
     if output:
@@ -81,14 +96,14 @@ def check(
         check_file(output)
         first = list(checked.task.features) if checked.task else []
         measured = checked.task.measured_shapes() if checked.task else ()
-        write_png(preview_figure(checked.scene, facts, chosen, pose, visible, first, measured), output)
+        write_png(preview_figure(checked.scene, facts, chosen, placed, visible, first, measured), output)
         say(f"picture: {output}")
     if bounces:
         from mitsim.report.bounce_figure import bounce_figure, bounced_light
         from mitsim.report.style import write_png
 
         check_file(bounces)
-        light = bounced_light(checked.scene, chosen, pose, visible)
+        light = bounced_light(checked.scene, chosen, placed, visible)
         write_png(bounce_figure(light, checked.scene.names, f"{scene.stem} before {chosen.name}"), bounces)
         say(f"picture: {bounces}")
     if html:
@@ -99,7 +114,7 @@ def check(
         write_text(html, text)
         say(f"page: {html}")
     if json:
-        about = {"scene": checked.scene.where, "sensor": chosen.name, "world_from_sensor": pose.matrix().tolist()}
+        about = {"scene": checked.scene.where, "sensor": chosen.name, "world_from_sensor": placed.matrix().tolist()}
         print(json_module.dumps({**about, **as_data(facts, visible, found)}, indent=2))
     else:
         print(as_text(facts, visible, found))

@@ -190,16 +190,16 @@ function finding(one) {
   return element('li', { class: `au-${one.severity}` }, element('strong', {}, sign), one.about ? ` ${one.about}: ` : ' ', `${one.what}. ${one.advice}`);
 }
 
-// Return a warning that needs no check by mitsim: a finish or Ra outside the map or the usual range.
-function finishWarning(finish) {
+// Return a remark that needs no check by mitsim: a finish or Ra outside the usual range or the map.
+function finishRemark(finish) {
   if (finish.type !== 'machined_metal') return '';
   const Ra = Number(finish.Ra), usual = data.processes[finish.process];
-  if (!(Ra > 0)) return 'Ra must be a number of um over 0';
+  if (!(Ra > 0)) return '▲ Ra must be a number of um over 0';
+  if (usual && (Ra < usual[0] || Ra > usual[1])) return `▲ ${finish.process} metal usually has Ra ${usual[0]} to ${usual[1]} um`;
   const known = data.known?.[`${finish.metal}/${finish.process}`];
-  if (data.known && !known) return `the map of ${data.sensor} has no ${finish.metal}/${finish.process}: a study that needs it characterises it`;
-  if (known?.length && (Ra < known[0] || Ra > known[1])) return `the map of ${data.sensor} contains this finish for Ra ${known[0]} to ${known[1]} um: a study that needs another value characterises it`;
-  if (usual && (Ra < usual[0] || Ra > usual[1])) return `${finish.process} metal usually has Ra ${usual[0]} to ${usual[1]} um`;
-  return '';
+  if (!data.known || (known && (!known.length || (Ra >= known[0] && Ra <= known[1])))) return '';
+  const has = known ? `${finish.metal}/${finish.process} of Ra ${known[0]} to ${known[1]} um alone` : `no ${finish.metal}/${finish.process}`;
+  return `● the map of ${data.sensor} has ${has}: its nearest finish ranks the views; virtual measurements have this one`;
 }
 
 // Say what a feature without a face of its own is.
@@ -367,13 +367,13 @@ function finishList() {
       select(choices(Object.keys(data.processes), one.process), one.process, change('process'), { 'aria-label': `process of ${one.id}` }),
       entry(one.Ra, change('Ra'), { 'aria-label': `Ra of ${one.id} in um`, size: 5, inputmode: 'decimal' }),
     ] : [one.type.replaceAll('_', ' '), '', ''];
-    const warning = finishWarning(one);
+    const remark = finishRemark(one);
     return element('tr', {}, element('th', { scope: 'row' }, element('span', { class: 'au-swatch', style: `background:${colourOf(one.id)}` }), one.id),
       ...cells.map((cell) => element('td', {}, cell)), element('td', { class: 'au-number' }, String(used)),
       element('td', {}, button('Choose these faces', () => {
         chosen.splice(0, Infinity, ...faces.filter((face) => face.finish === one.id).map((face) => face.number));
         show();
-      }, { 'aria-label': `choose the faces of ${one.id}` }), warning ? element('div', { class: 'au-warning' }, `▲ ${warning}`) : null));
+      }, { 'aria-label': `choose the faces of ${one.id}` }), remark ? element('div', { class: 'au-warning' }, remark) : null));
   });
   fillTable(place('finishes'), ['Finish', 'Metal', 'Process', 'Ra [um]', 'Faces', ''], rows);
   const real = faces.filter((face) => face.node), sprayed = real.length > 0 && real.every((face) => face.finish === SPRAY);

@@ -17,7 +17,7 @@ from mitsim.report.placement_figure import VERDICTS
 from mitsim.report.pose_texts import pose_texts
 from mitsim.report.templates import write_page
 from mitsim.running.numbers import NONE, listed, percent, quantity, rounded, two_digits, with_degree_signs
-from mitsim.study.choice_document import CHOICE, CellEntry, ChoiceDocument, SensorEntry, read_choice
+from mitsim.study.choice_document import CHOICE, CellEntry, ChoiceDocument, SensorEntry, best_statement, read_choice
 from mitsim.study.scene_geometry import read_scene_geometry
 
 
@@ -37,12 +37,12 @@ def write_choice_page(folder: Path) -> Path:
 
 def page_content(choice: ChoiceDocument, folder: Path) -> dict[str, Any]:
     """Return everything that the template shows."""
-    tolerances = any(one.tolerance is not None for one in choice.measurements.values())
+    tolerances = choice.toleranced > 0
     taking_part = [one for one in choice.sensors if one.status != "excluded"]
     return {
         "choice": choice,
         "part": Path(choice.scene).stem,
-        "first": of_choice(choice, read_scene_geometry(folder)),
+        "first": of_choice(choice, read_scene_geometry(folder), best_statement(choice, folder)),
         "tolerances": tolerances,
         "best": taking_part[0].name if taking_part else "no sensor",
         "names": [
@@ -51,7 +51,6 @@ def page_content(choice: ChoiceDocument, folder: Path) -> dict[str, Any]:
         ],
         "asked": [_asked(choice, name) for name in choice.measurements],
         "rows": [_row(choice, one) for one in taking_part],
-        "incomplete": any(one.impossible for one in taking_part),
         "screened": any(one.status == "screened" for one in taking_part),
         "sensors": [_details(choice, one, tolerances) for one in taking_part],
         "excluded": [{"name": one.name, "why": one.why} for one in choice.sensors if one.status == "excluded"],
@@ -71,7 +70,7 @@ def _asked(choice: ChoiceDocument, name: str) -> dict[str, str]:
 
 
 def _row(choice: ChoiceDocument, one: SensorEntry) -> dict[str, Any]:
-    toleranced = sum(entry.tolerance is not None for entry in choice.measurements.values())
+    toleranced = choice.toleranced
     return {
         "name": one.name,
         "stated": one.status == "stated",

@@ -23,10 +23,13 @@ from mitsim.report.pose_texts import angles_in_words, origin_text, pose_of_view
 from mitsim.report.statement_section import exposed_in_words, interval_words
 from mitsim.report.unknowns_words import unknowns_in_words
 from mitsim.running.numbers import NONE, count, listed, quantity, rounded, signed, two_digits
-from mitsim.study.choice_document import CHOICE, ChoiceDocument, PoseEntry, SensorEntry, read_choice
+from mitsim.study.choice_document import CHOICE, ChoiceDocument, PoseEntry, SensorEntry, best_statement, read_choice
 from mitsim.study.run_folder import Run, read_run
 from mitsim.study.scene_geometry import SceneGeometry
-from mitsim.study.statement_file import InfluenceEntry, StatedMeasurement, StatementDocument, read_statement
+from mitsim.study.statement_file import InfluenceEntry, StatedMeasurement, StatementDocument
+
+#: how the software was verified (ISO/TS 15530-4), in words; docs/explanation/validity.md, criteria 10 and 11
+VERIFIED = "closed forms, examples of JCGM 101 and 106, another renderer; not by a metal part with calibrated values"
 
 #: hexadecimal digits of a digest that are printed
 _DIGITS = 16
@@ -86,13 +89,12 @@ def _of_run(run: Run, geometry: SceneGeometry | None) -> Declaration:
 
 
 def _of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None, folder: Path) -> Declaration:
-    first = of_choice(choice, geometry)
-    best = next((one for one in choice.sensors if one.measurements), None)
+    document, best = best_statement(choice, folder), choice.best
+    first = of_choice(choice, geometry, document)
     if best is None:
         title = f"No sensor measures {Path(choice.scene).stem}"
         return _declared(folder, title, _day(folder / CHOICE), first, None, [("Part", _part(choice.scene, []))])
     own = folder / best.name
-    document = read_statement(own / "statement.json") if best.status == "stated" else None
     about = read_run(own).about if (own / "run.json").exists() else None
     finishes = [] if about is None else list(about.features.values())
     facts = [("Part", _part(choice.scene, finishes)), ("Sensor", best.name)]
@@ -164,7 +166,7 @@ def _notes(document: StatementDocument | None) -> list[str]:
     if names := [name for name, one in document.measurements.items() if not one.settled and one.trials]:
         which = "all" if len(names) == len(document.measurements) else listed(names)
         notes.append(f"Not settled after JCGM 101, 7.9 (more virtual measurements may change a digit): {which}.")
-    return notes
+    return [*notes, *(f"{one}." for one in document.doubts("the influences listed below"))]
 
 
 def _part(scene: str, finishes: Sequence[str]) -> str:
@@ -192,6 +194,7 @@ def _of_statement(document: StatementDocument, exposures: str) -> list[tuple[str
         ("Method", f"{count(trials)} virtual measurements, {how}: a virtual experiment, “simulate and analyse”"),
         ("Calibration", document.calibration.split("; drift:")[0]),
         ("Exposure", exposed or exposures),
+        ("Verified by", VERIFIED),
     ]
 
 
@@ -220,7 +223,7 @@ def _rules(rules: Iterable[str]) -> list[tuple[str, str]]:
 
 
 def _others(choice: ChoiceDocument, best: SensorEntry) -> list[tuple[str, str]]:
-    asked = sum(one.tolerance is not None for one in choice.measurements.values())
+    asked = choice.toleranced
     words = []
     for one in choice.sensors:
         if one is best or one.status == "excluded":

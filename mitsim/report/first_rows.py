@@ -137,9 +137,12 @@ def measured_words(kind: str, features: Sequence[str]) -> str:
         return f"{kind.replace('_', ' ')} of {listed(list(features))}" if kind else listed(list(features))
 
 
-def breakable(name: str) -> Markup:
-    """Return a name as safe markup that a browser may break after underscores."""
-    return Markup(escape(name).replace("_", Markup("_<wbr>")))
+def breakable(name: str, after: str = "_") -> Markup:
+    """Return a name as safe markup that a browser may break ``after`` some characters; of a path, ``_/``."""
+    text = escape(name)
+    for one in after:
+        text = text.replace(one, Markup(f"{one}<wbr>"))
+    return Markup(text)
 
 
 def exact(value: float, unit: str) -> str:

@@ -8,7 +8,7 @@ part coloured by the worst verdict of its measurements -> picture, its caption w
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -29,7 +29,7 @@ from mitsim.study.choice_document import ChoiceDocument, SensorEntry, judged
 from mitsim.study.remedies.entries import remedies_in_words
 from mitsim.study.run_folder import Run
 from mitsim.study.scene_geometry import SceneGeometry
-from mitsim.study.statement_file import StatedMeasurement
+from mitsim.study.statement_file import StatedMeasurement, StatementDocument
 
 #: good: every tolerance fits; plain: there are no tolerances; warn: values are missing, or a verdict is open; bad: a
 #: tolerance does not fit, or a set of views exceeds a limit
@@ -166,9 +166,11 @@ def _caption(run: Run, view: int) -> str:
     return f"{run.about.sensor} in view {view}, {best}: {pose_words(pose_of_view(run, view))}"
 
 
-def of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None) -> FirstScreen:
-    """Return the first screen of the page that compares sensors, which shows the best one."""
-    best = next((one for one in choice.sensors if one.status != "excluded" and one.measurements), None)
+def of_choice(
+    choice: ChoiceDocument, geometry: SceneGeometry | None, statement: StatementDocument | None = None
+) -> FirstScreen:
+    """Return the first screen of the page that compares sensors, which shows the best one and its ``statement``."""
+    best = choice.best
     if best is None:
         return FirstScreen(with_degree_signs(choice.words), "bad", [], None, [], {})
     verdicts = face_verdicts(
@@ -192,21 +194,19 @@ def of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None) -> FirstSc
         poses,
         verdicts,
         max((cell.trials for cell in best.measurements.values()), default=0),
-        doubts=_not_measured(choice, best),
+        doubts=(*_others_fit_more(choice, best), *(statement.doubts() if statement else ())),
     )
 
 
-def _not_measured(choice: ChoiceDocument, best: SensorEntry) -> tuple[str, ...]:
-    """Return a sentence on each sensor that may fit more tolerances than the best, and was not measured."""
-    tolerances = sum(one.tolerance is not None for one in choice.measurements.values())
-    if best.status != "stated":
-        return ()
-    return tuple(
-        f"{one.name} was not measured ({one.why}), but is expected to fit {one.expected_fits} of {tolerances} "
-        "tolerances: allow more minutes"
-        for one in choice.sensors
-        if one.status == "screened" and one.expected_fits > best.fits
-    )
+def _others_fit_more(choice: ChoiceDocument, best: SensorEntry) -> Iterator[str]:
+    """Yield a sentence on each sensor that fits more tolerances than the best, or may and was not measured."""
+    yield from choice.fit_more
+    for one in choice.sensors:
+        if best.status == "stated" and one.status == "screened" and one.expected_fits > best.fits:
+            yield (
+                f"{one.name} was not measured ({one.why}), but is expected to fit {one.expected_fits} of "
+                f"{choice.toleranced} tolerances: allow more minutes"
+            )
 
 
 def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[ResultRow]:
@@ -279,5 +279,7 @@ def _picture(
         by_verdict.setdefault(verdict, []).append(name)
     faces = (f"{verdict}: {', '.join(names)}" for verdict, names in by_verdict.items())
     alt = "The part and the sensor. " + "; ".join(faces)
-    drawn = f"{caption}. Drawn to scale; on the right, the part enlarged, from the same viewpoint."
-    return Picture(Markup(as_svg(placement_figure(geometry, poses, verdicts), alt)), drawn)
+    drawn = f"{caption}. Drawn to scale; beside it or below, the part enlarged, from the same viewpoint."
+    # a narrow window shows the second: text would shrink to 4 px in the first
+    both = [as_svg(placement_figure(geometry, poses, verdicts, stacked), alt) for stacked in (False, True)]
+    return Picture(Markup('<div class="wide">{}</div><div class="narrow">{}</div>').format(*map(Markup, both)), drawn)

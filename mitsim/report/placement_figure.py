@@ -54,7 +54,10 @@ _ASIDE_DEG, _LOWEST_DEG = 62.0, 18.0
 #: largest number of times that a picture is widened for its texts: it shrinks, and they do not
 _WIDENINGS = 12
 
-_SIZE_IN = (7.4, 3.9)
+#: size [in] of the figure, and with the part below the sensor; places of both pictures in it
+_SIZE_IN, _STACKED_IN = (7.4, 3.9), (3.9, 5.6)
+_BESIDE = (0.0, 0.09, 0.46, 0.91), (0.46, 0.09, 0.54, 0.91)
+_STACKED = (0.0, 0.54, 1.0, 0.46), (0.0, 0.1, 1.0, 0.42)
 
 #: keeps text readable on lines
 _HALO = [withStroke(linewidth=2.5, foreground=PAPER)]
@@ -72,33 +75,51 @@ def face_verdicts(measurements: Mapping[str, tuple[Sequence[str], str]]) -> dict
 
 
 def placement_figure(
-    geometry: SceneGeometry, poses: Sequence[tuple[str, ArrayLike]], verdicts: Mapping[str, str]
+    geometry: SceneGeometry,
+    poses: Sequence[tuple[str, ArrayLike]],
+    verdicts: Mapping[str, str],
+    stacked: bool = False,
 ) -> Figure:
-    """Draw a part with a sensor at each of ``poses`` (label, (4, 4) part_from_sensor) and its verdicts.
+    """Draw a part with a sensor at each pose and its verdicts, as a figure of its own.
 
-    The first sensor is drawn in full.
+    Parameters
+    ----------
+    geometry, poses, verdicts
+        As of :func:`draw_placement`.
+    stacked
+        Whether the enlarged part is below, for narrow windows, not on the right.
+
+    See Also
+    --------
+    draw_placement : into a figure that exists
     """
     with drawing():
-        figure = Figure(_SIZE_IN)
-    draw_placement(figure, geometry, poses, verdicts)
+        figure = Figure(_STACKED_IN if stacked else _SIZE_IN)
+    draw_placement(figure, geometry, poses, verdicts, stacked)
     return figure
 
 
 def draw_placement(
-    figure: FigureBase, geometry: SceneGeometry, poses: Sequence[tuple[str, ArrayLike]], verdicts: Mapping[str, str]
+    figure: FigureBase,
+    geometry: SceneGeometry,
+    poses: Sequence[tuple[str, ArrayLike]],
+    verdicts: Mapping[str, str],
+    stacked: bool = False,
 ) -> None:
     """Draw a part with a sensor at each pose into a figure.
 
     Parameters
     ----------
     figure
-        Figure or subfigure, about 1.9 times as wide as high.
+        Figure or subfigure, about 1.9 times as wide as high; if ``stacked``, 0.7 times.
     geometry
         Triangles of the part, and eyes of the sensor [mm].
     poses
         Label and part_from_sensor (4, 4) [mm] of each pose; the first sensor is drawn in full.
     verdicts
         Verdict of each feature, a key of :data:`VERDICTS`.
+    stacked
+        Whether the enlarged part is below, not on the right.
 
     See Also
     --------
@@ -109,7 +130,7 @@ def draw_placement(
         middle = _middle(geometry)
         turn = _viewpoint(matrices[0], middle)
         flat, depth = _projected(geometry.corners - middle, turn)
-        whole, near = figure.add_axes((0.0, 0.09, 0.46, 0.91)), figure.add_axes((0.46, 0.09, 0.54, 0.91))
+        whole, near = (figure.add_axes(place) for place in (_STACKED if stacked else _BESIDE))
         picture, extent = _part(geometry, flat, depth, turn, verdicts)
         for axes in (whole, near):
             axes.imshow(picture, origin="lower", extent=extent, interpolation="antialiased", zorder=2)
@@ -122,7 +143,7 @@ def draw_placement(
         _axes_of_part(near, turn)
         for axes in (whole, near):
             _make_room_for_texts(axes)
-        _legend(figure, verdicts, geometry.camera)
+        _legend(figure, verdicts, geometry.camera, 2 if stacked else None)
 
 
 def _middle(geometry: SceneGeometry) -> Floats:
@@ -298,10 +319,13 @@ def _make_room_for_texts(axes: Axes) -> None:
         axes.set_xlim(low - max(left + 2, 0) * per_pixel, high + max(right + 2, 0) * per_pixel)
 
 
-def _legend(figure: FigureBase, verdicts: Mapping[str, str], camera: str) -> None:
+def _legend(figure: FigureBase, verdicts: Mapping[str, str], camera: str, columns: int | None) -> None:
     used = [verdict for verdict in VERDICTS if verdict in verdicts.values()]
     handles: list[Any] = [Patch(facecolor=VERDICTS[verdict], label=_LEGEND.get(verdict, verdict)) for verdict in used]
     handles.append(Patch(facecolor=_NOT_ASKED, label="not measured"))
     seen = f"field of view of the {camera or 'first'} camera".replace("camera camera", "camera")
     handles.append(Line2D([], [], color=INK, lw=0.8, ls="--", label=seen))
-    figure.legend(handles=handles, loc="lower center", ncols=len(handles), handlelength=1.3, columnspacing=1.4)
+    space = 1.4 if columns is None else 0.8
+    figure.legend(
+        handles=handles, loc="lower center", ncols=columns or len(handles), handlelength=1.2, columnspacing=space
+    )

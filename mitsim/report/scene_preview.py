@@ -149,7 +149,9 @@ def _from_sensor(
     lit = np.clip(pose.inverse().directions(hits.normal) @ (light / np.linalg.norm(light)), 0, 1).reshape(size)
     nearest = tuple(np.clip(np.rint(one).astype(int), 0, end - 1) for one, end in ((rows, height), (columns, width)))
     clear = (visible.seen_by_all & np.where(seen, _within(sensor, visible), False))[nearest]
-    image = _painted(hits.shape.reshape(size), hits.front.reshape(size), lit, colours, clear)
+    source = without_leaks(hits.shape.reshape(size), hits.front.reshape(size))
+    shape, front = hits.shape.reshape(-1)[source], hits.front.reshape(-1)[source]
+    image = _painted(shape, front, lit.reshape(-1)[source], colours, clear)
     axes.imshow(image, extent=(left, right, bottom, top), interpolation="antialiased", zorder=0)
     _frames(axes, sensor)
     axes.set(xlim=(left, right), ylim=(bottom, top))
@@ -165,6 +167,21 @@ def _from_sensor(
     place = (left + 0.03 * (right - left), bottom - 0.045 * (bottom - top))
     scale_bar(axes, place, length * pixels, f"{length:g} mm at {at:.0f} mm", -0.02 * (bottom - top))
     return window
+
+
+def without_leaks(shape: NDArray[np.int16], front: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return for every pixel (H, W) the flat index of the pixel to draw: a neighbour where a ray has leaked.
+
+    A ray that hits an edge of a mesh exactly may pass between its triangles. Its pixel then differs in shape or side
+    from all four neighbours, which agree.
+    """
+    surface = 2 * shape.astype(np.int64) + front
+    index = np.arange(surface.size).reshape(surface.shape)
+    middle, left = surface[1:-1, 1:-1], surface[1:-1, :-2]
+    others = (surface[1:-1, 2:], surface[:-2, 1:-1], surface[2:, 1:-1])
+    leaked = (middle != left) & np.logical_and.reduce([one == left for one in others])
+    index[1:-1, 1:-1] -= leaked
+    return index
 
 
 def _part_in_image(axes: Axes, seen: NDArray[np.bool_]) -> tuple[float, float, float, float]:

@@ -24,7 +24,7 @@ from mitsim.running.numbers import NONE
 from mitsim.study.scene_geometry import SceneGeometry, read_scene_geometry
 
 #: smallest and largest height of the picture [in]
-_PICTURE = (1.75, 3.4)
+_PICTURE = (1.58, 3.4)
 
 #: height of the lines to sign, and of the last line of a page [in]
 _SIGNATURE, _FOOT = 0.95, 0.22
@@ -32,11 +32,12 @@ _SIGNATURE, _FOOT = 0.95, 0.22
 #: what only the user knows, to be written by hand
 _TO_FILL_IN = (
     ("Part: drawing number and revision", "Sensor: serial number, date of its calibration", "Valid until"),
-    ("Place and date", "Name", "Signature"),
+    ("Place and date", "Name, organisation", "Signature"),
 )
 
-#: sizes of text [pt] and the distance of a fact's text from the margin [in]
-_SMALL, _FACT, _FACT_LEFT = 6.5, 7.2, 1.15
+#: size of small text [pt], sizes of facts of which the largest gives one page [pt], and distance of their text from the
+#: margin [in]
+_SMALL, _FACTS, _FACT_LEFT = 6.5, (7.2, 6.6, 6.0), 1.15
 
 #: size of the result in words [pt], and its most lines
 _RESULT, _RESULT_LINES = 9.5, 4
@@ -89,8 +90,11 @@ def sheet_figures(declaration: Declaration, geometry: SceneGeometry | None) -> l
         page = pages[0]
         _head(page, declaration)
         shown = geometry is not None and len(geometry.corners) and declaration.first.poses
-        below = _SIGNATURE + _FOOT + MARGIN + _facts_height(declaration)
-        room = page.place - below - (_PICTURE[0] if shown else 0)
+        above = _PICTURE[0] if shown else 0.0
+        whole = above + _head_height(columns) + sum(_row_height(row, columns) for row in declaration.rows)
+        below = {size: _SIGNATURE + _FOOT + MARGIN + _facts_height(declaration, size) for size in _FACTS}
+        size = next((size for size in _FACTS if whole + below[size] <= page.place), _FACTS[0])
+        room = page.place - below[size] - above
         rows, taken = list(declaration.rows), _head_height(columns)
         here: list[DeclaredRow] = []
         while rows and (taken := taken + _row_height(rows[0], columns)) <= room:
@@ -98,7 +102,7 @@ def sheet_figures(declaration: Declaration, geometry: SceneGeometry | None) -> l
         if shown:
             assert geometry is not None
             table = _head_height(columns) + sum(_row_height(row, columns) for row in here)
-            height = min(_PICTURE[1], page.place - below - table)
+            height = min(_PICTURE[1], page.place - below[size] - table)
             grid = [HEIGHT - page.place, height, page.place - height]
             _picture(page.figure, grid, declaration, geometry)
             page.place -= height
@@ -111,7 +115,7 @@ def sheet_figures(declaration: Declaration, geometry: SceneGeometry | None) -> l
             count = max(1, int((further.place - MARGIN - _FOOT - 0.4) // _row_height(rows[0], columns)))
             _table(further, rows[:count], columns)
             rows = rows[count:]
-        _facts(page, declaration)
+        _facts(page, declaration, size)
         _sign(page)
         for number, one in enumerate(pages, 1):
             _foot(one, declaration, number, len(pages))
@@ -206,21 +210,22 @@ def _table(page: Page, rows: Sequence[DeclaredRow], columns: Columns) -> None:
         page.place = min(page.place, top - _row_height(row, columns))
 
 
-def _facts_height(declaration: Declaration) -> float:
-    lines = sum(len(wrapped(text, _FACT, ACROSS - _FACT_LEFT)) for _, text in declaration.facts)
-    notes = sum(len(wrapped(text, _SMALL, ACROSS)) for text in declaration.notes)
-    return lines * _FACT * LINE + 0.025 * len(declaration.facts) + notes * _SMALL * LINE + 0.16
+def _facts_height(declaration: Declaration, size: float) -> float:
+    small = min(size, _SMALL)
+    lines = sum(len(wrapped(text, size, ACROSS - _FACT_LEFT)) for _, text in declaration.facts)
+    notes = sum(len(wrapped(text, small, ACROSS)) for text in declaration.notes)
+    return lines * size * LINE + 0.025 * len(declaration.facts) + notes * small * LINE + 0.16
 
 
-def _facts(page: Page, declaration: Declaration) -> None:
+def _facts(page: Page, declaration: Declaration, size: float) -> None:
     page.place -= 0.05
     for note in declaration.notes:
-        page.write(note, _SMALL, MUTED)
+        page.write(note, min(size, _SMALL), MUTED)
     page.place -= 0.06
     for name, text in declaration.facts:
         if text:
-            page.put(0, name, _FACT, MUTED)
-            page.write(text, _FACT, left=_FACT_LEFT, across=ACROSS - _FACT_LEFT)
+            page.put(0, name, size, MUTED)
+            page.write(text, size, left=_FACT_LEFT, across=ACROSS - _FACT_LEFT)
             page.place -= 0.025
 
 
@@ -239,7 +244,8 @@ def _sign(page: Page) -> None:
 
 def _foot(page: Page, declaration: Declaration, number: int, of: int) -> None:
     page.place = MARGIN
-    words = "Simulated: no real sensor has measured this part. Verdicts are about the measurement, not about a part."
+    words = "Simulated, not traceable: no real sensor has measured this part."
+    words += " Verdicts are about the measurement, not about a part."
     page.put(0, words, _SMALL, MUTED)
     right = f"Page {number} of {of}"
     page.put(ACROSS - text_width(right, _SMALL), right, _SMALL, MUTED)

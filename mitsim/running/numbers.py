@@ -66,6 +66,11 @@ def count(number: int) -> str:
     return f"{number:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
 
 
+def how_many(number: int, noun: str) -> str:
+    """Return a number with its noun, in the plural except of one: ``1 view``, ``2 views``."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
 def finish_name(finish: str, roughness: float) -> str:
     """Return the name of a finish: ``matt white``, ``aluminium/ground, Ra 0.37 µm``."""
     name = finish.replace("_", " ")

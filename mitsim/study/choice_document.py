@@ -16,7 +16,7 @@ from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
 from characterisation.statements.verdict_words import Judged
 from mitsim.running.numbers import or_nan
-from mitsim.study.statement_file import PartialDocument
+from mitsim.study.statement_file import PartialDocument, StatementDocument, read_statement
 
 #: name of the file in the folder
 CHOICE = "choice.json"
@@ -157,6 +157,33 @@ class ChoiceDocument(PartialDocument):
     measurements: dict[str, ComparedMeasurement]
     sensors: list[SensorEntry]
 
+    @property
+    def best(self) -> SensorEntry | None:
+        """Return the first sensor that takes part; None without any."""
+        return next((one for one in self.sensors if one.status != "excluded" and one.measurements), None)
+
+    @property
+    def toleranced(self) -> int:
+        """Return the number of measurements with a tolerance."""
+        return sum(one.tolerance is not None for one in self.measurements.values())
+
+    @property
+    def fit_more(self) -> list[str]:
+        """Return a sentence on each measured sensor that fits more tolerances than the best, and why it comes later."""
+        best, out = self.best, list[str]()
+        if best is None or best.status != "stated":
+            return out
+        for one in self.sensors:
+            if one.status != "stated" or one.fits <= best.fits:
+                continue
+            why = "it can make more measurements"
+            if len(one.impossible) <= len(best.impossible):
+                ratios = f"{or_nan(best.ratio):.2g} times its limit, that of {one.name} at {or_nan(one.ratio):.2g}"
+                why = f"its worst measurement is at {ratios} times"
+            fits = f"{one.name} fits {one.fits} of {self.toleranced} tolerances, {best.name} {best.fits}"
+            out.append(f"{fits}. {best.name} leads, since {why}")
+        return out
+
     @model_validator(mode="after")
     def _of_all(self) -> ChoiceDocument:
         for one in self.sensors:
@@ -177,6 +204,18 @@ def read_choice(folder: Path) -> ChoiceDocument | None:
     if not path.exists():
         return None
     return validate(path, read_json_object(path), ChoiceDocument)
+
+
+def best_statement(choice: ChoiceDocument, folder: Path) -> StatementDocument | None:
+    """Return the statement of the best sensor of a comparison in ``folder``; None if it was not measured virtually.
+
+    Raises
+    ------
+    InputError
+        If the file is not a valid statement.
+    """
+    best = choice.best
+    return read_statement(folder / best.name / "statement.json") if best and best.status == "stated" else None
 
 
 def winner_folder(folder: Path) -> Path:

@@ -38,9 +38,7 @@ def maker_sigma(sensor: Sensor, measurement: Measurement, distance_mm: float) ->
     return min(finite) if finite else None
 
 
-def below_the_maker(
-    rows: Sequence[tuple[str, float | None, float | None]], left_out: Sequence[str], sensor: str
-) -> list[str]:
+def below_the_maker(rows: Sequence[tuple[str, float | None, float | None]], left_out: str, sensor: str) -> list[str]:
     """Return a sentence on measurements whose uncertainty is below a tenth of the maker's figure; none without any.
 
     Parameters
@@ -48,7 +46,7 @@ def below_the_maker(
     rows
         Name, standard uncertainty [mm] and figure of the maker [mm] of each measurement.
     left_out
-        Names of the influences that the statement does not contain.
+        The influences that the statement does not contain, in words.
     sensor
         Name of the sensor.
     """
@@ -60,5 +58,5 @@ def below_the_maker(
     return [
         f"{listed(each)} {verb} stated below a tenth of the accuracy that the maker of {sensor} publishes. That figure "
         "holds for every place in the volume, every unit and day; this statement holds for one view, and leaves out "
-        f"{'; '.join(left_out)}. Compare it with captures of your unit before you rely on it"
+        f"{left_out}. Compare it with captures of your unit before you rely on it"
     ]

@@ -134,10 +134,14 @@ class StatementDocument(PartialDocument):
     exposure: ExposureEntry | None = None
     sensor: str = ""
 
-    def doubts(self) -> list[str]:
-        """Return a sentence on measurements that are stated far below the accuracy of the maker, if there are any."""
+    def doubts(self, left_out: str = "") -> list[str]:
+        """Return a sentence on measurements that are stated far below the accuracy of the maker, if there are any.
+
+        ``left_out`` are words for the influences that are not included; by default it names each of them.
+        """
         rows = [(name, one.standard_uncertainty, one.maker_sigma) for name, one in self.measurements.items()]
-        return below_the_maker(rows, [one.name for one in self.influences if not one.included], self.sensor)
+        names = "; ".join(one.name for one in self.influences if not one.included)
+        return below_the_maker(rows, left_out or names, self.sensor)
 
 
 def read_statement(path: Path) -> StatementDocument | None:

@@ -109,7 +109,7 @@ def test_the_result_is_on_the_first_screen(browser, pages, page):
 #: names in cells and headings that a line breaks elsewhere than after an underscore or a space
 BROKEN = """(() => {
   const found = [];
-  for (const cell of document.querySelectorAll('th, td, h2, h3, .bar-name')) {
+  for (const cell of document.querySelectorAll('th, td, h2, h3, .bar-name, dd, p, figcaption, summary')) {
     const walker = document.createTreeWalker(cell, NodeFilter.SHOW_TEXT);
     for (let node = walker.nextNode(); node; node = walker.nextNode()) {
       for (const word of node.data.matchAll(/[\\p{L}\\p{N}.]+/gu)) {
@@ -142,11 +142,29 @@ def test_a_report_of_nine_measurements_is_folded_to_8000_px(browser, long_report
 
 
 @pytest.mark.parametrize("width", [1400, 400])
-def test_no_word_of_a_table_is_broken(browser, long_report, width):
+def test_no_word_is_broken(browser, long_report, tmp_path, width):
+    far = "/home/someone/measured_parts/brackets/bracket_of_the_gearbox"
+    folder = write_choice(tmp_path / "choice")
+    choice = json.loads((folder / "choice.json").read_text(encoding="utf-8"))
+    choice |= {"study": f"{far}/tolerances.toml", "scene": f"{far}/bracket.xml"}
+    (folder / "choice.json").write_text(json.dumps(choice), encoding="utf-8")
     set_size(browser, width, "screen", "light")
-    browser.open(long_report)
-    browser.tell("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
-    assert browser.tell(BROKEN) == []
+    for page in (long_report, write_choice_page(folder)):
+        browser.open(page)
+        browser.tell("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+        assert browser.tell(BROKEN) == []
+
+
+@pytest.mark.parametrize("width", [1400, 400])
+def test_words_of_the_picture_of_the_part_can_be_read(browser, tmp_path, width):
+    page = write_choice_page(write_choice(tmp_path / "choice"))
+    set_size(browser, width, "screen", "light")
+    browser.open(page)
+    heights = browser.tell(
+        "[...document.querySelectorAll('#stand svg [id^=text_], #stand svg g[transform] > use')]"
+        ".map((one) => one.getBoundingClientRect().height).filter((height) => height > 0)"
+    )
+    assert heights and max(heights) > 7, heights  # of a capital letter, 10 px high text
 
 
 def test_print_shows_what_is_folded(browser, long_report):

@@ -32,8 +32,9 @@ def test_labels_stand_apart_and_are_moved_least():
     assert spread([1.0, 3.0], 1.0) == [1.0, 3.0]
 
 
+@pytest.mark.parametrize("stacked", [False, True])
 @pytest.mark.parametrize(("height", "name"), [(1.0, "{}"), (4.0, "bore_24mm_front_right_{}")])
-def test_no_writing_of_the_picture_overlaps_other_writing_or_leaves_it(tmp_path, height, name):
+def test_no_writing_of_the_picture_overlaps_other_writing_or_leaves_it(tmp_path, height, name, stacked):
     write_scene_geometry(tmp_path)
     geometry = read_scene_geometry(tmp_path)
     names = tuple(name.format(one) for one in geometry.names)
@@ -42,7 +43,8 @@ def test_no_writing_of_the_picture_overlaps_other_writing_or_leaves_it(tmp_path,
     pose[2, 3] = 500.0
     aside = pose @ np.array([[1, 0, 0, -300.0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     poses = [("view 3", pose), ("view 1234", aside)]
-    figure = placement_figure(geometry, poses, dict.fromkeys(geometry.names, "fits"))
+    geometry = replace(geometry, camera="left camera")
+    figure = placement_figure(geometry, poses, dict.fromkeys(geometry.names, "no tolerance"), stacked)
     drawn = FigureCanvasAgg(figure).get_renderer()
     FigureCanvasAgg(figure).draw()
     texts = [one for axes in figure.axes for one in axes.texts] + list(figure.legends[0].get_texts())

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from scipy.spatial.transform import Rotation
 
 from characterisation.files.atomic_io import write_netcdf
+from mitsim.report.choice_page import write_choice_page
 from mitsim.report.declaration import pose_in_full, read_declaration
 from mitsim.report.sheet import sheet_figures, write_sheet
 from mitsim.report.sheet_layout import text_width, wrapped
@@ -71,6 +73,25 @@ def test_no_text_overlaps_another_or_leaves_the_page(run_folder, tmp_path, rows,
         small = [(text, box.padded(-1.5)) for text, box in boxes]
         assert [(a, b) for k, (a, one) in enumerate(small) for b, other in small[:k] if one.overlaps(other)] == []
     assert all(f"distance_{k}" in shown for k in range(rows)) and "Signature" in shown
+    assert "organisation" in shown and shown.count("not traceable") == pages
+
+
+def test_facts_are_set_smaller_before_a_sheet_gets_a_second_page(run_folder, tmp_path):
+    folder = shutil.copytree(run_folder, tmp_path / "run")
+    with_rows(folder, 9)
+    geometry = read_scene_geometry(folder)
+    declaration = read_declaration(folder, geometry)
+    found = []
+    for count in range(1, 30):
+        more = [(f"fact {k}", "one word after another") for k in range(count)]
+        pages = sheet_figures(replace(declaration, facts=more), geometry)
+        (name,) = [one for one in pages[0].texts if one.get_text() == "fact 0"]
+        found.append((len(pages), name.get_fontsize()))
+        if len(pages) > 1:
+            break
+    assert [pages for pages, _ in found[:-1]] == [1] * (len(found) - 1) and found[-1][0] == 2
+    sizes = [size for _, size in found[:-1]]
+    assert sizes == sorted(sizes, reverse=True) and len(set(sizes)) > 1 and found[-1][1] == sizes[0]
 
 
 def test_a_sheet_has_what_iso_ts_15530_4_and_jcgm_101_ask_for(run_folder, tmp_path):
@@ -88,6 +109,7 @@ def test_a_sheet_has_what_iso_ts_15530_4_and_jcgm_101_ask_for(run_folder, tmp_pa
     assert facts["Varied"] == "noise" and facts["Fixed"] == "form" and facts["Left out"] == "coatings"
     assert facts["with sizes of"] == "pose: placement 1 mm"
     assert {"Part", "Sensor", "Pose of the sensor", "Method", "Calibration", "Exposure", "Decision rule"} <= set(facts)
+    assert "not by a metal part with calibrated values" in facts["Verified by"]
     assert "200 virtual measurements" in facts["Method"] and "seed 7" in facts["Made with"]
     row = declaration.rows[0]
     # U = (0.47 + 0.52) / 2 and k = U / 0.25
@@ -119,6 +141,18 @@ def test_the_sheet_of_a_comparison_has_the_statement_of_the_best_sensor(tmp_path
     assert [row.result.verdict for row in declaration.rows] == ["fits"] * 3
     (figure,) = sheet_figures(declaration, read_scene_geometry(folder))
     assert [text for text, box in boxes_of(figure) if box.x0 < 0.5 * figure.dpi] == []
+
+
+def test_a_statement_far_below_the_maker_says_so_on_sheet_and_page_of_a_comparison(tmp_path):
+    folder = write_choice(tmp_path / "choice")
+    path = folder / "sensor-a-of-a-long-name" / "statement.json"
+    statement = json.loads(path.read_text(encoding="utf-8"))
+    for one in statement["measurements"].values():
+        one["maker_sigma"] = 100.0
+    path.write_text(json.dumps(statement), encoding="utf-8")
+    notes = read_declaration(folder, None).notes
+    assert "below a tenth of the accuracy that the maker" in notes[-1] and "the influences listed below" in notes[-1]
+    assert "below a tenth of the accuracy that the maker" in write_choice_page(folder).read_text(encoding="utf-8")
 
 
 def test_a_pose_in_full_gives_the_pose_back(run_folder):

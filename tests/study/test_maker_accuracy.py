@@ -35,7 +35,7 @@ def test_one_figure_holds_for_every_measurement_in_mm() -> None:
 
 def test_a_sentence_names_what_is_below_a_tenth_and_what_is_left_out() -> None:
     rows = [("radius", 0.0024, 0.05), ("distance", 0.006, 0.05), ("angle", 0.001, None), ("lost", None, 0.05)]
-    [sentence] = below_the_maker(rows, ["form of the part", "vibration"], "photoneo-phoxi-s")
+    [sentence] = below_the_maker(rows, "form of the part; vibration", "photoneo-phoxi-s")
     assert sentence.startswith("radius (0.0024 of 0.050 mm) is stated below a tenth")
     assert "form of the part; vibration" in sentence and "distance" not in sentence and "lost" not in sentence
-    assert not below_the_maker(rows[1:], [], "photoneo-phoxi-s")
+    assert not below_the_maker(rows[1:], "", "photoneo-phoxi-s")

@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.image import imread
 
 from characterisation.files.errors import InputError
-from mitsim.report.scene_preview import preview_figure
+from mitsim.report.scene_preview import preview_figure, without_leaks
 from mitsim.report.scene_table import as_data, as_text
 from mitsim.report.style import write_png
 from mitsim.scene.authoring.check import findings
@@ -395,3 +395,29 @@ def test_a_bad_task_is_told(tmp_path, text, says):
     (tmp_path / "task.toml").write_text(text)
     with pytest.raises(InputError, match=says):
         read_features(tmp_path / "task.toml")
+
+
+def test_a_leaked_ray_takes_the_colour_of_its_neighbours_and_edges_stay():
+    shape = np.zeros((6, 8), np.int16)
+    shape[:, 5:] = 1
+    front = np.ones(shape.shape, bool)
+    shape[2, 2], front[4, 6] = -1, False  # through a crack: nothing, or the back of another face
+    source = without_leaks(shape, front)
+    healed = shape.reshape(-1)[source]
+    assert (healed == np.where(np.arange(8) >= 5, 1, 0)).all() and front.reshape(-1)[source].all()
+    shape[1:4, 1:4] = 2  # a small face stays
+    assert (shape.reshape(-1)[without_leaks(shape, np.ones(shape.shape, bool))] == shape).all()
+
+
+def test_the_pose_of_a_run_is_that_of_the_picture(tmp_path):
+    (tmp_path / "scene.xml").write_text(
+        f'<scene version="3.0.0"><shape type="sphere" id="s">{BALL}{METAL}</shape></scene>', encoding="utf-8"
+    )
+    wanted = np.diag([1.0, -1.0, -1.0, 1.0])
+    wanted[:3, 3] = [5.0, -10.0, 500.0]
+    (tmp_path / "statement.json").write_text(json.dumps({"world_from_sensor": wanted.tolist()}), encoding="utf-8")
+    asked = ["check", tmp_path / "scene.xml", "--pose", tmp_path / "statement.json", "--json"]
+    said = mitsim_here(*asked)
+    assert json.loads(said.stdout)["world_from_sensor"] == wanted.tolist() and "no position" not in said.stderr
+    both = mitsim_here(*asked, "--position", "0", "0", "500", code=2)
+    assert both.stderr.startswith("mitsim: --pose: found --position too")

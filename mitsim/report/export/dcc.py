@@ -48,11 +48,13 @@ class Issuer:
     serial: str
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not value.strip() or not value.isprintable():  # XML has no control characters
-                hint = "a digital calibration certificate names its issuer"
-                raise InputError(f"--{field.name}", "", repr(value), "a line of text", hint)
+        hint = "a digital calibration certificate names its issuer"
+        values = {f"--{field.name}": getattr(self, field.name) for field in fields(self)}
+        if missing := [name for name, value in values.items() if not value.strip()]:
+            raise InputError(", ".join(missing), "", "nothing", "a line of text for each", hint)
+        for name, value in values.items():
+            if not value.isprintable():  # XML has no control characters
+                raise InputError(name, "", repr(value), "a line of text", hint)
         if not (len(self.country) == 2 and self.country.isascii() and self.country.isupper()):
             raise InputError("--country", "", repr(self.country), "two capital letters after ISO 3166-1: GB")
 

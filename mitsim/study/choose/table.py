@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from characterisation.files.atomic_io import json_values
-from characterisation.statements.decision import WORDS, decide, needed, tolerance_of
+from characterisation.statements.decision import WORDS, Verdict, decide, mostly_lost, needed, tolerance_of
 from characterisation.statements.statement import Statement
 from characterisation.statements.verdict_words import result_in_words
 from mitsim.running.text_table import aligned
@@ -152,7 +152,7 @@ def as_text(choice: ChoiceDocument) -> str:
     for one in choice.sensors:
         if one.status == "excluded":
             continue
-        toleranced = sum(choice.measurements[name].tolerance is not None for name in names)
+        toleranced = choice.toleranced
         rows.append(
             (
                 one.name + ("" if one.status == "stated" else " *"),
@@ -163,11 +163,12 @@ def as_text(choice: ChoiceDocument) -> str:
             )
         )
     legend = (
-        "cells: standard uncertainty, view, verdict; worst: demand of the decision rule, at most 1 if everything fits"
+        "cells: standard uncertainty, view, verdict; worst: demand of the decision rule, at most 1 if everything fits\n"
+        "order: sensors with virtual measurements, then the most possible measurements, then the smallest worst"
     )
-    lines = [*aligned(rows), "", legend]
+    lines = [*aligned(rows), "", legend, *choice.fit_more]
     if any(one.status == "screened" for one in choice.sensors):
-        least = "" if any(one.tolerance is not None for one in choice.measurements.values()) else " times the best"
+        least = "" if choice.toleranced else " times the best"
         reasons = f"fewer measurements are possible there, its demand there is above {LARGEST_DEMAND:g}{least}"
         lines.append(f"* by screening alone, (n of m) expected to fit: {reasons}, or time was over")
     lines += [
@@ -233,8 +234,9 @@ def _impossible(one: SensorResult, m: int, name: str) -> CellEntry:
     lost = sum(each.trials * each.without_value for each in statements) / trials
     toleranced = tolerance_of(one.candidate.study.task, name) is not None
     reasons = [loss for each in statements for loss in each.losses]
+    lost_verdict: Verdict = "undecidable" if mostly_lost(trials) else "not decided"
     return CellEntry(
-        verdict="undecidable" if toleranced else "no tolerance",
+        verdict=lost_verdict if toleranced else "no tolerance",
         trials=trials,
         without_value=min(lost, 1.0),
         reason=max(reasons, key=lambda loss: loss.count).reason if reasons else "",

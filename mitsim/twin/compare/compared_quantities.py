@@ -94,18 +94,19 @@ def _correlation_length(patches: SpecimenPatches, picked: Picked) -> Floats:
     return lengths
 
 
-_NOISE_FACTOR, _SHARE_MARGIN = 1.15, 0.02
+#: acceptable ratio of noise, contrast and lengths; acceptable difference of shares
+NOISE_FACTOR, _SHARE_MARGIN = 1.15, 0.02
 
 QUANTITIES = (
     Quantity("median grey level", "DN", "image", _level, factor=1.05, needs_pattern=False),
-    Quantity("finest detail", "DN", "image", _median("finest"), factor=_NOISE_FACTOR, needs_pattern=False),
-    Quantity("contrast", "1", "image", _median("contrast"), factor=_NOISE_FACTOR),
-    Quantity("run length", "px", "image", _run, factor=_NOISE_FACTOR),
+    Quantity("finest detail", "DN", "image", _median("finest"), factor=NOISE_FACTOR, needs_pattern=False),
+    Quantity("contrast", "1", "image", _median("contrast"), factor=NOISE_FACTOR),
+    Quantity("run length", "px", "image", _run, factor=NOISE_FACTOR),
     Quantity("F", "1", "cloud", _share(Status.VALID), margin=_SHARE_MARGIN),
-    Quantity("sigma, median", "mm", "cloud", _median("sigma"), factor=_NOISE_FACTOR),
+    Quantity("sigma, median", "mm", "cloud", _median("sigma"), factor=NOISE_FACTOR),
     Quantity("sigma, interquartile range", "mm", "cloud", _spread, factor=1.5),
-    Quantity("sigma in disparity", "px", "cloud", _median("sigma_px"), factor=_NOISE_FACTOR),
-    Quantity("correlation length", "px", "cloud", _correlation_length, factor=_NOISE_FACTOR),
+    Quantity("sigma in disparity", "px", "cloud", _median("sigma_px"), factor=NOISE_FACTOR),
+    Quantity("correlation length", "px", "cloud", _correlation_length, factor=NOISE_FACTOR),
     Quantity("distance", "mm", "cloud", _median("distance"), factor=1.002),
     Quantity("vertical error", "px", "cloud", _median("row_error"), margin=0.05),
     *(

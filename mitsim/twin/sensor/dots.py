@@ -54,6 +54,8 @@ class DotsFit:
     - ``patches``: number of patches seen.
     - ``uneven``: standard deviation of the field's terms that no parameter explains [1].
     - ``undetermined``: parameters that the capture does not determine; they keep the sensor's own values.
+    - ``misfit``: root mean square over the patches of log(recorded / simulated), smooth over the field, of the feature
+      ``worst``, which differs most.
     """
 
     sensor: Sensor
@@ -62,6 +64,8 @@ class DotsFit:
     patches: int
     uneven: float
     undetermined: tuple[Parameter, ...] = ()
+    worst: str = ""
+    misfit: float = 0.0
 
     def with_values(self, theta: Floats) -> Sensor:
         """Return the sensor with the varied numbers (k,) inserted."""
@@ -204,7 +208,27 @@ def fit_dots(
         settled = True
     if _misses(found):
         found = replace(found, covariance=found.covariance * found.chi_square / max(found.freedom, 1))
-    return DotsFit(sensor, tuple(own), found, len(field.corners), uneven, tuple(undetermined))
+    misfits = field_misfits(names, found.off, field.basis)
+    worst = max(misfits, key=lambda figure: misfits[figure])
+    return DotsFit(sensor, tuple(own), found, len(field.corners), uneven, tuple(undetermined), worst, misfits[worst])
+
+
+def field_misfits(names: Sequence[tuple[str, str]], off: Floats, basis: Floats) -> dict[str, float]:
+    """Return the root mean square over the patches of each feature's difference.
+
+    Parameters
+    ----------
+    names
+        Feature and term of each coefficient.
+    off
+        Differences (n,) of the coefficients, of logarithms.
+    basis
+        The terms at the patches (P, 6).
+    """
+    over_field = dict[str, Floats]()
+    for (figure, term), value in zip(names, off, strict=True):
+        over_field[figure] = over_field.get(figure, np.zeros(len(basis))) + value * basis[:, TERMS.index(term)]
+    return {figure: float(np.sqrt(np.mean(values**2))) for figure, values in over_field.items()}
 
 
 def _misses(found: MomentFit) -> bool:

@@ -34,13 +34,17 @@ DETERMINED_SHARE = 0.35
 
 @dataclass(frozen=True)
 class MomentFit:
-    """Parameters (k,), their ``covariance`` (k, k) and whether they are ``determined``; chi-square, freedom."""
+    """Parameters (k,), their ``covariance`` (k, k) and whether they are ``determined``; chi-square, freedom.
+
+    ``off`` (n,) are the features of the recording less those of the simulation.
+    """
 
     values: Floats
     covariance: Floats
     determined: NDArray[np.bool_]
     chi_square: float
     freedom: int
+    off: Floats
 
 
 @dataclass(frozen=True)
@@ -119,9 +123,8 @@ def match_moments(
     total = np.linalg.inv(jacobian.T @ weight @ jacobian + inverse_prior)
     off = real - seen
     determined = np.sqrt(np.diag(total)) < DETERMINED_SHARE * prior.spread
-    return MomentFit(
-        theta, np.asarray(total, float), determined, float(off @ weight @ off), len(real) - int(determined.sum())
-    )
+    freedom = len(real) - int(determined.sum())
+    return MomentFit(theta, np.asarray(total, float), determined, float(off @ weight @ off), freedom, off)
 
 
 def _bounded_step(normal: Floats, pull: Floats, theta: Floats, prior: Prior) -> Floats:

@@ -134,8 +134,10 @@ def fit_sensor(
         for key, pair in turns.items():
             turned.append(FittedKey(f"misalignment.{key}", *pair, "mrad", (source.name,), method))
     estimates += pooled(turned)
-    fits = {name: found.moment_fit for name, found in dots.items()}
-    agreements = tuple(Agreement(name, fit.chi_square, fit.freedom) for name, fit in fits.items())
+    agreements = tuple(
+        Agreement(name, found.moment_fit.chi_square, found.moment_fit.freedom, found.misfit, found.worst)
+        for name, found in dots.items()
+    )
     return SensorFit(base, tuple(input_captures), tuple(estimates), tuple(undetermined), agreements)
 
 

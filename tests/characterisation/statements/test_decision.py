@@ -18,6 +18,8 @@ from characterisation.statements.decision import (
     plus_minus,
     tolerance_of,
 )
+from characterisation.statements.statement import statement
+from characterisation.statements.verdict_words import Judged, result_in_words
 from characterisation.tasks.decision_table import Decision
 from characterisation.tasks.task_file import Task
 
@@ -142,6 +144,16 @@ def test_what_is_needed_does_not_depend_on_the_number_of_trials(rule):
 def test_a_single_value_leaves_a_measurement_not_decided_and_none_undecidable():
     assert decide(np.array([0.001]), plus_minus(20.0, 0.15)).verdict == "not decided"
     assert decide(np.array([]), plus_minus(20.0, 0.15)).verdict == "undecidable"
+
+
+def test_a_few_trials_without_a_value_do_not_show_that_there_is_none():
+    """Of a share of one half, four in a row are lost in 6 % of the cases, five in 3 %."""
+    for trials, verdict in ((1, "not decided"), (4, "not decided"), (5, "undecidable"), (40, "undecidable")):
+        stated = statement("radius", "mm", np.full(trials, np.nan), plus_minus(20.0, 0.15))
+        assert stated.verdict == verdict
+        words = result_in_words([Judged("radius", "mm", verdict, np.nan, np.nan, without_value=1.0)])
+        assert ("no value in the few virtual measurements" in words) == (verdict == "not decided")
+        assert "a single virtual measurement" not in words
 
 
 def test_where_the_uncertainty_is_as_large_as_the_tolerance_nothing_is_accepted():

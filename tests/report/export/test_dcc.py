@@ -175,7 +175,7 @@ def test_the_command_asks_who_issues_and_writes_nothing(tmp_path):
     folder = with_names_of_tasks(write_expecting_run(tmp_path / "run"))
     (tmp_path / "task.toml").write_text(TASK)
     asked = ["results", folder, "--task", tmp_path / "task.toml", "-o", tmp_path / "out.xml"]
-    with pytest.raises(InputError, match="--laboratory"):
+    with pytest.raises(InputError, match="--laboratory, --country, --responsible, --customer, --serial"):
         export(*asked)
     assert not (tmp_path / "out.xml").exists()
     export(*asked, "--laboratory", "L", "--country", "GB", "--responsible", "P", "--customer", "C", "--serial", "1")

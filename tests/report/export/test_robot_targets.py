@@ -120,6 +120,7 @@ def test_targets_of_a_run_are_its_set_of_views(tmp_path):
         assert [one.name for one in read_targets(folder)[0]] == [f"view_{number:04d}" for number in (view, *others)]
     said = export("targets", folder, "--robot", "ur", "--views", "11,3", "-o", tmp_path / "views.script")
     assert "2 poses of the sensor" in said and "flange_from_sensor" in said
+    assert "1 pose of" in export("targets", folder, "--robot", "ur", "--views", "3", "-o", tmp_path / "view.script")
     document["flange_from_sensor"] = np.eye(4).tolist()
     for one in document["views"]:
         one["part_from_flange"] = POSE.matrix().tolist()

@@ -143,8 +143,15 @@ def test_a_bracket_from_step_to_a_study_without_an_editor(served, folder, browse
     page.measure("perpendicularity", "0.2")
     page.choose("seat_18mm", "boss_20mm")
     page.pick("#author-finish", "+")
-    page.type("[aria-label^='Ra of finish_2']", "7")
-    assert "contains this finish for Ra" in browser.tell("document.getElementById('author-finishes').textContent")
+    for Ra, remark in (
+        ("7", "▲ ground metal usually has Ra"),
+        ("1.2", "● the map of ensenso-n10 has aluminium/ground of Ra"),
+    ):
+        page.type("[aria-label^='Ra of finish_2']", Ra)
+        assert remark in browser.tell("document.getElementById('author-finishes').textContent")
+    assert "its nearest finish ranks the views" in browser.tell(
+        "document.getElementById('author-finishes').textContent"
+    )
     page.type("[aria-label^='Ra of finish_2']", "0.2")
     browser.tell("document.getElementById('author-done').click()")
     browser.until("document.getElementById('author-status').textContent.startsWith('Done')", 90)

@@ -232,6 +232,27 @@ def test_a_sensor_with_a_tolerance_that_is_not_decided_does_not_fit_all(candidat
     assert sentence([sensors[0], open_one]) == f"{sensors[0].name}: fits 3 of 3 tolerances"
 
 
+def test_a_later_sensor_that_fits_more_is_named_with_the_reason(candidates, tmp_path):
+    """The first fits one tolerance of three and is twice its limit at worst; the second fits two, but not the third."""
+    one, other = (with_tolerances(each, 1.0) for each in candidates)
+    choice = documented(
+        [measured(one, (0.01, 0.01, 2.0), tolerance=1.0), measured(other, (0.01, 0.4, 0.4), tolerance=1.0)]
+    )
+    assert [(each.name, each.fits) for each in choice.sensors] == [(other.name, 1), (one.name, 2)]
+    (words,) = choice.fit_more
+    assert words.startswith(f"{one.name} fits 2 of 3 tolerances, {other.name} 1. {other.name} leads, since its worst ")
+    assert f"at {choice.sensors[0].ratio:.2g} times" in words and words.endswith(f"{choice.sensors[1].ratio:.2g} times")
+    assert words in as_text(choice) and of_choice(choice, None).doubts == (words,)
+    (tmp_path / "choice.json").write_text(choice.model_dump_json())
+    page = write_choice_page(tmp_path).read_text()
+    assert "Order: sensors with virtual measurements first" in page and f"{one.name} fits 2 of 3 tolerances" in page
+    fewer = documented(
+        [measured(one, (INF, 0.01, 0.01), tolerance=1.0), measured(other, (2.0, 2.0, 2.0), tolerance=1.0)]
+    )
+    assert fewer.fit_more[0].endswith(f"{other.name} leads, since it can make more measurements")
+    assert documented([measured(each, (0.01, 0.01, 0.01), tolerance=1.0) for each in (one, other)]).fit_more == []
+
+
 def test_views_are_raced_for_the_measurements_that_are_possible():
     cost = np.array([[INF, INF, INF], [3.0, 1.0, 1.4], [1.0, 3.0, 1.4]])
     together = combined_cost(np.log(cost), np.full(3, np.nan))

@@ -8,7 +8,7 @@ import pytest
 from characterisation.files.errors import InputError
 from mitsim.twin.finish.place import known_place
 from mitsim.twin.sensor import specimen_simulator
-from mitsim.twin.sensor.dots import DotDraws, fit_dots
+from mitsim.twin.sensor.dots import DotDraws, field_misfits, fit_dots
 from mitsim.twin.sensor.parameters import FLUX
 from tests.twin.sensor.small_unit import capture_of, place, small_sensor, standard_errors, unit
 
@@ -25,6 +25,16 @@ def test_intervals_of_dots_hold_the_truth_as_often_as_they_say(monkeypatch):
     assert len(errors) >= 30
     assert np.mean(errors**2) < 1 + 3 * np.sqrt(2 / 15)
     assert np.mean(np.abs(errors) < 1.96) >= 0.8
+
+
+def test_the_misfit_of_a_feature_is_its_root_mean_square_over_the_patches():
+    x = np.linspace(-1, 1, 5001)
+    basis = np.stack([np.ones_like(x), x, 0 * x, x**2 - np.mean(x**2), 0 * x, 0 * x], axis=1)
+    names = [("level", "1"), ("level", "x"), ("contrast", "xx"), ("grain", "1")]
+    found = field_misfits(names, np.array([0.3, -0.4, 0.5, -0.1]), basis)
+    # x has the variance 1 / 3, its square 1 / 5 - 1 / 9
+    wanted = {"level": (0.09 + 0.16 / 3) ** 0.5, "contrast": 0.5 * (1 / 5 - 1 / 9) ** 0.5, "grain": 0.1}
+    assert found == pytest.approx(wanted, rel=1e-3)
 
 
 def test_what_an_image_shows_is_found_whatever_the_file_says():

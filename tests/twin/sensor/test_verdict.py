@@ -21,21 +21,25 @@ ENTRIES = {
 
 
 @pytest.mark.parametrize(
-    ("chi_square", "freedom", "word"),
+    ("chi_square", "freedom", "misfit", "word"),
     [
-        (14.0, 14, "good"),
-        (chi2.isf(0.011, 14), 14, "good"),
-        (chi2.isf(0.009, 14), 14, "fair"),
-        (43.0, 14, "bad"),
-        (83.7, 14, "bad"),
+        (14.0, 14, 0.3, "good"),
+        (chi2.isf(0.011, 14), 14, 0.3, "good"),
+        (chi2.isf(0.009, 14), 14, 0.3, "fair"),
+        (43.0, 14, 0.3, "bad"),
+        (83.7, 14, 0.3, "bad"),
+        (83.7, 14, 0.1, "fair"),  # within the margin of mitsim compare, which says agrees
     ],
 )
-def test_the_verdict_follows_from_chance_and_ratio(chi_square, freedom, word):
-    assert verdict_of((Agreement("sheet", chi_square, freedom),)).word == word
+def test_the_verdict_follows_from_chance_and_ratio_or_the_margin_of_compare(chi_square, freedom, misfit, word):
+    found = verdict_of((Agreement("sheet", chi_square, freedom, misfit, "sharpness"),))
+    assert found.word == word
+    assert ("sharpness by " in found.why) == (word != "good")
 
 
 def test_the_worst_capture_decides_and_is_named():
-    found = verdict_of((Agreement("a", 10, 14), Agreement("b", 83.7, 14), Agreement("c", 40, 14)))
+    rows = {"a": 10, "b": 83.7, "c": 40}
+    found = verdict_of(tuple(Agreement(name, square, 14, 0.3, "level") for name, square in rows.items()))
     assert found.word == "bad"
     assert "chi-square 83.7 of 14 for b" in found.why
     assert verdict_of(()).word == "not tested"
