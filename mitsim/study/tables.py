@@ -82,8 +82,9 @@ class StatementTable(Document):
     """How the uncertainty of the chosen view is stated.
 
     ``trials`` are made with draws that no race uses. A study that names no number goes on after the default, up to five
-    times as many, until every standard uncertainty has at most the relative standard error ``known_to``. Within a time
-    limit, ``known_to`` is not used.
+    times as many, until every standard uncertainty has at most the relative standard error ``known_to``, but on bare
+    metal not before errors with tails as long as those of metal could have it. Within a time limit, ``known_to`` is not
+    used.
     """
 
     trials: int = Field(default=200, ge=2, le=1_000_000)

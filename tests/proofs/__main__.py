@@ -293,13 +293,16 @@ def seeds(
 ) -> None:
     """Compare the statements of one view of a study with different seeds.
 
-    Continues an interrupted run in the same folder. Prints u of every measurement by seed.
+    Continues an interrupted run in the same folder. Prints u of every measurement by seed, and the
+    kurtosis of its errors.
 
     Example: python -m tests.proofs seeds scenes/two_pillars/study.toml --view 99 -o runs/seeds
     """
     start(variant)
+    import numpy as np
+
     from mitsim.study import open_study
-    from tests.proofs.seeds import seeds_table, statements_of_seeds
+    from tests.proofs.seeds import seeds_table, statements_of_seeds, tails
 
     workers = requested_workers(None, processes)
     opened = open_study(study, mapped=False)
@@ -307,6 +310,8 @@ def seeds(
     check_folder(output)
     stated = statements_of_seeds(opened, stated_view, range(1, seeds + 1), trials, output, workers)
     print(seeds_table(stated), end="")
+    least, middle, most = np.quantile(tails(opened, stated_view, range(1, seeds + 1), output), [0, 0.5, 1])
+    print(f"kurtosis less 1 of the errors of all seeds: {least:.1f} to {most:.1f}, median {middle:.1f}")
 
 
 def finishes(

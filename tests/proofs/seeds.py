@@ -18,6 +18,7 @@ from characterisation.statements.statement import Statement
 from mitsim.running.executor import Executor
 from mitsim.study import StatementTable, Study
 from mitsim.study.session import Session
+from mitsim.study.virtual.world import SET_DAYS, STATEMENT_DAYS
 from mitsim.views import View
 from tests.proofs.tables import markdown, number
 
@@ -38,6 +39,19 @@ def statements_of_seeds(
         session = Session(one, folder / f"seed_{seed}", workers)
         out[seed] = session.state(view, None if trials is None else StatementTable(trials=trials)).statements
     return out
+
+
+def tails(study: Study, view: View, seeds: Sequence[int], folder: Path) -> list[float]:
+    """Return kurtosis less 1 of the errors of each measurement, over the statement's trials of all seeds."""
+    parts = []
+    for seed in seeds:
+        one = replace(study, file=study.file.model_copy(update={"seed": seed}))
+        trials = Session(one, folder / f"seed_{seed}").trials
+        made = [trial for trial in trials.known(view.number) if STATEMENT_DAYS <= trial.day < SET_DAYS]
+        parts.append(trials.errors(view.number, made))
+    apart = np.hstack(parts)
+    apart = apart - np.nanmean(apart, axis=1, keepdims=True)
+    return list(np.nanmean(apart**4, axis=1) / np.nanmean(apart**2, axis=1) ** 2 - 1)
 
 
 def spread(values: Sequence[float]) -> float:

@@ -146,17 +146,32 @@ class NormalErrors:
             yield job, Outcome({name: float(rng.normal(0.0, 1.9 * tail)) for name in self.names})
 
 
+def stated_with(runner, study, folder, monkeypatch):
+    monkeypatch.setattr(Session, "trials_of", lambda session, _: TrialsOfView(runner, session.trials, None))
+    monkeypatch.setattr(state, "_settled", lambda _: False)
+    return Session(study, folder).state(study.views[4]).statements
+
+
 @pytest.mark.parametrize("long_tail", [False, True])
 def test_a_statement_goes_on_until_its_uncertainties_are_known(study, tmp_path, monkeypatch, long_tail):
     """Trials beyond the default are made where tails are long, and no more than the standard error needs."""
-    runner = NormalErrors(study.task.measurements, long_tail)
-    monkeypatch.setattr(Session, "trials_of", lambda session, _: TrialsOfView(runner, session.trials, None))
-    monkeypatch.setattr(state, "_settled", lambda _: False)
-    stated = Session(study, tmp_path).state(study.views[4]).statements
+    monkeypatch.setattr(state, "least_trials", lambda *_: 2)
+    stated = stated_with(NormalErrors(study.task.measurements, long_tail), study, tmp_path, monkeypatch)
     known_to = max(one.moved[1] / one.standard_uncertainty for one in stated)
     default = StatementTable()
     assert stated[0].trials > default.trials if long_tail else stated[0].trials == default.trials
     assert known_to <= default.known_to or stated[0].trials == MOST
+
+
+@pytest.mark.parametrize("sprayed", [False, True])
+def test_few_errors_of_bare_metal_are_not_believed_to_be_normal(study, tmp_path, monkeypatch, sprayed):
+    """A relative standard error of a tenth takes 50 normal errors, and 700 of the kurtosis of errors of metal."""
+    metal = {"scene": "two_pillars.xml", "sprayed": sprayed}
+    bare = open_study(SCENES / "study.toml", study.file.model_copy(update=metal))
+    runner = NormalErrors(study.task.measurements, long_tail=False)
+    stated = stated_with(runner, bare, tmp_path, monkeypatch)
+    assert stated[0].trials == (StatementTable().trials if sprayed else 720)
+    assert state.least_trials(bare, 0.1) == (50 if sprayed else 700)
 
 
 def test_a_run_within_a_limit_says_what_it_lacks_and_goes_on_without_one(study, tmp_path):
