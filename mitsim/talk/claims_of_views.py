@@ -69,9 +69,8 @@ def scoring(talk: Talk, judged: Judged) -> Slide:
     slide.claims.append(
         Claim(
             "Sub divide icosahedron to sample a sphere. Ensure reachability by the tilt table.",
-            f"The three-axis table reaches {reached} of {reached + outside} directions.{others} {moved} views were "
-            f"moved away to keep the sensor clear of the part. {feature} has {points.min():.0f} to {points.max():.0f} "
-            "points.",
+            f"The three-axis table reaches {reached} of {reached + outside} directions.{others} {moved} views moved "
+            f"away to keep clear of the part. {feature} has {points.min():.0f} to {points.max():.0f} points.",
             f"{reached} of {reached + outside} directions",
             "shown",
         )
@@ -149,8 +148,8 @@ _WORDS = {
 
 #: why errors alone say little where many trials have no value
 _SURVIVORS = (
-    "A fit that its points do not determine is rejected, so a poor view shows the errors of its best trials alone; the "
-    "score predicts which views give a value."
+    "Fits that their points do not determine are rejected, so a poor view shows its best trials alone; the score "
+    "predicts which views give a value."
 )
 
 
@@ -171,11 +170,10 @@ def _example(judged: Judged, one: ExampleEntry) -> Claim:
     ends = "" if math.isnan(ratio) else f" ({two_digits(values[known[0]])} to {two_digits(values[known[-1]])} {unit})"
     found = (
         f"{one.measurement}, {one.sample}: {possible} of {int(views.sum())} views are possible by V_m; {measurable} "
-        f"have a value in at least half of the trials. Trials with a value: {_percent(share[0])} where V_m says "
-        f"impossible, {_percent(_mean_share(cell))} elsewhere. Rank correlation of bins with error "
-        f"{_signed(correlations[0])}, with standard deviation {_signed(correlations[1])}, with missing values "
-        f"{_signed(correlations[2])}. Error of the worst over the best bin: {_ratio(ratio)}{ends}. "
-        f"The errors of the best three bins differ by the factor {_ratio(top)}."
+        f"have a value in half of the trials. Trials with a value: {_percent(share[0])} where V_m says impossible, "
+        f"{_percent(_mean_share(cell))} elsewhere. Rank correlation of bins with error {_signed(correlations[0])}, "
+        f"standard deviation {_signed(correlations[1])}, missing values {_signed(correlations[2])}. Error of the worst "
+        f"over the best bin: {_ratio(ratio)}{ends}; the best three bins differ by the factor {_ratio(top)}."
     )
     good = [correlation < _GOOD for correlation in correlations[:2] if not math.isnan(correlation)]
     predicts = correlations[2] < _GOOD
@@ -200,8 +198,7 @@ def _nothing_possible(judged: Judged, one: ExampleEntry, measurable: int, share:
         _WORDS.get(one.slide, one.measurement),
         f"{one.measurement}, {one.sample}: V_m calls all {views} views impossible. Some are expected to show up to "
         f"{most}, but none to show {MINIMUM_POINTS} of each. Of the trials {_percent(share)} have a value nonetheless, "
-        f"since they also render light from other faces. {measurable or 'No'} views have one in at least half of their "
-        "trials.",
+        f"by light from other faces. {measurable or 'No'} views have one in half of their trials.",
         f"0 of {views} views possible by V_m, {measurable} measurable in half of the trials",
         verdict(False, not measurable),
         "The prediction that this cannot be measured holds. Without possible views there is no correlation to test.",
@@ -249,15 +246,15 @@ def accuracy(judged: Judged) -> Slide:
     talks = [found["V_m"][quantity].attrs["correlation"] for quantity in ("error", "deviation")]
     good = max(talks) <= _VERY_GOOD
     trend = spearman(found["V_m"]["error"]["bin"].values, found["V_m"]["error"]["rank"].values)
-    why = f"{_SURVIVORS} The predicted risk also knows how the points constrain a fit."
+    why = "The predicted risk also knows how the points constrain a fit."
     slide.claims.append(
         Claim(
             "Comparison of our predicted bin rank based on the view score and actual bin ranking are very good.",
             f"Over {count} cells, {len(judged.task.measurements)} measurements of {len(judged.errors)} samples, the "
             "mean rank correlations of bins with error, with standard deviation and with missing values are "
             + "; ".join(f"{correlations(kind)} for {name}" for kind, name in SCORES.items())
-            + f". Of V_m with error, by sample: {'; '.join(_by_sample(judged))}. The mean ranks of the bins over all "
-            f"cells, as the talk shows them, have the rank correlation {_signed(trend)} with the bins.",
+            + f". Of V_m with error, by sample (share of trials with a value): {'; '.join(_by_sample(judged))}. The mean "
+            f"ranks over all cells, as the talk shows them, have the rank correlation {_signed(trend)} with the bins.",
             f"rank correlation {_signed(talks[0])} of a cell, {_signed(trend)} of the mean ranks",
             verdict(good, trend <= _VERY_GOOD),
             "" if good else why,
@@ -273,9 +270,7 @@ def accuracy(judged: Judged) -> Slide:
             "Especially good at predicting bad views.",
             f"The mean rank by error misses the predicted one by {_ratio(bad)} for the three worst bins, and by "
             f"{_ratio(best)} for the three best. Of the trials of views that V_m calls impossible "
-            f"{_percent(impossible)} have a value, of the others {_percent(possible)}. Mean ranks from the worst "
-            "bin to the best: "
-            f"{', '.join(_ratio(rank) for rank in found['V_m']['error']['rank'].values)}.",
+            f"{_percent(impossible)} have a value, of the others {_percent(possible)}.",
             f"ranks missed by {_ratio(bad)} for bad views, {_ratio(best)} for good ones",
             verdict(bad < best, impossible < possible / 2),
         )
@@ -291,5 +286,5 @@ def _by_sample(judged: Judged) -> list[str]:
         middle = mean_of([cell.attrs["error_correlation"] for cell in cells])
         tried = errors["error"].values[:, errors["tried"].values > 0]
         share = float(np.isfinite(tried).mean()) if tried.size else math.nan
-        out.append(f"{sample} {_signed(middle)} ({_percent(share)} of the trials have a value)")
+        out.append(f"{sample} {_signed(middle)} ({_percent(share)})")
     return out

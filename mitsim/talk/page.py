@@ -147,11 +147,10 @@ def _parts(slide: Slide, drawn: Sequence[_Picture]) -> list[tuple[_Picture | Non
 def _intro(talk: Talk, measured: dict[str, xr.Dataset]) -> list[str]:
     lines = [
         "Every figure of the talk “Task Specific Viewpoint Optimisation” (Kinnell and Justham, Hamburg 2018), made "
-        "again by simulation, beside the claim of its slide. Quotations are the talk’s own words.",
+        "again by simulation, beside the quoted claim of its slide.",
         f"{len(talk.views)} views of {talk.sensor.name} before the talk’s artefact are compared, in "
         f"{len(talk.file.samples)} finishes. The true error of a view is that of {talk.file.trials} virtual "
-        "measurements: calibration, unit, decoder, finish, light, temperature, pose and noise are drawn anew for each, "
-        "then the images are rendered, decoded and measured.",
+        "measurements with all unknowns drawn anew.",
     ]
     if measured:
         lines.append(f"The errors of {listed(sorted(measured))} are those of real captures.")
@@ -207,8 +206,8 @@ def _markdown(
                 lines += [f"> {html.escape(claim.words, quote=False)}", "", html.escape(found, quote=False), ""]
     lines += ["## Every claim with its figure", ""]
     lines += ["| slide | claim of the talk | figure | verdict |", "|---|---|---|---|"]
-    for slide in slides:
+    for number, slide in enumerate(slides, 1):
         for claim in slide.claims:
-            row = (slide.title, claim.words, claim.figure, claim.verdict)
+            row = (str(number), claim.words, claim.figure, claim.verdict)
             lines.append(f"| {' | '.join(html.escape(cell, quote=False).replace('|', '&#124;') for cell in row)} |")
     return "\n".join(lines).rstrip() + "\n"

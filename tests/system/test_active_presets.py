@@ -1,7 +1,7 @@
 """Presets of projected dots, closed loop: floors without noise, sigma with noise beside what is published.
 
 Matt white plates that are square to the axis, or tilted by 20 deg. The plates and their poses are known, so errors are
-along the view ray from the truth; a plane is fitted for sigma. Figures in docs/explanation/stereo.md.
+along the view ray from the truth; a plane is fitted for sigma. Figures of all presets: docs/reference/sensors.md.
 """
 
 from __future__ import annotations
