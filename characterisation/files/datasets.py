@@ -17,14 +17,16 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.files.checked_files import DIGEST, SEAL, dataset_digest, is_file, read_bounded
 from characterisation.files.errors import InputError
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 #: largest dataset that may be unpacked [bytes]
 LARGEST_DATASET = 1 << 30
@@ -89,6 +91,8 @@ def read_dataset(path: str | Path, schema: Schema) -> xr.Dataset:
         If the file is missing, too large, not a plain netCDF file, or changed since it was written; or if a variable
         violates the schema. The error names the file and the variable.
     """
+    import xarray as xr  # half a second, which commands without a dataset save
+
     path = Path(path)
     if not is_file(path):
         found = "something that is no file" if os.path.lexists(str(path)[:4096].replace("\0", "")) else "no such file"

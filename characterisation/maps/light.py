@@ -15,13 +15,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.files.datasets import Variable
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 #: two surfaces are optically equal if all numbers agree within this share. Assumed: a tenth of the uncertainty of the
 #: renderer's laws for a well-known finish

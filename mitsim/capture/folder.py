@@ -30,13 +30,15 @@ from characterisation.files.atomic_io import FULL, write_folder
 from characterisation.files.checked_files import content_checksum, is_inside, read_bounded
 from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
+from characterisation.files.threads import in_threads
 from mitsim.capture.calibration import CalibrationDocument, PoseDocument, rig_of
 from mitsim.capture.capture import DERIVED_UNITS, Capture
 from mitsim.capture.capture_document import SCHEMA_VERSION, CaptureDocument, FileEntry
 from mitsim.capture.decoding import read_settings
 from mitsim.capture.npy import decode_npy
 from mitsim.capture.packed_files import SAFE_NAME, check_image, packed
-from mitsim.sensor.png import decode_png
+from mitsim.sensor.camera import Camera
+from mitsim.sensor.png import Image, decode_png
 from mitsim.sensor.transforms import Transform
 
 #: largest allowed size of all files of a capture [bytes]
@@ -164,7 +166,7 @@ def read_capture(folder: str | Path) -> Capture:
     pose = validate(*only("pose"), PoseDocument)
     rig = rig_of(calibration)
     decoding, records = read_settings(*only("settings"), document.technology)
-    images: dict[str, list[NDArray[np.unsignedinteger[Any]]]] = {name: [] for name in rig.cameras}
+    frames: dict[str, list[int]] = {name: [] for name in rig.cameras}
     derived: dict[str, NDArray[np.float32]] = {}
     for number, entry in enumerate(document.files):
         if entry.role == "derived":
@@ -173,24 +175,22 @@ def read_capture(folder: str | Path) -> Capture:
             derived[entry.name] = _derived_map(data[entry.path], entry, f"files.{number}", where, folder / entry.path)
         if entry.role != "image":
             continue
-        if entry.camera not in images:
-            raise InputError(where, f"files.{number}.camera", entry.camera, f"one of {', '.join(images)}")
-        stack, camera = images[entry.camera], rig.cameras[entry.camera]
-        if entry.frame != len(stack):
-            raise InputError(where, f"files.{number}.frame", entry.frame, f"{len(stack)}: frames in order from 0")
-        image = decode_png(data[entry.path], folder / entry.path, (camera.height, camera.width))
-        if image.dtype != entry.dtype or image.shape != entry.shape:
-            raise InputError(
-                where, f"files.{number}", f"{entry.dtype} {entry.shape}", f"{image.dtype} {image.shape}, as in the file"
-            )
-        check_image(image, stack, document.bits, folder / entry.path)
-        stack.append(image)
+        if entry.camera not in frames:
+            raise InputError(where, f"files.{number}.camera", entry.camera, f"one of {', '.join(frames)}")
+        if entry.frame != len(frames[entry.camera]):
+            allowed = f"{len(frames[entry.camera])}: frames in order from 0"
+            raise InputError(where, f"files.{number}.frame", entry.frame, allowed)
+        frames[entry.camera].append(number)
+    images = {}
+    for name, numbers in frames.items():
+        if numbers:
+            images[name] = _read_stack(rig.cameras[name], numbers, document, data, folder)
     return Capture(
         sensor=document.sensor,
         technology=document.technology,
         source=document.source,
         rig=rig,
-        images={name: np.stack(stack) for name, stack in images.items() if stack},
+        images=images,
         bits=document.bits,
         decoding=decoding,
         settings=records,
@@ -219,6 +219,25 @@ def read_settings_and_pose(folder: str | Path) -> tuple[str, dict[str, Any], Tra
         raise InputError(where, "files", f"only {', '.join(read) or 'none'} of settings and pose", "both")
     pose = validate(folder / "pose.json", read["pose"], PoseDocument)
     return document.sensor, read["settings"], pose.transform()
+
+
+def _read_stack(
+    camera: Camera, numbers: list[int], document: CaptureDocument, data: Mapping[str, bytes], folder: Path
+) -> Image:
+    """Return the images (P, H, W) of a camera, from the bytes of the files that the index lists at ``numbers``."""
+
+    def read(number: int) -> Image:
+        entry = document.files[number]
+        image = decode_png(data[entry.path], folder / entry.path, (camera.height, camera.width))
+        if image.dtype != entry.dtype or image.shape != entry.shape:
+            found, allowed = f"{entry.dtype} {entry.shape}", f"{image.dtype} {image.shape}, as in the file"
+            raise InputError(folder / "capture.json", f"files.{number}", found, allowed)
+        return image
+
+    frames = in_threads(read, numbers)
+    for number, image in zip(numbers, frames, strict=True):
+        check_image(image, frames[:1], document.bits, folder / document.files[number].path)
+    return np.stack(frames)
 
 
 def _derived_map(data: bytes, entry: FileEntry, field: str, where: Path, file: Path) -> NDArray[np.float32]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.checked_files import LARGEST_FILE, read_bounded
 from characterisation.files.errors import InputError
-from mitsim.sensor.png import LONGEST_SIDE_PX, PNG_SIGNATURE, check_png, decode_png
+from mitsim.sensor.png import LONGEST_SIDE_PX, PNG_SIGNATURE, check_png, decode_png, is_grey_png
 
 #: suffixes of the image files that are read
 SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".pgm")
@@ -115,9 +115,10 @@ def decode_grey(data: bytes, where: str | Path, *, channel: int | None = None) -
 
 def _decoded(data: bytes, where: str | Path, channel: int | None) -> NDArray[Any]:
     """Return the numbers (H, W) of an image: its only channel, or the one that is asked for."""
-    is_png = data.startswith(PNG_SIGNATURE)
-    if is_png:
+    if data.startswith(PNG_SIGNATURE):
         check_png(data, where)  # OpenCV would decode the undamaged part of a damaged PNG
+        if is_grey_png(data):
+            return decode_png(data, where)
     image = None
     with suppress(cv2.error):  # reported below, as where OpenCV returns None
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
@@ -131,7 +132,7 @@ def _decoded(data: bytes, where: str | Path, channel: int | None) -> NDArray[Any
             hint = "convert it without changing its levels; for a colour camera, take one channel or the raw image"
             raise InputError(where, "colour", f"{image.shape[2]} channels that differ", "a grey image", hint)
         return np.ascontiguousarray(image[..., 0])
-    return decode_png(data, where) if is_png else image
+    return image
 
 
 def _checked(image: NDArray[Any], where: str | Path) -> Image:

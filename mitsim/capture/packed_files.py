@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from characterisation.files.checked_files import content_checksum
 from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
+from characterisation.files.threads import in_threads
 from mitsim.capture.calibration import CalibrationDocument, PoseDocument, calibration_table, pose_table
 from mitsim.capture.capture import DERIVED_UNITS, Capture
 from mitsim.capture.capture_document import FRAME, SCHEMA_VERSION, UNITS, CaptureDocument
@@ -81,10 +82,11 @@ def packed(
             raise InputError(
                 folder, f"images.{camera}", f"{stack.dtype} {stack.shape}", "1 to 1000 uint8 or uint16 images"
             )
-        for frame, image in enumerate(stack):
-            path = f"images/{camera}_{frame:03d}.png"
+        paths = [f"images/{camera}_{frame:03d}.png" for frame in range(len(stack))]
+        for path, image in zip(paths, stack, strict=True):
             check_image(image, [], capture.bits, folder / path)
-            files[path] = encode_png(image)
+        for frame, (path, image, data) in enumerate(zip(paths, stack, in_threads(encode_png, stack), strict=True)):
+            files[path] = data
             entries.append(
                 {"path": path, "role": "image", "camera": camera, "frame": frame}
                 | {"dtype": str(image.dtype), "shape": list(image.shape), "unit": "DN", "scale": 1.0, "invalid": None}

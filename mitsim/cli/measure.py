@@ -132,7 +132,6 @@ def clouds(
     from characterisation.tasks.windows import WindowPlan, measure_windows
     from mitsim.cli.measure_frame import read_frame
     from mitsim.cli.measure_request import read_request
-    from mitsim.cli.simulated_beside import RecordedTarget, beside_simulated, beside_table
     from mitsim.decoding.input_clouds import cloud_paths, read_cloud
     from mitsim.decoding.measured_document import beside_document, measured_document, result_tables, summary
     from mitsim.running.progress import say
@@ -166,11 +165,7 @@ def clouds(
     reference = None if against is None else read_cloud(against, sensor, reference=True)
     paths = cloud_paths(inputs)
     beside: tuple[list[Result], list[Result]] | None = None
-    targets = {
-        name: RecordedTarget(shape, window)
-        for name, (shape, window) in request.plan.features.items()
-        if shape != "cylinder"
-    }
+    targets = {name: one for name, one in request.plan.features.items() if one[0] != "cylinder"}
     if simulated is not None and not targets:
         raise InputError("--simulated", "", "no --plane and no --sphere", "a plane or a sphere to simulate")
 
@@ -190,7 +185,10 @@ def clouds(
             say(about_frame)
         found, drawn = request.measure(one, reference, to_frame)
         if simulated is not None and beside is None:
-            beside = beside_simulated(one.cloud, targets, simulated, figures, seed)
+            from mitsim.cli.simulated_beside import RecordedTarget, beside_simulated
+
+            recorded = {name: RecordedTarget(*target) for name, target in targets.items()}
+            beside = beside_simulated(one.cloud, recorded, simulated, figures, seed)
         if of_task is not None:
             found += of_task(one)
         if picture is not None:
@@ -212,6 +210,8 @@ def clouds(
     else:
         print(result_tables(paths, results, over))
         if beside is not None:
+            from mitsim.cli.simulated_beside import beside_table
+
             print(f"\n{paths[0]}, beside a simulation\n" + beside_table(*beside, simulated or ""))
         if any(result.origin == "fit" for found in results for result in found):
             left_out = "; ".join(NOT_INCLUDED)

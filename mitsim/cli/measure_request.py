@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -28,7 +29,6 @@ from characterisation.tasks.result import Result, failed
 from characterisation.tasks.windows import PairKind, Shape, WindowPlan, measure_windows, window_slices
 from mitsim.decoding.input_clouds import InputCloud
 from mitsim.decoding.plate import Plate, image_on_grid, measure_plate
-from mitsim.report.measured_figures import difference_figure, distance_figure
 from mitsim.running.progress import track_if_long
 
 if TYPE_CHECKING:
@@ -88,10 +88,10 @@ class Request:
                 results += measure_plate(name, plate, cloud, image)
         boxes = self._boxes()
         if reference is None:
-            return results, lambda: distance_figure(cloud, boxes)
+            return results, lambda: _figures().distance_figure(cloud, boxes)
         values = self._difference(given, reference)
         difference = distribution(values, int(cloud.valid[window_slices(self.window, cloud, "difference")].sum()))
-        return results + _difference_results(difference), lambda: difference_figure(
+        return results + _difference_results(difference), lambda: _figures().difference_figure(
             values, difference, boxes, self.window
         )
 
@@ -112,6 +112,13 @@ class Request:
         windows = {name: window for name, (_, window) in self.plan.features.items()}
         windows |= {name: plate.window for name, plate in self.plates.items()}
         return {name: one for name, one in windows.items() if one is not None}
+
+
+def _figures() -> ModuleType:
+    """Return the module that draws; Matplotlib takes longer to import than a window to measure."""
+    from mitsim.report import measured_figures
+
+    return measured_figures
 
 
 def read_request(

@@ -25,7 +25,7 @@ from mitsim.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from mitsim.report.author_page import Authored
+    from mitsim.scene.authoring.check import Authored
     from mitsim.scene.visible_surfaces import VisibleSurfaces
     from mitsim.sensor.sensor import Sensor
     from mitsim.sensor.transforms import Transform
@@ -126,8 +126,7 @@ def _inspected(
     scene: Path, sensor: Sensor, defined: dict[str, str], task: Path | None, stand: Transform | None, roll: float = 0.0
 ) -> tuple[Authored, VisibleSurfaces, Transform]:
     """Load a scene and look for mistakes; return also what the sensor sees, and its pose: the usual one if None."""
-    from mitsim.report.author_page import Authored
-    from mitsim.scene.authoring.check import findings
+    from mitsim.scene.authoring.check import Authored, findings
     from mitsim.scene.authoring.check_task import read_features
     from mitsim.scene.inspect import inspect
     from mitsim.scene.load import load_scene

@@ -22,6 +22,7 @@ import typer
 
 from characterisation.files.atomic_io import FULL
 from characterisation.files.errors import InputError, MissingEnvironmentError
+from characterisation.files.threads import keep_blas_to_one_thread
 from mitsim.cli import (
     acceptance,
     calibrations,
@@ -162,6 +163,7 @@ def run_application(app: typer.Typer) -> None:
 
     A bug ends with its traceback, and with an exit code that differs from that of a failed check.
     """
+    keep_blas_to_one_thread()
     _prepare_streams()
     _stop_as_by_hand()
     code = 0

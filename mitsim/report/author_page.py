@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -24,15 +24,13 @@ from characterisation.tasks.definitions import DEFINITIONS
 from mitsim.report.templates import joined_script, rendered, script_content
 from mitsim.report.view_clouds import box_around, packed, packed_normals, smoothly_shaded
 from mitsim.report.view_data import COLOURS, as_json
-from mitsim.scene.authoring.check_task import TaskFeatures
+from mitsim.scene.authoring.check import Authored
 from mitsim.scene.authoring.finding import SceneFinding
 from mitsim.scene.authoring.general_tolerances import ANGLES, LINEAR, ZONES
-from mitsim.scene.inspect import SceneFacts
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.triangles import triangles_by_shape
 from mitsim.scene.surface.metals import CONSTANTS
 from mitsim.scene.surface.processes import PROCESSES
-from mitsim.sensor.sensor import Sensor
 
 #: in the order in which they are joined to one script
 SCRIPTS = ("view_scene.js", "author_files.js", "author_geometry.js", "author_page.js")
@@ -42,18 +40,6 @@ MOST_TRIANGLES = 150_000
 
 #: largest number of faces on a page
 MOST_FACES = 2000
-
-
-@dataclass(frozen=True)
-class Authored:
-    """Content of the page: the scene with its facts and findings, and the path of its task (None without one)."""
-
-    scene: Scene
-    facts: SceneFacts
-    sensor: Sensor
-    found: Sequence[SceneFinding]
-    task_path: Path | None
-    task: TaskFeatures | None
 
 
 def author_page(about: Authored, served: str = "") -> str:

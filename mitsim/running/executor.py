@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Protocol, TypeVar
 
 from characterisation.files.errors import MissingEnvironmentError
-from characterisation.files.threads import usable_cores
+from characterisation.files.threads import keep_blas_to_one_thread, usable_cores
 from mitsim.running.progress import say, track
 
 Item = TypeVar("Item")
@@ -174,8 +174,8 @@ def _start_worker(threads: int, parent: int) -> None:
             ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
     if os.getppid() != parent:
         raise SystemExit(0)
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[name] = str(threads)
+    os.environ["OMP_NUM_THREADS"] = str(threads)
+    keep_blas_to_one_thread()
 
 
 def results_of(

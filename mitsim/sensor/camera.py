@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.threads import in_threads
 from mitsim.sensor.distortion_fold import before_fold, inverse_fold_radii
 from mitsim.sensor.transforms import Transform
 
@@ -80,16 +81,21 @@ class Camera:
         NaN where the pixel has no unique direction, since the distortion folds over before it.
         """
         flat = np.ascontiguousarray(pixels, np.float64).reshape(-1, 1, 2)
-        if flat.size == 0:  # OpenCV returns None for no points
-            return np.empty((*pixels.shape[:-1], 3))
-        if self.model == "fisheye":
-            ideal = cv2.fisheye.undistortPoints(flat, self.matrix, self.distortion.reshape(-1, 1), criteria=_EXACT)
-        else:
-            ideal = cv2.undistortPointsIter(flat, self.matrix, self.distortion, np.eye(3), np.eye(3), _EXACT)
-        ideal = self._unique(np.asarray(ideal.reshape(-1, 2), np.float64), flat[:, 0])
-        x, y = ideal.T
-        rays = np.stack([x, y, np.ones_like(x)], axis=-1) / np.sqrt(x * x + y * y + 1)[:, None]
-        return np.asarray(rays.reshape(*pixels.shape[:-1], 3))
+        rays = np.empty((len(flat), 3))
+
+        def find(part: slice) -> None:
+            if self.model == "fisheye":
+                distortion = self.distortion.reshape(-1, 1)
+                ideal = cv2.fisheye.undistortPoints(flat[part], self.matrix, distortion, criteria=_EXACT)
+            else:
+                ideal = cv2.undistortPointsIter(flat[part], self.matrix, self.distortion, np.eye(3), np.eye(3), _EXACT)
+            ideal = self._unique(np.asarray(ideal.reshape(-1, 2), np.float64), flat[part, 0])
+            x, y = ideal.T
+            length = np.sqrt(x * x + y * y + 1)
+            rays[part, 0], rays[part, 1], rays[part, 2] = x / length, y / length, 1 / length
+
+        in_threads(find, [slice(start, start + _TOGETHER) for start in range(0, len(flat), _TOGETHER)])
+        return rays.reshape(*pixels.shape[:-1], 3)
 
     def rays_to_fold(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return :meth:`rays` of pixels (..., 2), with the direction at the fold in place of NaN.
@@ -225,7 +231,9 @@ class Camera:
             u = x * radial * inverse + p1 * xy + p2 * xx + s1 * r2 + s2 * r4
             v = y * radial * inverse + p1 * yy + p2 * xy + s3 * r2 + s4 * r4
             (fx, _, cx), (_, fy, cy), _ = self.matrix
-            return np.stack([u * fx + cx, v * fy + cy], axis=1)
+            pixels = np.empty((len(local), 2))
+            pixels[:, 0], pixels[:, 1] = u * fx + cx, v * fy + cy
+            return pixels
 
     def binned(self, step: int) -> Camera:
         """Return the camera with pixels binned ``step`` x ``step``; incomplete bins at the edges are cut off."""

@@ -101,5 +101,10 @@ def check_png(data: bytes, where: str | Path) -> tuple[int, int]:
     return width, height
 
 
+def is_grey_png(data: bytes) -> bool:
+    """Return whether the header of a PNG, checked by :func:`check_png`, says grey without transparency."""
+    return data[25] == 0
+
+
 def _damaged(where: str | Path, how: str) -> InputError:
     return InputError(where, "", f"a damaged PNG ({how})", "a complete PNG: copy the file again")

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import numpy as np
 from pydantic import Field, model_validator
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from characterisation.files.documents import Document
 
@@ -50,4 +50,4 @@ class PublishedLengths(Document):
         """
         inside = self.distance_mm[0] <= distance_mm <= self.distance_mm[-1]
         error = float(np.interp(distance_mm, self.distance_mm, self.error)) if inside else float("nan")
-        return error / float(norm.ppf((1 + self.share) / 2))
+        return error / float(ndtri((1 + self.share) / 2))

@@ -2,6 +2,8 @@
 
 import json
 import re
+import subprocess
+import sys
 
 import pytest
 from typer.testing import CliRunner
@@ -75,6 +77,20 @@ def test_a_difference_with_its_picture(clouds):
     assert float(deviation[3]) == pytest.approx(0.1 * 2**0.5, rel=0.05)
     assert deviation[-1] == "8000/8000"
     assert (clouds / "difference.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_difference_without_a_picture_loads_no_slow_library(clouds):
+    """Matplotlib, xarray and SciPy's statistics take longer to import than a window to measure."""
+    arguments = [str(clouds / "0.ply"), "--against", str(clouds / "1.ply"), "--window", "20", "20", "100", "80"]
+    code = (
+        "import sys; from mitsim.cli.program import app; app(sys.argv[1:], standalone_mode=False);"
+        " print('loaded', *sys.modules)"
+    )
+    ran = [sys.executable, "-c", code, "measure", *arguments]
+    done = subprocess.run(ran, check=True, capture_output=True, text=True)
+    loaded = done.stdout.partition("\nloaded ")[2].split()
+    assert "characterisation.acceptance.cloud_difference" in loaded
+    assert not {"matplotlib", "xarray", "pandas", "scipy.stats", "mitsuba"} & set(loaded)
 
 
 def test_what_is_not_possible_ends_with_one(clouds, rng):

@@ -40,6 +40,16 @@ def test_the_import_loads_no_heavy_module(package):
     assert not loaded & set(HEAVY)
 
 
+@pytest.mark.parametrize(
+    "modules", ["mitsim.scene.authoring.check, mitsim.report.scene_table", "mitsim.decoding.checks.checked_cloud"]
+)
+def test_checking_a_scene_and_decoding_load_neither_figures_nor_tables(modules):
+    """They take longer to import than a small scene to check."""
+    loaded = set(run(f"import sys, {modules}; print(*sys.modules)").split())
+    assert set(modules.split(", ")) <= loaded
+    assert not {"matplotlib", "xarray", "pandas", "scipy.stats"} & loaded
+
+
 @PACKAGES
 def test_the_import_takes_under_a_fifth_of_a_second(package):
     code = f"import time; t = time.process_time(); import {package.__name__}; print(time.process_time() - t)"

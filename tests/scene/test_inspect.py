@@ -7,10 +7,10 @@ import pytest
 import trimesh
 
 from characterisation.files.errors import InputError
-from mitsim.report.author_page import Authored, page_data
+from mitsim.report.author_page import page_data
 from mitsim.report.scene_preview import preview_figure
 from mitsim.report.scene_table import as_data, as_text
-from mitsim.scene.authoring.check import findings
+from mitsim.scene.authoring.check import Authored, findings
 from mitsim.scene.first_hits import first_hits
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene

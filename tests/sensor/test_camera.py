@@ -32,6 +32,18 @@ def test_pixel_to_ray_to_pixel(distortion, model):
     assert np.allclose(np.linalg.norm(camera.rays(grid), axis=-1), 1)
 
 
+@pytest.mark.parametrize(("distortion", "model"), [(ENSENSO, "perspective"), (FISHEYE, "fisheye")])
+@pytest.mark.parametrize("threads", ["1", "3"])
+def test_the_ray_of_a_pixel_does_not_depend_on_the_others(distortion, model, threads, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", threads)
+    camera = Camera(K, distortion, 752, 480, model=model)
+    grid = camera.pixel_grid()
+    rays = camera.rays(grid)
+    for row in (0, 21, 22, 479):  # a part of 16384 pixels ends in row 21
+        assert camera.rays(grid[row]).tobytes() == rays[row].tobytes()
+    assert camera.rays(grid[:0]).shape == (0, 752, 3)
+
+
 @pytest.mark.parametrize(("distortion", "model"), [(FOURTEEN, "perspective"), (FISHEYE, "fisheye")])
 def test_many_points_are_projected_as_all_at_once(distortion, model):
     camera = Camera(K, distortion, 752, 480, Transform.from_degrees([3, -8, 1], [100, 2, 7]), model)

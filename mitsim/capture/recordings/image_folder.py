@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from characterisation.files.errors import InputError
+from characterisation.files.threads import in_threads
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_image import CHANNELS, SUFFIXES, Image, channel_name, is_colour, read_grey
@@ -145,8 +146,10 @@ def _stack(files: list[Path], camera: Camera, bits: int | None, channel: int) ->
     """Return the images (P, H, W) of one camera."""
     first = read_grey(files[0], channel=channel)
     out = np.empty((len(files), camera.height, camera.width), first.dtype)
-    for index, path in enumerate(files):
-        image = first if index == 0 else read_grey(path, channel=channel)
+
+    def read(index: int) -> None:
+        path = files[index]
+        image = read_grey(path, channel=channel) if index else first
         if image.shape != (camera.height, camera.width):
             found = f"{image.shape[1]} x {image.shape[0]} px"
             raise InputError(path, "size", found, f"{camera.width} x {camera.height} px, as the calibration says")
@@ -156,6 +159,8 @@ def _stack(files: list[Path], camera: Camera, bits: int | None, channel: int) ->
             hint = "set imager.bits to the camera's output; levels must begin at bit 0"
             raise InputError(path, "grey level", image.max(), f"0 to {2**bits - 1}, since imager.bits is {bits}", hint)
         out[index] = image
+
+    in_threads(read, range(len(files)))
     if bits is not None and bits > 8 * first.itemsize:
         hint = "set imager.bits to 8, or save the images with 16 bits"
         raise InputError(files[0], "depth", "8 bits", f"more: imager.bits is {bits}", hint)

@@ -319,10 +319,18 @@ def _reject_contradictions(
     The tolerance grows with stripes wider than a pixel, whose centre may be off by half a stripe. Since sigma is stripe
     / sqrt(12), half a stripe is sqrt(3) sigma.
     """
-    rows, columns = np.nonzero((status == Status.VALID) & (second.status == Status.VALID))
-    projected = projector.project(points[rows, columns].astype(np.float64))[:, 0 if axis == "columns" else 1]
-    stripe_margin = np.nan_to_num(np.maximum(np.sqrt(3.0) * second.sigma[rows, columns] - 0.5, 0.0))
-    contradicted = ~(np.abs(projected - second.value[rows, columns]) <= tolerance_px + stripe_margin)
-    status[rows[contradicted], columns[contradicted]] = Status.PHASE_INCONSISTENT
+    both = np.flatnonzero((status == Status.VALID) & (second.status == Status.VALID))
+    places, values, sigmas = points.reshape(-1, 3), second.value.ravel(), second.sigma.ravel()
+    judged, component = status.reshape(-1), 0 if axis == "columns" else 1
+
+    def compare(blocks: list[slice]) -> None:
+        for block in blocks:
+            pixels = both[block]
+            projected = projector.project(places[pixels].astype(np.float64))[:, component]
+            stripe_margin = np.nan_to_num(np.maximum(np.sqrt(3.0) * sigmas[pixels] - 0.5, 0.0))
+            contradicted = ~(np.abs(projected - values[pixels]) <= tolerance_px + stripe_margin)
+            judged[pixels[contradicted]] = Status.PHASE_INCONSISTENT
+
+    in_blocks(compare, len(both))
     undecoded = (status == Status.VALID) & (second.status != Status.VALID)
     status[undecoded] = second.status[undecoded]

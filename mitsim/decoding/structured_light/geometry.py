@@ -179,8 +179,7 @@ def _prepared(
         if not iterated:
             break
     nodes, differences = _polynomial(coordinate, ray, low, high, _START_COUNT if iterated else count)
-    change = np.diff(nodes, axis=0)
-    monotonic, changes = _monotonic(change), np.ptp(nodes, axis=0) > MINIMUM_CHANGE_PX
+    monotonic, changes = _shape(nodes)
     undetermined = ~known | (seen & ~monotonic & changes)
     seen &= monotonic & changes
     if not seen.any():
@@ -271,9 +270,16 @@ def _shorten(
 
     Such rays pass a corner of the box around the field. They keep the longest part in the image and its margin.
     """
-    with np.errstate(invalid="ignore"):
-        ends = np.stack([projector.project(camera.centre + ray / end[..., None]) for end in (low, high)])
-    outside = np.nonzero(seen & np.isnan(ends).any(axis=(0, -1)))
+    leaves = np.zeros(seen.shape, bool)
+
+    @np.errstate(invalid="ignore")
+    def find(rows: slice) -> None:
+        for end in (low, high):
+            places = camera.centre + ray[rows] / end[rows][..., None]
+            leaves[rows] |= np.isnan(projector.project(places)).any(axis=-1)
+
+    in_threads(find, _bands(*seen.shape))
+    outside = np.nonzero(seen & leaves)
     if not outside[0].size:
         return
     share = np.linspace(0, 1, _SEARCHED_DEPTHS)[:, None]
@@ -366,12 +372,31 @@ def _polynomial(
         for node, inverse_depth in zip(u, w, strict=True):
             node[:] = coordinate(inverse_depth, ray[rows])
         for order in range(1, count):
-            w[order:] = (w[order:] - w[order - 1 : -1]) / (u[order:] - u[: count - order])
+            for k in range(count - 1, order - 1, -1):  # in place: w[k - 1] is still that of the order before
+                w[k] -= w[k - 1]
+                w[k] /= u[k] - u[k - order]
 
-    # bands of rows that stay in the processor's cache
-    band = max(1, BLOCK // low.shape[1])
-    in_threads(solve, [slice(top, top + band) for top in range(0, len(low), band)])
+    in_threads(solve, _bands(*low.shape))
     return nodes, differences
+
+
+def _bands(height: int, width: int) -> list[slice]:
+    """Return bands of rows of an image that stay in the processor's cache."""
+    band = max(1, BLOCK // width)
+    return [slice(top, top + band) for top in range(0, height, band)]
+
+
+def _shape(nodes: Floats) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return where (H, W) the coordinates of the nodes only rise or only fall, and where they change enough."""
+    monotonic, changes = np.empty(nodes.shape[1:], bool), np.empty(nodes.shape[1:], bool)
+
+    @np.errstate(invalid="ignore")
+    def judge(rows: slice) -> None:
+        monotonic[rows] = _monotonic(np.diff(nodes[:, rows], axis=0))
+        changes[rows] = np.ptp(nodes[:, rows], axis=0) > MINIMUM_CHANGE_PX
+
+    in_threads(judge, _bands(*nodes.shape[1:]))
+    return monotonic, changes
 
 
 def evaluate(nodes: Floats, differences: Floats, u: Floats) -> tuple[Floats, Floats]:

@@ -102,7 +102,7 @@ def _residuals(
     if sum(map(len, groups)) <= 1 + 2 * len(groups):
         return empty
     step = max(1, int(np.sqrt(stack[0].size / _SAMPLED_PIXELS)))
-    images = stack[np.concatenate(groups).astype(int)][:, step // 2 :: step, step // 2 :: step]
+    images = stack[:, step // 2 :: step, step // 2 :: step][np.concatenate(groups).astype(int)]
     images = images.reshape(len(images), -1)
     usable = images.max(axis=0) < full_scale
     phases = fit_phases(images[:, None], shifts)

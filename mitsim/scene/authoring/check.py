@@ -6,7 +6,9 @@ geometry of a task (:mod:`mitsim.scene.authoring.check_task`) -> findings.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,7 @@ from scipy.spatial import cKDTree
 from mitsim.scene.authoring.check_task import NOMINAL_MM, TaskFeatures, task_findings
 from mitsim.scene.authoring.finding import SceneFinding, Severity
 from mitsim.scene.inspect import SceneFacts, ShapeFacts
+from mitsim.scene.load import Scene
 from mitsim.scene.mesh_facts import MeshFacts
 from mitsim.scene.surface.processes import PROCESSES
 from mitsim.scene.visible_surfaces import VisibleSurfaces
@@ -46,6 +49,18 @@ _STOCK = ("rectangle", "disk", "cube", "sphere", "cylinder")
 
 #: units in which a part that looks too small may have been modelled [mm]
 _UNITS = {word: UNITS_MM[word] for word in ("inches", "metres")}
+
+
+@dataclass(frozen=True)
+class Authored:
+    """A scene with its facts and the findings about it, and the path of its task (None without one)."""
+
+    scene: Scene
+    facts: SceneFacts
+    sensor: Sensor
+    found: Sequence[SceneFinding]
+    task_path: Path | None
+    task: TaskFeatures | None
 
 
 def findings(

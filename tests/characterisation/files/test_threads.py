@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import threading
 
 import numpy as np
@@ -21,6 +24,27 @@ def test_the_count_is_what_the_environment_asks_for_or_the_usable_cores(monkeypa
     monkeypatch.setattr(threads, "usable_cores", lambda: cores)
     monkeypatch.setenv("OMP_NUM_THREADS", asked)
     assert thread_count() == count
+
+
+BLAS_THREADS = """
+import atexit, os, sys
+from mitsim.cli.program import main
+def tell():
+    import numpy, threadpoolctl
+    print(*(pool["num_threads"] for pool in threadpoolctl.threadpool_info() if pool["user_api"] == "blas"))
+atexit.register(tell)
+sys.argv = ["mitsim", "--version"]
+main()
+"""
+
+
+@pytest.mark.parametrize(("asked", "used"), [({}, "1"), (dict.fromkeys(threads.BLAS_VARIABLES, "2"), "2")])
+def test_a_command_has_one_thread_of_blas_unless_its_variables_are_set(asked, used):
+    environment = {name: value for name, value in os.environ.items() if name not in threads.BLAS_VARIABLES}
+    environment |= {"OMP_NUM_THREADS": "2"} | asked
+    done = subprocess.run([sys.executable, "-c", BLAS_THREADS], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert set(done.stdout.splitlines()[-1].split()) == {used}
 
 
 @pytest.mark.parametrize(("asked", "most", "used"), [(1, 8, 1), (3, 8, 3), (3, 2, 2), (8, 8, 4)])
