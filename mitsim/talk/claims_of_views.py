@@ -253,8 +253,9 @@ def accuracy(judged: Judged) -> Slide:
             f"Over {count} cells, {len(judged.task.measurements)} measurements of {len(judged.errors)} samples, the "
             "mean rank correlations of bins with error, with standard deviation and with missing values are "
             + "; ".join(f"{correlations(kind)} for {name}" for kind, name in SCORES.items())
-            + f". Of V_m with error, by sample (share of trials with a value): {'; '.join(_by_sample(judged))}. The mean "
-            f"ranks over all cells, as the talk shows them, have the rank correlation {_signed(trend)} with the bins.",
+            + f". Of V_m with error, by sample (share of trials with a value): {'; '.join(_by_sample(judged))}. The "
+            "mean ranks over all cells, as the talk shows them, have the rank correlation "
+            f"{_signed(trend)} with the bins.",
             f"rank correlation {_signed(talks[0])} of a cell, {_signed(trend)} of the mean ranks",
             verdict(good, trend <= _VERY_GOOD),
             "" if good else why,
