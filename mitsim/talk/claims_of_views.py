@@ -254,7 +254,8 @@ def accuracy(judged: Judged) -> Slide:
             "mean rank correlations of bins with error, with standard deviation and with missing values are "
             + "; ".join(f"{correlations(kind)} for {name}" for kind, name in SCORES.items())
             + f". Of V_m with error, by sample (share of trials with a value): {'; '.join(_by_sample(judged))}. The "
-            f"mean ranks over all cells, as in the talk, have the rank correlation {_signed(trend)} with the bins.",
+            "mean ranks over all cells, as the talk shows them, have the rank correlation "
+            f"{_signed(trend)} with the bins.",
             f"rank correlation {_signed(talks[0])} of a cell, {_signed(trend)} of the mean ranks",
             verdict(good, trend <= _VERY_GOOD),
             "" if good else why,
