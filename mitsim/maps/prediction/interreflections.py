@@ -124,19 +124,20 @@ class Interreflections:
 
 @dataclass(frozen=True)
 class InterreflectionImage:
-    """:class:`Interreflections` of every pixel of a ``camera``, (4, H, W) in the order of its fields."""
+    """:class:`Interreflections` of the pixels of a ``region`` of a ``camera``, (4, h, w) in the order of its fields."""
 
     camera: Camera
+    region: Roi
     values: Floats
 
     def at(self, points: NDArray[np.floating]) -> Interreflections:
         """Return the values of the pixels that show points (n, 3) of the sensor frame.
 
-        Points outside the image have rho NaN, and 0 for the other values.
+        Points outside the region have rho NaN, and 0 for the other values.
         """
         places = np.nan_to_num(self.camera.project(np.asarray(points, float)), nan=-9)
-        column, row = np.rint(places).astype(int).T
-        inside = (column >= 0) & (row >= 0) & (column < self.camera.width) & (row < self.camera.height)
+        column, row = (np.rint(places).astype(int) - [self.region.left, self.region.top]).T
+        inside = (column >= 0) & (row >= 0) & (column < self.region.width) & (row < self.region.height)
         rho, *others = self.values[:, np.where(inside, row, 0), np.where(inside, column, 0)]
         return Interreflections(np.where(inside, rho, np.nan), *(np.where(inside, one, 0.0) for one in others))
 
@@ -241,7 +242,7 @@ class InterreflectionEffect:
     ) -> InterreflectionImage:
         """Return the interreflections of one view from its direct light and one or two renders of the other light.
 
-        All are images of a region; outside it there are none.
+        All are images (..., h, w) of the region.
         """
         code = self.sensor.pattern
         # number of images whose mean is the total light
@@ -266,10 +267,7 @@ class InterreflectionEffect:
         elif self.fringe is not None:
             one, *two = (amplitude(images[1:]) for images in (direct, *indirect))
             displaced, scattered = phase_bias(one, (two[0], two[1]), shape, self.step)
-        values = np.zeros((4, self.coarse.height, self.coarse.width))
-        values[0] = np.nan
-        values[:, *region.slices] = rho, displaced, scattered, rejected
-        return InterreflectionImage(self.coarse, values)
+        return InterreflectionImage(self.coarse, region, np.stack([rho, displaced, scattered, rejected]))
 
     def _levels(self, region: Roi) -> float | Floats:
         """Return grey levels per radiance [DN / (W mm^-2 sr^-1)] in the shortest exposure, for pixels of a region."""

@@ -106,9 +106,7 @@ def trace_poses(
     together = max(1, min(LARGEST_LAUNCH // lanes, PHOTONS_AT_ONCE // max(1, photons)))
     # of about equal size: a launch of one pose would be another kernel
     groups = np.array_split(np.arange(len(poses)), -(-len(poses) // together))
-    return np.concatenate(
-        [_traced(scene, rays, light, [poses[k] for k in group], paths, region) for group in groups]
-    )
+    return np.concatenate([_traced(scene, rays, light, [poses[k] for k in group], paths, region) for group in groups])
 
 
 def _traced(
