@@ -94,9 +94,9 @@ def test_interreflections_of_a_view_are_rendered_once(study, limited, monkeypatc
 
     def images(_, scene, poses):
         rendered.extend(pose.matrix().tobytes() for pose in poses)
-        return [InterreflectionImage(effect.coarse, np.zeros((4, effect.coarse.height, effect.coarse.width)))] * len(
-            poses
-        )
+        whole = effect.rays.whole
+        image = InterreflectionImage(effect.coarse, whole, np.zeros((4, whole.height, whole.width)))
+        return [image] * len(poses)
 
     monkeypatch.setattr(InterreflectionEffect, "render_views", images)
     views = study.file.views.model_copy(update={"subdivisions": 1, "rolls_deg": [0.0, 90.0]})

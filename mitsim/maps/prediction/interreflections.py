@@ -35,6 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.documents import Document, read_toml
+from characterisation.region_of_interest import Roi
 from mitsim.capture.simulated.indirect_light import smoothed
 from mitsim.maps.prediction.multipath_phase_bias import amplitude, finest_fringe, fringes, phase_bias
 from mitsim.maps.prediction.multipath_range_bias import path_amplitudes, path_bias, range_bias
@@ -71,6 +72,10 @@ PHOTONS = 130_000
 
 #: number of views that are rendered at once: recording a kernel takes about as long as rendering one of them
 TOGETHER = 16
+
+#: points along an edge of the box around a scene whose images limit the region that is rendered, since a distortion
+#: bends the edges; and pixels of the coarse camera that are rendered around it
+_BOX_POINTS, _AROUND_PX = 5, 2
 
 #: standard deviation of the window that averages rho, in pixels of the sensor
 SMOOTHED_PX = 3.0
@@ -119,19 +124,20 @@ class Interreflections:
 
 @dataclass(frozen=True)
 class InterreflectionImage:
-    """:class:`Interreflections` of every pixel of a ``camera``, (4, H, W) in the order of its fields."""
+    """:class:`Interreflections` of the pixels of a ``region`` of a ``camera``, (4, h, w) in the order of its fields."""
 
     camera: Camera
+    region: Roi
     values: Floats
 
     def at(self, points: NDArray[np.floating]) -> Interreflections:
         """Return the values of the pixels that show points (n, 3) of the sensor frame.
 
-        Points outside the image have rho NaN, and 0 for the other values.
+        Points outside the region have rho NaN, and 0 for the other values.
         """
         places = np.nan_to_num(self.camera.project(np.asarray(points, float)), nan=-9)
-        column, row = np.rint(places).astype(int).T
-        inside = (column >= 0) & (row >= 0) & (column < self.camera.width) & (row < self.camera.height)
+        column, row = (np.rint(places).astype(int) - [self.region.left, self.region.top]).T
+        inside = (column >= 0) & (row >= 0) & (column < self.region.width) & (row < self.region.height)
         rho, *others = self.values[:, np.where(inside, row, 0), np.where(inside, column, 0)]
         return Interreflections(np.where(inside, rho, np.nan), *(np.where(inside, one, 0.0) for one in others))
 
@@ -204,20 +210,40 @@ class InterreflectionEffect:
 
     def render_views(self, scene: Scene, poses: Sequence[Transform], seed: int = 1) -> list[InterreflectionImage]:
         """Render the interreflections in several views at once; each image is the one that :meth:`render` returns."""
+        region = self._region(scene, poses)
         given = scene, self.rays, self.light, poses
-        direct = trace_poses(*given, LightPaths(samples=self.samples, seed=seed))
+        direct = trace_poses(*given, LightPaths(samples=self.samples, seed=seed), region)
         paths = LightPaths(self.samples, 2 * seed, self.depth, photons=self.photons, indirect_only=True)
         halves = range(1 if self.fringe is None else 2)
-        indirect = [trace_poses(*given, replace(paths, seed=2 * seed + half)) for half in halves]
+        indirect = [trace_poses(*given, replace(paths, seed=2 * seed + half), region) for half in halves]
+        middles = self.middles.within(region)
         return [
-            self._image(shapes_met(scene, self.middles, pose), direct[k], [one[k] for one in indirect])
+            self._image(region, shapes_met(scene, middles, pose), direct[k], [one[k] for one in indirect])
             for k, pose in enumerate(poses)
         ]
 
+    def _region(self, scene: Scene, poses: Sequence[Transform]) -> Roi:
+        """Return the region of the image that shows the box around the scene at all poses, the whole one if behind."""
+        whole = self.rays.whole
+        steps = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, _BOX_POINTS)] * 3), axis=-1).reshape(-1, 3)
+        box = scene.bounds[0] + steps * (scene.bounds[1] - scene.bounds[0])
+        places = np.concatenate([self.coarse.project(pose.inverse().points(box)) for pose in poses])
+        if not np.isfinite(places).all():
+            return whole
+        first, last = np.floor(places.min(axis=0)) - _AROUND_PX, np.ceil(places.max(axis=0)) + _AROUND_PX + 1
+        return Roi.between(*first, *last).overlap(whole) or Roi.whole(1, 1)
+
     def _image(
-        self, shape: NDArray[np.integer], direct: NDArray[np.float32], indirect: Sequence[NDArray[np.float32]]
+        self,
+        region: Roi,
+        shape: NDArray[np.integer],
+        direct: NDArray[np.float32],
+        indirect: Sequence[NDArray[np.float32]],
     ) -> InterreflectionImage:
-        """Return the interreflections of one view from its direct light and one or two renders of the other light."""
+        """Return the interreflections of one view from its direct light and one or two renders of the other light.
+
+        All are images (..., h, w) of the region.
+        """
         code = self.sensor.pattern
         # number of images whose mean is the total light
         own = code.steps if isinstance(code, AmplitudeModulation) else 1
@@ -228,7 +254,7 @@ class InterreflectionEffect:
         displaced, scattered, rejected = np.zeros((3, *rho.shape))
         if isinstance(code, AmplitudeModulation):
             assert isinstance(self.sensor.settings, TimeOfFlightSettings)
-            levels = self._levels()
+            levels = self._levels(region)
             displaced, rejected = path_bias(
                 path_amplitudes(direct, code) * levels,
                 path_amplitudes(indirect[0], code) * levels,
@@ -241,15 +267,15 @@ class InterreflectionEffect:
         elif self.fringe is not None:
             one, *two = (amplitude(images[1:]) for images in (direct, *indirect))
             displaced, scattered = phase_bias(one, (two[0], two[1]), shape, self.step)
-        return InterreflectionImage(self.coarse, np.stack([rho, displaced, scattered, rejected]))
+        return InterreflectionImage(self.coarse, region, np.stack([rho, displaced, scattered, rejected]))
 
-    def _levels(self) -> float | Floats:
-        """Return grey levels per radiance [DN / (W mm^-2 sr^-1)] in the shortest exposure, for each pixel (H, W)."""
+    def _levels(self, region: Roi) -> float | Floats:
+        """Return grey levels per radiance [DN / (W mm^-2 sr^-1)] in the shortest exposure, for pixels of a region."""
         sensor = self.sensor
         seconds = min(sensor.exposure.exposures(None, sensor.imager.full_well))
         levels = sensor.electrons() * seconds * sensor.imager.gain
         loss = camera_illumination(sensor.imager.corner_illumination, self.coarse)
-        return levels if loss is None else np.asarray(levels * loss, float)
+        return levels if loss is None else np.asarray(levels * loss[region.slices], float)
 
 
 def _key(pose: Transform) -> bytes:

@@ -69,16 +69,21 @@ def trace(
 
     See Also
     --------
-    trace_poses : whole images at several poses
+    trace_poses : several poses
     """
     (images,) = _traced(scene, rays, light, [world_from_sensor], paths, roi or rays.whole, shift)
     return np.asarray(images)
 
 
 def trace_poses(
-    scene: Scene, rays: CameraRays, light: ProjectedLight, poses: Sequence[Transform], paths: LightPaths
+    scene: Scene,
+    rays: CameraRays,
+    light: ProjectedLight,
+    poses: Sequence[Transform],
+    paths: LightPaths,
+    roi: Roi | None = None,
 ) -> NDArray[np.float32]:
-    """Return the radiance of :func:`trace` for whole images at several poses: (poses, P, height, width).
+    """Return the radiance of :func:`trace` for images at several poses: (poses, P, height, width).
 
     Poses that fit into one launch share it. Recording a kernel takes about as long as rendering 20 000 pixels.
 
@@ -88,20 +93,20 @@ def trace_poses(
         As for :func:`trace`.
     poses
         ``world_from_sensor`` of each.
+    roi
+        As for :func:`trace`, the same at all poses.
 
     See Also
     --------
-    trace : one pose, and a region of the image
+    trace : one pose
     """
-    pixels = rays.camera.width * rays.camera.height
-    together = max(
-        1, min(LARGEST_LAUNCH // (pixels * (light.count + 1)), PHOTONS_AT_ONCE // max(1, paths.photon_count(pixels)))
-    )
+    region = roi or rays.whole
+    photons = paths.photon_count(rays.camera.width * rays.camera.height)
+    lanes = region.width * region.height * (light.count + 1)
+    together = max(1, min(LARGEST_LAUNCH // lanes, PHOTONS_AT_ONCE // max(1, photons)))
     # of about equal size: a launch of one pose would be another kernel
     groups = np.array_split(np.arange(len(poses)), -(-len(poses) // together))
-    return np.concatenate(
-        [_traced(scene, rays, light, [poses[k] for k in group], paths, rays.whole) for group in groups]
-    )
+    return np.concatenate([_traced(scene, rays, light, [poses[k] for k in group], paths, region) for group in groups])
 
 
 def _traced(

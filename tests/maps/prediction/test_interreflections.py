@@ -14,6 +14,7 @@ from mitsim.maps.prediction import Predictor
 from mitsim.maps.prediction.interreflections import InterreflectionEffect, LossCurve, found_share
 from mitsim.maps.prediction.perturbation import SceneView
 from mitsim.scene.load import load_scene, scene_from_dict
+from mitsim.scene.ray_casting.raycast import shapes_met
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import Transform, look_at
 from tests.smaller_sensors import binned
@@ -152,18 +153,28 @@ def white_corner(sensor):
 
 
 @pytest.mark.parametrize("name", ["ensenso-n10", "david-sls-3", "kinect-v2"])
-def test_views_rendered_together_are_those_rendered_alone(name):
-    """Every pose of a launch has its own frame, streams and pixels; the images agree to the last bit."""
+def test_views_rendered_together_are_those_rendered_alone(name, monkeypatch):
+    """Every pose of a launch has its own frame, streams and pixels; the images agree to the last bit.
+
+    Views together, a view alone and the whole image have different regions, all of which show the whole scene.
+    """
     sensor = load_sensor(name)
     near = 1.2 * sensor.working_range_mm[0]
     scene = white_corner(sensor)
     poses = [look_at([x, -0.7 * near, 0.7 * near], [0, 0, 0], [0, 0, 1]) for x in (-200, 0, 150)]
     effect = InterreflectionEffect(sensor, photons=100_000)
-    alone = [effect.render(scene, pose).values for pose in poses]
-    together = [image.values for image in effect.render_views(scene, poses)]
-    assert not np.array_equal(alone[0], alone[1], equal_nan=True)
-    for one, other in zip(alone, together, strict=True):
-        np.testing.assert_array_equal(one, other)
+    alone, together = [effect.render(scene, pose) for pose in poses], effect.render_views(scene, poses)
+    monkeypatch.setattr(InterreflectionEffect, "_region", lambda self, *_: self.rays.whole)
+    for pose, whole, *parts in zip(poses, effect.render_views(scene, poses), alone, together, strict=True):
+        shown = shapes_met(scene, effect.middles, pose) >= 0
+        assert shown.any() and not shown.all()
+        for part in parts:
+            assert part.values.size < whole.values.size
+            np.testing.assert_array_equal(part.values, whole.values[:, *part.region.slices])
+            outside = shown.copy()
+            outside[part.region.slices] = False
+            assert not outside.any()
+    assert not np.array_equal(together[0].values, together[1].values, equal_nan=True)
 
 
 def test_views_named_ahead_are_rendered_once_and_in_any_order(n10):
