@@ -136,14 +136,17 @@ def _nearer(local: Array, centre: Array, radius: float) -> tuple[Array, float]:
     if extent == 0 or np.mean(off**2) <= (_ROUND * extent) ** 2:
         return centre, radius
     corners = _some_of(local, local.shape[1] + 1)
-    designs = _linear(corners / extent)
+    middles = corners.mean(axis=1)
+    sizes = np.maximum(np.ptp(corners, axis=1).max(axis=1), 1e-9 * extent)
+    places = (corners - middles[:, None]) / sizes[:, None, None]
+    designs = _linear(places)
     usable = np.abs(np.linalg.det(designs)) > 1e-6
     if not usable.any():
         return centre, radius
-    squares = np.sum((corners[usable] / extent) ** 2, axis=-1)
-    solved = extent * np.linalg.solve(designs[usable], squares[..., None])[..., 0]
+    solved = np.linalg.solve(designs[usable], np.sum(places[usable] ** 2, axis=-1)[..., None])[..., 0]
     centres = solved[:, :-1]
-    radii = np.sqrt(np.maximum(extent * solved[:, -1] + np.sum(centres**2, axis=1), 0.0))
+    radii = sizes[usable] * np.sqrt(np.maximum(solved[:, -1] + np.sum(centres**2, axis=1), 0.0))
+    centres = middles[usable] + sizes[usable, None] * centres
     some = local[:: 1 + len(local) // _SOME]
     apart = np.linalg.norm(some[:, None] - centres, axis=-1)
     medians = np.median(np.abs(apart - radii), axis=0)
@@ -205,7 +208,7 @@ _SOME, _TRIPLES = 1000, 60
 _TRIES = 200
 
 #: largest rms distance from a circle or sphere, over the width of the points, of points that lie on it; assumed
-_ROUND = 0.02
+_ROUND = 2e-3
 
 #: largest rms sine of the angle between normals and the plane across one axis; assumed
 _FLAT = 0.1

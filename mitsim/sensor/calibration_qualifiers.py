@@ -33,7 +33,7 @@ _CENTRE_SHARE = 20.0
 UNITS_MM = {
     word: size
     for size, words in {
-        1e-3: "um micron microns micrometer micrometers micrometre micrometres",
+        1e-3: "um µm μm micron microns micrometer micrometers micrometre micrometres",
         1.0: "mm millimeter millimeters millimetre millimetres",
         10.0: "cm centimeter centimeters centimetre centimetres",
         1000.0: "m meter meters metre metres",
