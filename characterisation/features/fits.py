@@ -25,7 +25,7 @@ from characterisation.features.robust_fit import (
     robust_fit,
     usable,
 )
-from characterisation.features.starts import plane_start
+from characterisation.features.starts import plane_start, sphere_start
 from characterisation.features.surfaces import (
     Cone,
     Cylinder,
@@ -208,13 +208,7 @@ def fit_sphere(points: ArrayLike, viewpoint: ArrayLike | None = None) -> SphereF
     (25.0, 400.0)
     """
     points = _usable(points, Sphere)
-    centroid = points.mean(axis=0)
-    local = points - centroid
-    # |p|^2 = 2 c.p + (r^2 - |c|^2) is linear in the unknowns: a starting value without iteration
-    square = np.sum(local**2, axis=1)
-    solution, *_ = np.linalg.lstsq(np.column_stack([2 * local, np.ones(len(local))]), square, rcond=None)
-    start = Sphere(centroid + solution[:3], float(np.sqrt(max(solution[3] + solution[:3] @ solution[:3], 1e-12))))
-    sphere, kept = _fit(start, points, viewpoint)
+    sphere, kept = _fit(sphere_start(points), points, viewpoint)
     extent = float(np.ptp(points[kept], axis=0).max())
     if not 0 < sphere.radius < 100 * extent:
         raise FitError(f"{len(points)} points that do not curve enough to determine a sphere")

@@ -1,12 +1,15 @@
-"""Estimate a cylinder or a plane from its points alone, as the starting value of a fit.
+"""Estimate a plane, a sphere or a cylinder from its points alone, as the starting value of a fit.
 
 Signal chain of a cylinder: points -> normals of some of them, from the plane through the neighbours of each -> axis,
 the direction perpendicular to all normals -> circle through the points projected along the axis (Pratt's algebraic fit)
 -> cylinder.
 
-The number of neighbours is large enough for a normal if noise is up to a tenth of their extent. A few points of another
-surface tilt the axis by some degrees, which the subsequent robust fit tolerates
-(:func:`~characterisation.features.fits.fit_cylinder`).
+The number of neighbours is large enough for a normal if noise is up to a tenth of their extent.
+
+Least squares gives each start. A window about a ball or a rod also shows what is beside it, which turns or widens a
+shape of least squares. So where the points do not lie on that shape, shapes through the fewest points are tried, and
+the one that is nearest to half of the points is used if it is much nearer (least median of squares: Rousseeuw, J. Am.
+Stat. Assoc. 79 (1984) 871). A window of which a third shows another surface then has a good start.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ from scipy.linalg import eig
 from scipy.spatial import cKDTree
 
 from characterisation.features.robust_fit import FitError, usable
-from characterisation.features.surfaces import Cylinder, Plane, tangents
+from characterisation.features.surfaces import Cylinder, Plane, Sphere, tangents
 
 Array = NDArray[np.float64]
 
@@ -47,15 +50,41 @@ def cylinder_start(points: ArrayLike) -> Cylinder:
     some = points[:: 1 + len(points) // _NORMALS]
     _, index = cKDTree(points).query(some, count)
     patches = points[index] - points[index].mean(axis=1, keepdims=True)
-    normals = np.linalg.svd(patches, full_matrices=False)[2][:, -1]
-    axis = np.linalg.eigh(normals.T @ normals)[1][:, 0]
+    axis = _across(np.linalg.svd(patches, full_matrices=False)[2][:, -1])
     basis = tangents(axis)
     middle = points.mean(axis=0)
-    centre, radius = _circle((points - middle) @ basis.T)
-    extent = float(np.ptp((points - middle) @ basis.T, axis=0).max())
+    centre, radius = _robust_circle((points - middle) @ basis.T)
+    extent = _width((points - middle) @ basis.T)
     if not 0 < radius < 100 * extent:
         raise FitError(f"{len(points)} points that do not curve enough to determine a cylinder")
     return Cylinder(middle + centre @ basis, axis, radius)
+
+
+def _across(normals: Array) -> Array:
+    """Return the direction (3,) perpendicular to most of the normals (n, 3)."""
+    squares: Array = np.linalg.eigh(normals.T @ normals)[1][:, 0]
+    sines = np.abs(normals @ squares)
+    if np.mean(sines**2) < _FLAT**2:
+        return squares
+    first, second = _some_of(normals, 2).swapaxes(0, 1)
+    axes = np.cross(first, second)
+    lengths = np.linalg.norm(axes, axis=1)
+    apart = lengths > _FLAT
+    if not apart.any():
+        return squares
+    axes = axes[apart] / lengths[apart, None]
+    medians = np.median(np.abs(normals @ axes.T), axis=0)
+    best = axes[np.argmin(medians)]
+    nearest = np.abs(normals @ best)
+    half = normals[nearest <= np.median(nearest)]
+    axis: Array = np.linalg.eigh(half.T @ half)[1][:, 0]
+    return axis if np.median(np.abs(normals @ axis)) * _MUCH < np.median(sines) else squares
+
+
+def _robust_circle(places: Array) -> tuple[Array, float]:
+    """Return centre (2,) and radius of the circle through most of the places (n, 2)."""
+    centre, radius = _circle(places)
+    return _nearer(places, centre, radius)
 
 
 def _circle(places: Array) -> tuple[Array, float]:
@@ -82,18 +111,74 @@ def _circle(places: Array) -> tuple[Array, float]:
     return centre * scale, float(np.sqrt(max(centre @ centre - d / a, 0.0)) * scale)
 
 
-def plane_start(points: Array) -> Plane:
-    """Return a plane from which a fit to points (n, 3) [mm] may start, also if a third of them are far outliers.
+def sphere_start(points: Array) -> Sphere:
+    """Return a sphere from which a fit to points (n, 3) [mm] may start, also if a third of them lie elsewhere.
 
-    It is the plane of total least squares. If the points are not flat about it, a plane through three of the points is
-    used that is much nearer to half of them (least median of squares: Rousseeuw, J. Am. Stat. Assoc. 79 (1984) 871). So
-    the outliers of a matcher, which may lie farther from the surface than it is wide, do not turn the start.
+    That of least squares solves |p|^2 = 2 c.p + (r^2 - |c|^2), which is linear in the unknowns.
+    """
+    middle = points.mean(axis=0)
+    local = points - middle
+    solution, *_ = np.linalg.lstsq(_linear(local), np.sum(local**2, axis=1), rcond=None)
+    radius = float(np.sqrt(max(solution[3] + solution[:3] @ solution[:3], 1e-12)))
+    centre, radius = _nearer(local, solution[:3], radius)
+    return Sphere(middle + centre, radius)
+
+
+def _linear(local: Array) -> Array:
+    """Return the design (..., n, d + 1) of a circle or sphere through points (..., n, d)."""
+    return np.concatenate([2 * local, np.ones((*local.shape[:-1], 1))], axis=-1)
+
+
+def _nearer(local: Array, centre: Array, radius: float) -> tuple[Array, float]:
+    """Return a circle or sphere, or the one through a few of the points (n, d) that is much nearer to half of them."""
+    off = np.abs(np.linalg.norm(local - centre, axis=1) - radius)
+    extent = _width(local)
+    if extent == 0 or np.mean(off**2) <= (_ROUND * extent) ** 2:
+        return centre, radius
+    corners = _some_of(local, local.shape[1] + 1)
+    middles = corners.mean(axis=1)
+    sizes = np.maximum(np.ptp(corners, axis=1).max(axis=1), 1e-9 * extent)
+    places = (corners - middles[:, None]) / sizes[:, None, None]
+    designs = _linear(places)
+    usable = np.abs(np.linalg.det(designs)) > 1e-6
+    if not usable.any():
+        return centre, radius
+    solved = np.linalg.solve(designs[usable], np.sum(places[usable] ** 2, axis=-1)[..., None])[..., 0]
+    centres = solved[:, :-1]
+    radii = sizes[usable] * np.sqrt(np.maximum(solved[:, -1] + np.sum(centres**2, axis=1), 0.0))
+    centres = middles[usable] + sizes[usable, None] * centres
+    some = local[:: 1 + len(local) // _SOME]
+    apart = np.linalg.norm(some[:, None] - centres, axis=-1)
+    medians = np.median(np.abs(apart - radii), axis=0)
+    best = int(np.argmin(medians))
+    if medians[best] * _MORE < np.median(off):
+        return centres[best], float(radii[best])
+    return centre, radius
+
+
+def _width(places: Array) -> float:
+    """Return the largest width over the axes of places (n, d), without the outer fifth of them on each axis."""
+    low, high = np.quantile(places, (0.1, 0.9), axis=0)
+    return float((high - low).max())
+
+
+def _some_of(rows: Array, count: int) -> Array:
+    """Return :data:`_TRIES` random choices (tries, count, d) of rows (n, d); the same rows give the same."""
+    rng = np.random.default_rng(len(rows))
+    return np.asarray(rows[rng.integers(len(rows), size=(_TRIES, count))])
+
+
+def plane_start(points: Array) -> Plane:
+    """Return a plane from which a fit to points (n, 3) [mm] may start, also if a third of them lie elsewhere.
+
+    Its least squares are total. A step of a few millimetres turns them, as do the outliers of a matcher, which may lie
+    farther from the surface than it is wide. The plane of three points is that of the half of the points nearest to it.
     """
     middle = points.mean(axis=0)
     about = points - middle
     moments, axes = np.linalg.eigh(about.T @ about)
     squares = Plane(middle, axes[:, 0])
-    if moments[0] < _FLAT**2 * moments[1]:
+    if moments[0] < _THIN**2 * moments[1]:
         return squares
     rng = np.random.default_rng(len(points))
     some = points if len(points) <= _SOME else points[rng.choice(len(points), _SOME, replace=False)]
@@ -107,16 +192,32 @@ def plane_start(points: Array) -> Plane:
     offsets = np.abs(some @ normals.T - np.einsum("ij,ij->i", corners[:, 0], normals))
     medians = np.median(offsets, axis=0)
     best = int(np.argmin(medians))
-    if medians[best] * _MUCH < np.median(np.abs((some - middle) @ squares.normal)):
-        return Plane(corners[best, 0], normals[best])
+    half = some[offsets[:, best] <= medians[best]]
+    place = half.mean(axis=0)
+    normal = np.linalg.eigh((half - place).T @ (half - place))[1][:, 0]
+    nearest = np.median(np.abs((some - place) @ normal))
+    if nearest * _MUCH < np.median(np.abs((some - middle) @ squares.normal)):
+        return Plane(place, normal)
     return squares
 
 
 #: points and triples of them that are tried: a triple without an outlier has a probability of 0.3 for a third of them
 _SOME, _TRIPLES = 1000, 60
 
-#: largest thickness over width of points that are flat; assumed
+#: choices of the fewest points of a circle, a sphere or an axis: of four points without one of 40 % outliers, 26 in 200
+_TRIES = 200
+
+#: largest rms distance from a circle or sphere, over the width of the points, of points that lie on it; assumed
+_ROUND = 2e-3
+
+#: largest rms sine of the angle between normals and the plane across one axis; assumed
 _FLAT = 0.1
 
-#: ratio of the medians from which the plane of three points replaces that of least squares; assumed
-_MUCH = 4.0
+#: largest thickness over width of points whose plane no step can turn: 0.1 deg; assumed
+_THIN = 2e-3
+
+#: ratio of the medians from which the shape of a few points replaces that of least squares; of a bowed plane it is 2
+_MUCH = 3.0
+
+#: the same of a circle or sphere; of normal noise it is about 1
+_MORE = 2.0

@@ -65,6 +65,9 @@ def window_slices(window: Roi | None, cloud: PointCloud, name: str) -> tuple[sli
     if not window.fits(grid.width, grid.height):
         found = f"{window.left},{window.top},{window.width},{window.height}"
         allowed = f"column,row,width,height within {grid.width} x {grid.height} pixels"
+        if grid.height == 1:
+            hint = "the points are a list, without rows and columns: measure all of them, with the name alone"
+            raise InputError("window", name, found, "no window", hint)
         raise InputError("window", name, found, allowed, "--picture shows the cloud with its rows and columns")
     return window.slices
 

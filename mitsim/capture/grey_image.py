@@ -70,7 +70,7 @@ def read_grey(path: Path, *, channel: int | None = None) -> Image:
 
 
 def read_depths(path: Path) -> NDArray[Any]:
-    """Read a grey image (H, W) of whole numbers, as :func:`read_grey` does, or of floating point.
+    """Read a grey image (H, W) as :func:`read_grey` does, or one of signed whole numbers or of floating point.
 
     Raises
     ------
@@ -79,7 +79,8 @@ def read_depths(path: Path) -> NDArray[Any]:
     """
     data = _bytes_of(path)
     image = _decoded(data, path, None)
-    return image if image.dtype.kind == "f" and max(image.shape) <= LONGEST_SIDE_PX else _checked(image, path)
+    of_depths = image.dtype.kind in "fi" and image.ndim == 2 and max(image.shape) <= LONGEST_SIDE_PX
+    return image if of_depths else _checked(image, path)
 
 
 def _bytes_of(path: Path) -> bytes:

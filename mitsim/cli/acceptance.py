@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from characterisation.files.errors import InputError
-from mitsim.cli.options import Clouds, DecodedAs, Frame, Json, Seed, Simulated, Topic, Variant, start
+from mitsim.cli.options import Clouds, DecodedAs, Frame, Json, Seed, Simulated, Topic, Unit, Variant, check_unit, start
 
 if TYPE_CHECKING:
     from characterisation.point_cloud import PointCloud
@@ -43,6 +43,7 @@ def acceptance(
     simulated: Simulated = None,
     topic: Topic = None,
     frame: Frame = None,
+    unit: Unit = None,
     as_json: Json = False,
     sensor: DecodedAs = None,
     seed: Seed = 1,
@@ -69,12 +70,13 @@ def acceptance(
     )
     from mitsim.running.progress import say
 
+    check_unit(unit)
     artefacts = read_artefacts(plane or [], sphere or [], spacing or [])
     if not (artefacts.planes or artefacts.spheres):
         command = "mitsim measure acceptance"
         raise InputError(command, "", "no artefact", "--plane or --sphere", f"see {command} --help")
     chosen = tuple(topic) if topic else None
-    given = [read_cloud(path, sensor, topic=chosen, frame=frame) for path in cloud_paths(clouds)]
+    given = [read_cloud(path, sensor, topic=chosen, frame=frame, unit=unit) for path in cloud_paths(clouds)]
     results = [cloud_figures(one.cloud, artefacts, baseline) for one in given]
     several = len(given) > 1
     together = joint_figures([one.cloud for one in given], artefacts) if several else []

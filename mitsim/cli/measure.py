@@ -19,9 +19,11 @@ from mitsim.cli.options import (
     Seed,
     Simulated,
     Topic,
+    Unit,
     Variant,
     ViewOfPoses,
     check_file,
+    check_unit,
     definitions,
     start,
 )
@@ -114,6 +116,7 @@ def clouds(
     simulated: Simulated = None,
     topic: Topic = None,
     frame: Frame = None,
+    unit: Unit = None,
     as_json: Json = False,
     sensor: DecodedAs = None,
     seed: Seed = 1,
@@ -136,6 +139,7 @@ def clouds(
     from mitsim.decoding.measured_document import beside_document, measured_document, result_tables, summary
     from mitsim.running.progress import say
 
+    check_unit(unit)
     request = read_request(
         {"plane": plane or [], "sphere": sphere or [], "cylinder": cylinder or []},
         {"angle": angle or [], "distance": distance or []},
@@ -162,7 +166,7 @@ def clouds(
         start(variant)
     if task is not None and scene is not None:
         of_task = _task(task, scene, pose, view, correct, definitions(define))
-    reference = None if against is None else read_cloud(against, sensor, reference=True)
+    reference = None if against is None else read_cloud(against, sensor, reference=True, unit=unit)
     paths = cloud_paths(inputs)
     beside: tuple[list[Result], list[Result]] | None = None
     targets = {name: one for name, one in request.plan.features.items() if one[0] != "cylinder"}
@@ -177,7 +181,7 @@ def clouds(
     for number, path in enumerate(paths):
         if len(paths) > 1:
             say(f"{path} ({number + 1}/{len(paths)})")
-        one = read_cloud(path, sensor, topic=tuple(topic) if topic else None, frame=frame)
+        one = read_cloud(path, sensor, topic=tuple(topic) if topic else None, frame=frame, unit=unit)
         if picture is not None and one.cloud.grid.height == 1:
             raise InputError("--picture", "", f"{path}, a cloud without a grid", "a cloud with rows and columns")
         to_frame, about_frame = places_in.of(one, view)

@@ -56,6 +56,13 @@ Topic = Annotated[
         help="For a bag of ROS: the topic of depth images or of clouds; twice for the left and the right images."
     ),
 ]
+Unit = Annotated[
+    str | None,
+    typer.Option(
+        help="Unit of clouds of other programs: um, mm, cm, m, inch or foot; default: that of the file, else m if the "
+        "median distance is below 20, else mm."
+    ),
+]
 Frame = Annotated[
     str | None, typer.Option(help="For a recording with several: image set, pair or frame, its number or name.")
 ]
@@ -247,6 +254,14 @@ def check_file(file: Path) -> None:
     if file.exists() and not file.is_file():  # an atomic write would replace a device: /dev/null
         raise InputError("--output", "", f"{file}, a device or a pipe", "a file")
     remove_partial_beside(file)
+
+
+def check_unit(unit: str | None) -> None:
+    """Check the unit of length of ``--unit``."""
+    from mitsim.sensor.calibration_qualifiers import LENGTHS_MM
+
+    if unit is not None and unit not in LENGTHS_MM:
+        raise InputError("--unit", "", repr(unit), " | ".join(LENGTHS_MM))
 
 
 def keep_finished(folder: Path, overwrite: bool, last: str) -> None:

@@ -76,6 +76,7 @@ def read_cloud(
     *,
     topic: tuple[str, ...] | None = None,
     frame: str | None = None,
+    unit: str | None = None,
 ) -> InputCloud:
     """Read a cloud file, or decode a capture folder or recording.
 
@@ -90,6 +91,9 @@ def read_cloud(
         Whether its points may lie anywhere; those of another cloud with a grid lie on the view rays of its camera.
     topic, frame
         Message of a recording, as of ``mitsim import``.
+    unit
+        Unit of length of a cloud of another program; by default the one that its file states, else that of its median
+        distance.
 
     Raises
     ------
@@ -103,28 +107,28 @@ def read_cloud(
     if path.is_file() and _is_mitsim_ply(path):
         return InputCloud(path, cloud_files.read_cloud(path), None)
     if is_array_or_text(path) and not is_map_of_depths(path):
-        return _plain(path, *read_plain_cloud(path))
+        return _plain(path, *read_plain_cloud(path, unit))
     if (path / "capture.json").exists():
         capture = read_capture(path)
     elif path.is_file() and path.suffix.lower() in _SUFFIXES:
         stored = read_stored_cloud(path)
         if stored.size is None:
-            return _plain(path, *plain_cloud(stored.points, path))
+            return _plain(path, *plain_cloud(stored.points, path, unit, stored.unit))
         try:
-            capture = read_organised_cloud(stored)
-        except InputError:
+            capture = read_organised_cloud(stored, unit=unit)
+        except InputError as error:
             if not reference:
-                raise
-            return _plain(path, *plain_cloud(stored.points, path))
+                hint = f"{error.hint}; mitsim import has these options" if "--" in error.hint else error.hint
+                raise InputError(error.where, error.field, error.found, error.allowed, hint) from None
+            return _plain(path, *plain_cloud(stored.points, path, unit, stored.unit))
     elif path.exists():
         kind = kind_of(path, sensor=sensor)
         used = sensor if "sensor" in KINDS[kind].options else None
         try:
-            capture = read_recording(path, ReadOptions(topic=topic, frame=frame, sensor=used), kind).capture
+            options = ReadOptions(topic=topic, frame=frame, sensor=used, unit=unit)
+            capture = read_recording(path, options, kind).capture
         except NoGridError as error:
-            return _plain(path, *plain_cloud(error.points, path))
-        for warning in capture.settings.get("warnings", []):
-            say(f"warning: {warning}")
+            return _plain(path, *plain_cloud(error.stored.points, path, unit, error.stored.unit))
     else:
         raise InputError(
             path,
@@ -132,8 +136,11 @@ def read_cloud(
             "no such file or folder",
             "a cloud (.ply, .pcd, .npy, .npz, .mat, .xyz), a capture folder, or folders of these",
         )
+    if not (path / "capture.json").exists():
+        for warning in capture.settings.get("warnings", []):
+            say(f"warning: {warning}")
     settings, imager = decoder_settings(capture, sensor)
-    chosen = (settings, imager, topic, frame, sensor)
+    chosen = (settings, imager, topic, frame, sensor, unit)
     cloud = kept_cloud(path, chosen, lambda: decoded_once(capture, settings, imager)[0])
     return InputCloud(path, cloud, capture, margin_of(settings))
 

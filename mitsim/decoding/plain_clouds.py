@@ -21,12 +21,15 @@ from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.capture.recordings.array_file import array_of_npy, arrays_of_npz, map_in, points_among
+from mitsim.capture.recordings.cloud_numbers import leave_out_marks, scale_to_mm
 from mitsim.capture.recordings.cloud_text import points_of_text
-from mitsim.capture.recordings.organised_cloud import scale_to_mm
 from mitsim.sensor.mat_structure import read_mat
 
 #: most numbers of a MATLAB file: x, y, z and more of 100 million points
 _MOST_NUMBERS = 1_000_000_000
+
+#: rounding of coordinates [mm] that is worth a remark: clouds hold 24 bits
+_COARSE_MM = 1e-3
 
 #: suffixes of clouds in arrays and text
 ARRAYS, TEXTS = (".npy", ".npz", ".mat"), (".xyz", ".xyzn", ".xyzi", ".xyzrgb", ".txt", ".asc", ".pts", ".csv")
@@ -37,8 +40,10 @@ def is_array_or_text(path: Path) -> bool:
     return path.suffix.lower() in (*ARRAYS, *TEXTS) and path.is_file()
 
 
-def read_plain_cloud(path: Path) -> tuple[PointCloud, str]:
+def read_plain_cloud(path: Path, unit: str | None = None) -> tuple[PointCloud, str]:
     """Return the cloud [mm] of an array or a text, and a sentence about its unit and its grid.
+
+    ``unit`` is that of :func:`plain_cloud`.
 
     Raises
     ------
@@ -47,11 +52,25 @@ def read_plain_cloud(path: Path) -> tuple[PointCloud, str]:
     """
     data = read_bounded(path, "a cloud")
     suffix = path.suffix.lower()
-    return plain_cloud(points_of_text(data, path) if suffix in TEXTS else _of_arrays(path, data, suffix), path)
+    if suffix in TEXTS:
+        points, stated = points_of_text(data, path)
+        return plain_cloud(points, path, unit, stated)
+    return plain_cloud(_of_arrays(path, data, suffix), path, unit)
 
 
-def plain_cloud(stored: NDArray[np.floating], path: Path) -> tuple[PointCloud, str]:
+def plain_cloud(
+    stored: NDArray[np.floating], path: Path, unit: str | None = None, stated: str | None = None
+) -> tuple[PointCloud, str]:
     """Return the cloud [mm] of points (n, 3) or (H, W, 3) as a file has them, and a sentence about its unit and grid.
+
+    Parameters
+    ----------
+    stored
+        The points.
+    path
+        The file, for messages.
+    unit, stated
+        Unit of length that the user gives, and the one that the file states; by default that of the median distance.
 
     Raises
     ------
@@ -59,14 +78,18 @@ def plain_cloud(stored: NDArray[np.floating], path: Path) -> tuple[PointCloud, s
         If there is no point, or one is too far away.
     """
     points = np.array(stored, np.float64)
-    name, distance = scale_to_mm(points, path)
+    note = leave_out_marks(points)
+    name, distance = scale_to_mm(points, path, unit or stated, "name the unit: --unit")
     organised = points.ndim == 3 and min(points.shape[:2]) > 1
     grid = points if organised else points.reshape(1, -1, 3)
     status = np.where(np.isfinite(grid[..., 0]), Status.VALID, Status.NO_SURFACE).astype(np.uint8)
     cloud = PointCloud(grid.astype(np.float32), status, _through(grid), "point-cloud", "device")
     shape = f"{grid.shape[1]} x {grid.shape[0]} points" if organised else f"{grid.shape[1]} points without a grid"
-    unit = f"in {name}, which their median distance of {distance:.4g} suggests"
-    return cloud, f"{path.name}: {shape}, {unit}"
+    why = "as given" if unit else "as the file states" if stated else ""
+    why = why or f"which their median distance of {distance:.4g} suggests; if not, --unit"
+    step = float(np.spacing(np.float32(np.nanmax(np.abs(grid)))))
+    coarse = f"coordinates kept to {step:.2g} mm: subtract their offset" if step > _COARSE_MM else ""
+    return cloud, "; ".join(each for each in (f"{path.name}: {shape}, in {name}, {why}", note, coarse) if each)
 
 
 def _through(points: NDArray[np.float64]) -> ViewGrid:

@@ -7,7 +7,9 @@ A camera matrix is a matrix under a usual name (:mod:`mitsim.sensor.calibration_
 ``fy``, ``cx``, ``cy`` (``ppx``, ``ppy`` of librealsense); or two lists, such as ``focal_length`` and
 ``principal_point``; or one list of four beside a lens model or an image size (Kalibr, EuRoC). Distortion and pose stand
 in the same map, in a map inside it, or in those around it that have no other eye; size and model in any map around it.
-``T_cn_cnm1`` of Kalibr takes coordinates of the camera before to this one, in metres.
+``T_cn_cnm1`` of Kalibr takes coordinates of the camera before to this one, in metres. A pose in the map of each camera
+takes coordinates of one common frame to the camera. Nine numbers of a rotation are by rows; those of librealsense
+(``rs2_extrinsics``) are by columns, and its lengths in metres.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from mitsim.sensor.calibration_names import USUAL_NAMES
 
@@ -39,8 +42,11 @@ _SIZES = frozenset(name.lower() for name in USUAL_NAMES["size"][0])
 _LENSES = frozenset(name.lower() for name in (*USUAL_NAMES["distortion"][0], "coeffs"))
 
 #: single numbers of the distortion in OpenCV's order, and those of a fisheye lens
-_BENT = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_BENT = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "taux", "tauy")
 _FISHEYE = ("k1", "k2", "k3", "k4")
+
+#: name of Kalibr for the pose of a camera from the one before it
+_STEP = "T_cn_cnm1"
 
 #: names under which maps state the model of a lens
 LENS_MODELS = ("camera_model", "distortion_model", "camera_type", "lens_model", "model_type", "model", "type")
@@ -69,6 +75,10 @@ class Eye:
     name: str
     matrix_map: str
     values: dict[str, Composed] = field(repr=False)
+
+    def sources(self, what: str) -> tuple[str, ...]:
+        """Return the dotted names of the sources of a value; none without it."""
+        return self.values[what].sources if what in self.values else ()
 
     @property
     def is_projector(self) -> bool:
@@ -134,10 +144,26 @@ def usual_values(eyes: Sequence[Eye]) -> dict[str, Composed]:
     elif ordered and cameras:
         out |= _under(cameras[0], {"matrix": "+K1", "distortion": "+D1", "size": "+size"})
         out |= _under(cameras[1], {"matrix": "+K2", "distortion": "+D2", "size": "+size2"} | poses)
+        if _STEP not in {source.rpartition(".")[2] for source in cameras[1].sources("rotation")}:
+            out |= _between(cameras[0], cameras[1])
     for eye in [eye for eye in eyes if eye.is_projector][:1]:
         out |= _under(eye, {"matrix": "+K_proj", "distortion": "+D_proj", "size": "+size_proj"})
         out |= _under(eye, {"rotation": "+R_proj", "translation": "+T_proj"})
     return out
+
+
+def _between(first: Eye, second: Eye) -> dict[str, Composed]:
+    """Return R and T from the first camera to the second, if both are posed in a common frame."""
+    poses = [(eye.values.get("rotation"), eye.values.get("translation")) for eye in (first, second)]
+    (R1, T1), (R2, T2) = poses
+    if R1 is None or T1 is None or R2 is None or T2 is None:
+        return {}
+    turn1, turn2 = (Rotation.from_rotvec(R.value).as_matrix() if R.value.size == 3 else R.value for R in (R1, R2))
+    turn = turn2 @ turn1.T
+    return {
+        "+R": Composed(turn, (*R1.sources, *R2.sources), R2.table),
+        "+T": Composed(T2.value - turn @ T1.value, (*T1.sources, *T2.sources), T2.table),
+    }
 
 
 def _under(eye: Eye, names: dict[str, str]) -> dict[str, Composed]:
@@ -239,7 +265,7 @@ def _lens(maps: list[_Named], fisheye: bool) -> Composed | None:
         ]
         if names:
             order = _FISHEYE if fisheye else _BENT
-            count = next(each for each in (4, 5, 8) if each > order.index(names[-1]))
+            count = next(each for each in (4, 5, 8, 12, 14) if each > order.index(names[-1]))
             numbers = [_number(table[low[each]]) if each in names else 0.0 for each in order[:count]]
             return Composed(np.array(numbers), tuple(_dotted(name, low[each]) for each in names), table)
     return None
@@ -273,10 +299,11 @@ def size_of(value: Any) -> NDArray[np.float64] | None:
 
 def _pose(maps: list[_Named]) -> dict[str, Composed]:
     """Return R and T from the first camera to this eye, if its maps state them; those of no map need no search."""
+    of_librealsense = any("ppx" in table for _, table in maps)
     for name, table in maps:
-        step = vector(table.get("T_cn_cnm1"), 16)
+        step = vector(table.get(_STEP), 16)
         if step is not None:
-            motion, metres, source = step.reshape(4, 4), {"unit": "m"}, (_dotted(name, "T_cn_cnm1"),)
+            motion, metres, source = step.reshape(4, 4), {"unit": "m"}, (_dotted(name, _STEP),)
             return {
                 "rotation": Composed(motion[:3, :3], source, metres),
                 "translation": Composed(motion[:3, 3], source, metres),
@@ -286,6 +313,8 @@ def _pose(maps: list[_Named]) -> dict[str, Composed]:
         R, T = vector(table.get(turn)), vector(table.get(shift), 3)
         if name and T is not None and R is not None and len(R) in (3, 9):
             rotation = R.reshape(3, 3) if len(R) == 9 else R
+            if of_librealsense and len(R) == 9 and np.ndim(table[turn]) == 1:
+                rotation, table = rotation.T, {"unit": "m"} | table
             return {
                 "rotation": Composed(rotation, (_dotted(name, turn),), table),
                 "translation": Composed(T, (_dotted(name, shift),), table),

@@ -8,8 +8,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from characterisation.files.errors import InputError
+from mitsim.sensor.transforms import is_rotation
+
+#: longest rotation vector [rad]; that of Rodrigues' formula is up to pi, of an adjustment a little more
+_LONGEST_VECTOR = 3.5
 
 
 def numbers_of(value: Any, file: Path, key: str, shapes: tuple[tuple[int, ...], ...]) -> NDArray[np.float64]:
@@ -73,3 +78,35 @@ def checked_matrix(K: NDArray[np.float64], name: str, file: str) -> NDArray[np.f
     if K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs([K[1, 0], *(K[2] - [0, 0, 1])]).max() > 1e-9:
         raise InputError(file, f"matrix of {name}", np.round(K, 3).tolist(), "fx 0 cx, 0 fy cy, 0 0 1")
     return K
+
+
+def rotation_matrix(R: NDArray[np.float64], name: str, file: str, by_columns: bool) -> NDArray[np.float64]:
+    """Return R (3, 3) by rows, of a rotation vector or of nine numbers, after a check that it is a rotation.
+
+    Parameters
+    ----------
+    R
+        As the file has it.
+    name, file
+        The eye and the file, for messages.
+    by_columns
+        Whether the camera matrix in the file is written by columns. Then the order of R is not known.
+
+    Raises
+    ------
+    InputError
+        If it is no rotation, or the transposed one is as likely.
+    """
+    field = f"rotation of {name}"
+    if R.size == 3:
+        if np.linalg.norm(R) > _LONGEST_VECTOR:
+            hint = "write a matrix of nine numbers, or the vector of cv2.Rodrigues"
+            raise InputError(file, field, R.reshape(3).tolist(), "a rotation vector in rad, up to pi", hint)
+        return np.asarray(Rotation.from_rotvec(R.reshape(3)).as_matrix())
+    R = R.reshape(3, 3)
+    if not is_rotation(R, 1e-4):
+        raise InputError(file, field, np.round(R, 4).tolist(), "a rotation matrix, 3 x 3, by rows")
+    if by_columns:
+        found = "a rotation of unknown order beside a camera matrix by columns"
+        raise InputError(file, field, found, "both by rows", "write both by rows: K[0][2] is cx")
+    return R

@@ -33,7 +33,7 @@ _CENTRE_SHARE = 20.0
 UNITS_MM = {
     word: size
     for size, words in {
-        1e-3: "um micron microns micrometer micrometers micrometre micrometres",
+        1e-3: "um µm μm micron microns micrometer micrometers micrometre micrometres",
         1.0: "mm millimeter millimeters millimetre millimetres",
         10.0: "cm centimeter centimeters centimetre centimetres",
         1000.0: "m meter meters metre metres",
@@ -72,9 +72,6 @@ _OTHER_MODELS = ("omni", "omnidirectional", "mei", "eucm", "ds", "double_sphere"
 
 #: models of librealsense that are OpenCV's only if all coefficients are zero
 _OF_ZEROS = ("inverse_brown_conrady", "modified_brown_conrady", "ftheta")
-
-#: shortest baseline [mm] that raises no doubt about the unit
-_SHORTEST_MM = 1.0
 
 
 @dataclass(frozen=True)
@@ -298,16 +295,6 @@ def unit_mm(table: dict[str, Any], where: str | Path) -> float | None:
                 raise InputError(where, name, repr(text), ", ".join(UNITS_MM), hint)
             return unit
     return None
-
-
-def baseline_note(name: str, baseline_mm: float) -> str:
-    """Return a warning about a distance between two eyes [mm] that suggests another unit; empty without doubt."""
-    if baseline_mm >= _SHORTEST_MM or baseline_mm == 0:
-        return ""
-    return (
-        f"{name} stands {baseline_mm:.3g} mm from the first camera: if the translation is in metres, say so in a "
-        "sensor file: [calibration] with to_mm = 1000"
-    )
 
 
 def rectified_pair(

@@ -22,11 +22,11 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.files.documents import Document, validate
 from characterisation.files.errors import InputError, nearest
+from mitsim.sensor.calibration_doubts import baseline_note, facing_note, lens_note, principal_note
 from mitsim.sensor.calibration_eyes import size_of
 from mitsim.sensor.calibration_names import USUAL_NAMES, Names
-from mitsim.sensor.calibration_numbers import by_rows, checked_matrix, numbers_of
+from mitsim.sensor.calibration_numbers import by_rows, checked_matrix, numbers_of, rotation_matrix
 from mitsim.sensor.calibration_qualifiers import (
-    baseline_note,
     lens_model,
     of_images,
     read_out_of,
@@ -34,7 +34,6 @@ from mitsim.sensor.calibration_qualifiers import (
     unit_mm,
 )
 from mitsim.sensor.calibration_tree import CalibrationTree, Found, read_tree
-from mitsim.sensor.transforms import is_rotation
 
 
 class EyeKeys(Document):
@@ -186,7 +185,8 @@ def _own(table: dict[str, Any], *names: str) -> dict[str, Any]:
 class _Values:
     """Values of a calibration by request; missing values are collected and reported together.
 
-    ``tables`` that qualify the matrices found, by eye; ``size`` of the images, if known.
+    ``tables`` that qualify the matrices found, by eye; ``size`` of the images, if known; ``by_columns``: whether a
+    matrix is written so.
     """
 
     def __init__(
@@ -196,6 +196,7 @@ class _Values:
         self.missing: list[tuple[str, str, Names]] = []
         self.tables: list[dict[str, Any]] = []
         self.notes: list[str] = []
+        self.by_columns = False
 
     def find(
         self, name: str, place: int, what: str, shapes: tuple[tuple[int, ...], ...], needed: bool = True
@@ -252,6 +253,8 @@ def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[st
     if place < 2:
         stating = file if matrix is None else matrix.file
         model = lens_model(table, stating, calibration_table.model, not distortion.any()) or calibration_table.model
+    if place < 2 and model is None and (note := lens_note(name, distortion)):
+        values.notes.append(f"calibration {file}: {note}")
     model = model or "perspective"
     if model == "fisheye" and len(distortion) not in (0, 4):
         raise InputError(file, f"distortion of {name}", f"{len(distortion)} numbers", "4, as of a fisheye lens")
@@ -260,6 +263,7 @@ def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[st
     if matrix is not None:
         K, by_columns = by_rows(matrix.value)
         K = checked_matrix(K, name, file)
+        values.by_columns |= by_columns
         if by_columns:
             values.notes.append(f"calibration {matrix.file.name}: {name}: its matrix is written by columns")
         read_out = read_out_of(table, matrix.file)
@@ -269,6 +273,10 @@ def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[st
             K, size, note = of_images(K, size, read_out, images)
             if note:
                 values.notes.append(f"calibration {matrix.file.name}: {name}: {note}")
+        width, height = own.get("width"), own.get("height")
+        seen = (width, height) if isinstance(width, int) and isinstance(height, int) else size or values.size
+        if place < 2 and read_out is None and seen and (note := principal_note(name, K, *seen)):
+            values.notes.append(f"calibration {matrix.file.name}: {note}")
         out |= {"focal_px": [float(K[0, 0]), float(K[1, 1])], "principal_px": [float(K[0, 2]), float(K[1, 2])]}
     if size is not None:
         out |= {"width": size[0], "height": size[1]}
@@ -311,15 +319,14 @@ def _pose(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[s
         (R, T), stated = pair, 1000.0
     else:
         return {}
-    R = np.asarray(Rotation.from_rotvec(R.reshape(3)).as_matrix()) if R.size == 3 else R.reshape(3, 3)
-    if not is_rotation(R, 1e-4):
-        raise InputError(file, f"rotation of {name}", np.round(R, 4).tolist(), "a rotation matrix, 3 x 3, by rows")
+    R = rotation_matrix(R, name, file, values.by_columns and rotation is not None)
     given = values.calibration_table.to_mm
     T = T * (given or stated or 1.0)
     if given is not None and stated is not None and given != stated:
         values.notes.append(f"calibration: to_mm = {given:g} is used, though the file states {stated:g} mm")
-    if note := baseline_note(name, float(np.linalg.norm(T))):
-        values.notes.append(f"calibration: {note}")
+    for note in (baseline_note(name, float(np.linalg.norm(T))), facing_note(name, R)):
+        if note:
+            values.notes.append(f"calibration: {note}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # at 90 deg about y the angles are not unique; any solution is valid
         turn = Rotation.from_matrix(R.T)

@@ -121,7 +121,111 @@ def test_texts_of_many_programs(tmp_path, name, encoding):
     (tmp_path / "a.csv").write_bytes(TEXTS[name].encode(encoding))
     cloud, about = read_plain_cloud(tmp_path / "a.csv")
     np.testing.assert_allclose(cloud.points[cloud.valid], plane(2.0)[np.isfinite(plane()[..., 0])], atol=1e-3)
-    assert "in mm, which" in about
+    assert "in mm, " in about
+
+
+def sized(factor, head="", separator=","):
+    """A text of the plane, with its numbers multiplied."""
+    rows = (plane(2.0).reshape(-1, 3) * factor).tolist()
+    return head + "".join(separator.join(f"{value:.7g}" for value in row) + "\n" for row in rows)
+
+
+UNITS = {
+    "names in micrometres": sized(1000, "X [um],Y [um],Z [um]\n"),
+    "names with a Greek letter": sized(1000, "x (µm),y (µm),z (µm)\n"),
+    "names in inches": sized(1 / 25.4, "x_in,y_in,z_in\n"),
+    "a line of units below": sized(0.1, "X,Y,Z\ncm,cm,cm\n"),
+    "a remark": sized(1000, "# Units: micrometers\n"),
+    "a table of remarks": sized(1 / 25.4, "Version,1.2\nUnit,inch\nX,Y,Z\n"),
+}
+
+
+@pytest.mark.parametrize("name", UNITS)
+def test_the_unit_that_a_text_states_counts(tmp_path, name):
+    """Before, 600,000 um were 600 m, and 15 mm were 15 m, as the median distance suggests."""
+    (tmp_path / "a.csv").write_text(UNITS[name], encoding="utf-8")
+    cloud, about = read_plain_cloud(tmp_path / "a.csv")
+    np.testing.assert_allclose(cloud.points[cloud.valid], plane(2.0)[np.isfinite(plane()[..., 0])], rtol=1e-5)
+    assert "as the file states" in about
+
+
+def test_units_that_differ_or_are_not_stated_are_refused(tmp_path):
+    (tmp_path / "a.csv").write_text(sized(1, "x [mm],y [mm],z [m]\n"))
+    with pytest.raises(InputError, match="coordinates in m and mm"):
+        read_cloud(tmp_path / "a.csv")
+    (tmp_path / "b.csv").write_text(sized(1000))
+    with pytest.raises(InputError, match=r"the file does not state.*--unit um"):
+        read_cloud(tmp_path / "b.csv")
+    cloud = read_cloud(tmp_path / "b.csv", unit="um").cloud
+    assert np.median(cloud.points[cloud.valid][:, 2]) == pytest.approx(602.0)
+
+
+def test_what_a_list_of_points_cannot_have_is_said(tmp_path):
+    """Before, a window was to lie within 2701 x 1 pixels, and one surface was asked for where the place was wrong."""
+    (tmp_path / "a.xyz").write_text(sized(1, separator=" "))
+    done = mitsim_here("measure", tmp_path / "a.xyz", "--plane", "a=5,5,20,20", code=2)
+    assert "the points are a list" in done.stderr
+    flat = np.random.default_rng(1).uniform(-50, 50, (500, 3)) * (1, 1, 0) + (100, 0, 5)
+    np.savetxt(tmp_path / "b.xyz", flat)
+    done = mitsim_here("measure", tmp_path / "b.xyz", "--plane", "a", code=1)
+    assert "the origin of their frame" in done.stdout
+    (tmp_path / "c.ply").write_bytes(ply(plane() * np.array([1, -1, -1], np.float32)))
+    done = mitsim_here("measure", tmp_path / "c.ply", "--plane", "a", code=2)
+    assert "--axes opengl; mitsim import has these options" in done.stderr
+
+
+def test_the_unit_is_an_option_of_measure(tmp_path):
+    """A list in mm about its own origin is nearer than 20 mm."""
+    (tmp_path / "a.xyz").write_text(sized(0.02, separator=" "))
+    asked = ("measure", tmp_path / "a.xyz", "--plane", "all", "--json")
+    values = {}
+    for options in ([], ["--unit", "mm"]):
+        done = mitsim_here(*asked, *options)
+        found = json.loads(done.stdout)["clouds"][0]["measurements"]
+        values[len(options)] = next(one["value"] for one in found if one["name"] == "all perpendicular distance")
+    assert values == {0: pytest.approx(12040.0, rel=1e-5), 2: pytest.approx(12.04, rel=1e-5)}
+    assert "--unit: found 'mile'" in mitsim_here(*asked, "--unit", "mile", code=2).stderr
+
+
+@pytest.mark.parametrize(
+    "row", ["{n}{s}{x}{s}{y}{s}{z}", "{n}{s}7{s}{x}{s}{y}{s}{z}", "{n}{s}{n}{s}{x}{s}{y}{s}{z}{s}0.5"]
+)
+def test_columns_that_count_are_not_coordinates(tmp_path, row):
+    """Before, the number of a row was its x."""
+    (tmp_path / "a.csv").write_text(text(",", "", row, missing="nan"))
+    with pytest.raises(InputError, match="columns without names, of which the first"):
+        read_cloud(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize(
+    ("head", "row"),
+    [
+        ("# x right, y down, z forward\n", "{x}{s}{y}{s}{z}"),
+        ("# columns: x y z\n", "{x}{s}{y}{s}{z}"),
+        ("# columns: n z y x\n", "{n}{s}{z}{s}{y}{s}{x}"),
+    ],
+)
+def test_a_sentence_about_axes_names_no_columns(tmp_path, head, row):
+    (tmp_path / "a.xyz").write_text(text(" ", head, row))
+    cloud = read_cloud(tmp_path / "a.xyz").cloud
+    np.testing.assert_allclose(cloud.points[cloud.valid], plane(2.0)[np.isfinite(plane()[..., 0])], atol=1e-3)
+
+
+@pytest.mark.parametrize("mark", [(-1, -1, -1), (0, 0, -1), (-9999, -9999, -9999), (0, 0, 1e5)])
+@pytest.mark.parametrize("name", ["a.xyz", "a.npy", "a.pcd"])
+def test_a_point_that_is_repeated_is_missing(tmp_path, name, mark):
+    """Before, 400 points at (-1, -1, -1) made a sphere of 50 mm one of 524 mm."""
+    points = plane()
+    points[np.isnan(points[..., 0])] = mark
+    cloud = read_cloud(save(tmp_path / name, points)).cloud
+    assert cloud.valid.sum() == np.isfinite(plane()[..., 0]).sum()
+    assert np.isclose(cloud.points[cloud.valid][:, 2], 600).all()
+
+
+def test_points_on_a_raster_repeat_and_are_kept(tmp_path):
+    points = np.round(plane() / 25) * 25
+    cloud = read_cloud(save(tmp_path / "a.xyz", points)).cloud
+    assert cloud.valid.sum() == np.isfinite(plane()[..., 0]).sum()
 
 
 def test_names_that_do_not_fit_the_columns_are_refused(tmp_path):

@@ -26,6 +26,9 @@ D = [-0.3, 0.1, 0.001, -0.002, 0.01]
 OM, T = np.array([0.01, 0.2, -0.02]), np.array([-60.0, 0.5, 2.0])
 R = cv2.Rodrigues(OM)[0]
 
+#: pose of the first camera in another frame
+R_LEFT, T_LEFT = cv2.Rodrigues(np.array([0.3, -0.1, 1.2]))[0], np.array([20.0, -30.0, 400.0])
+
 NUMBERS = {"fx": FX, "fy": FY, "cx": CX, "cy": CY}
 OF_LIBREALSENSE = {"fx": FX, "fy": FY, "ppx": CX, "ppy": CY, "width": 640, "height": 480}
 SINGLES = dict(zip(("k1", "k2", "p1", "p2", "k3"), D, strict=True))
@@ -110,12 +113,59 @@ PAIRS = {
             "extrinsics": {"R": R.tolist(), "T": T.tolist()},
         },
     },
+    "librealsense, whose rotation is by columns and in metres": {
+        "left": OF_LIBREALSENSE | {"coeffs": D},
+        "right": {"fx": 598.0, "fy": 599.0, "ppx": 318.9, "ppy": 238.2, "coeffs": D}
+        | {"rotation": R.T.ravel().tolist(), "translation": (T / 1000).tolist()},
+    },
+    "both in a common frame": {
+        "left": {"K": K.tolist(), "D": D, "R": R_LEFT.tolist(), "T": T_LEFT.tolist()},
+        "right": {"K": K2.tolist(), "D": D, "R": (R @ R_LEFT).tolist(), "T": (R @ T_LEFT + T).tolist()},
+    },
     "numbers, and a map of the pose": {
         "cameras": {"cam1": {"K": K2.tolist(), "D": D}, "cam0": {"K": K.tolist(), "D": D}},
         "R": OM.tolist(),
         "t": T.tolist(),
     },
 }
+
+
+def test_all_single_numbers_of_opencvs_lens_are_read(tmp_path):
+    """Before, the thin prism and the tilt were left out without a word."""
+    names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY")
+    bent = [0.1, -0.02, 1e-3, -2e-3, 0.01, 0.12, -0.01, 0.005, 3e-3, 1e-3, -2e-3, 5e-4, 0.01, -0.02]
+    for count in (12, 14):
+        table = NUMBERS | dict(zip(names[:count], bent[:count], strict=True))
+        sees(read_calibration(saved(tmp_path / "a.json", table), SIZE).rig.reference, K, bent[:count])
+
+
+DOUBTS = {
+    "has four coefficients, of which p1 and p2": {"K": K.tolist(), "D": [-0.05, 0.03, 0.06, -0.04]},
+    "the principal point 100, 70 is far from the middle": NUMBERS | {"cx": 100.0, "cy": 70.0},
+    "the principal point 2, -3 is far from the middle": NUMBERS | {"cx": 2.0, "cy": -3.0},
+    "right stands 1.2 mm": {"K1": K.tolist(), "K2": K2.tolist(), "R": np.eye(3).tolist(), "T": [-1.2, 0, 0]},
+    "right looks 172 deg away": {"K1": K.tolist(), "K2": K2.tolist(), "R": [0.0, 3.0, 0.0], "T": [-60, 0, 0]},
+}
+
+
+@pytest.mark.parametrize("words", DOUBTS)
+def test_numbers_that_seldom_are_right_raise_a_doubt(tmp_path, words):
+    notes = read_calibration(saved(tmp_path / "a.json", DOUBTS[words]), SIZE).notes
+    assert [words in note for note in notes] == [True]
+
+
+@pytest.mark.parametrize(
+    ("rotation", "matrices", "message"),
+    [
+        ([0.0, 8.0, 0.0], (K, K2), "a rotation vector in rad, up to pi"),
+        (R.ravel().tolist(), (K.T, K2.T), "both by rows"),
+    ],
+)
+def test_a_rotation_that_is_not_known_is_refused(tmp_path, rotation, matrices, message):
+    """Before, degrees were radians, and a rotation by columns beside a matrix by columns was transposed."""
+    pair = {"K1": matrices[0].tolist(), "K2": matrices[1].tolist(), "R": rotation, "T": T.tolist()}
+    with pytest.raises(InputError, match=message):
+        read_calibration(saved(tmp_path / "a.json", pair), SIZE)
 
 
 @pytest.mark.parametrize("name", PAIRS)

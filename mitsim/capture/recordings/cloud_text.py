@@ -1,10 +1,12 @@
 """Read the points of a text: lines of x, y and z with any separators, a decimal point or comma, and names of columns.
 
-Signal chain: bytes -> text -> comments and names of columns -> separators and decimal mark -> numbers -> x, y, z.
+Signal chain: bytes -> text -> comments, names of columns and their unit -> separators and decimal mark -> numbers ->
+x, y, z.
 
 Names of columns, in a line before the numbers or a comment, tell which columns are x, y and z; without names they are
-the first three. A comma is the decimal mark if other separators stand between the numbers and no number has a point:
-programs write so in countries with a decimal comma. An empty field is a missing number.
+the first three, unless these seem to count rows. The unit stands with the names (``x [mm]``, ``x_mm``), in a line below
+them, or in a line of its own (``units: mm``). A comma is the decimal mark if other separators stand between the numbers
+and no number has a point: programs write so in countries with a decimal comma. An empty field is a missing number.
 """
 
 from __future__ import annotations
@@ -16,7 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
+from mitsim.capture.recordings.cloud_numbers import unit_in, unit_named
 from mitsim.capture.recordings.number_text import number_words
+from mitsim.sensor.calibration_qualifiers import UNITS_MM
 
 #: largest text [bytes]; reading takes ten times as much memory
 _LARGEST = 256 * 1024**2
@@ -25,14 +29,25 @@ _SPACES = bytes.maketrans(b",;\t", b"   ")
 _MARKS = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16", b"\xef\xbb\xbf": "utf-8-sig"}
 
 #: a name of a column: x, y or z, which a word may precede, and a unit may follow
-_NAME = re.compile(r"(?:points?|pos(?:ition)?|coord(?:inate)?)?[_.:]?([xyz])(?:_?(?:mm|m|cm|um))?")
+_NAME = re.compile(
+    r"(?:points?|pos(?:ition)?|coord(?:inate)?)?[_.:]?([xyz])(?:_?(?:mm|m|cm|um|µm|μm)|_(?:in|inch|ft))?"
+)
+
+#: a remark in brackets, such as a unit
+_BRACKETS = re.compile(r"[\[(][^\])]*[\])]")
+
+#: the unit of a column x, y or z
+_OF_AXIS = re.compile(r"(?<![a-z])[xyz](?:\s*[\[(]\s*(\w+)\s*[\])]|_(\w+))")
+
+#: words before the names in a comment
+_BEFORE_NAMES = re.compile(r"^(?:[\w ]*:|columns?|fields?|format)\s+")
 
 #: lines from which separators and decimal mark are found
 _SAMPLE = 200
 
 
-def points_of_text(data: bytes, path: Path) -> NDArray[np.float64]:
-    """Return the points (n, 3) of a text.
+def points_of_text(data: bytes, path: Path) -> tuple[NDArray[np.float64], str | None]:
+    """Return the points (n, 3) of a text, and their unit of length if the text states one.
 
     Parameters
     ----------
@@ -44,16 +59,17 @@ def points_of_text(data: bytes, path: Path) -> NDArray[np.float64]:
     Raises
     ------
     InputError
-        If the lines are not equally many numbers, three or more, or their names lack x, y or z.
+        If the lines are not equally many numbers, three or more, their names lack x, y or z, or columns without names
+        seem to count rows.
     """
     if len(data) > _LARGEST:
         raise InputError(path, "", f"{len(data):,} bytes of text", f"at most {_LARGEST:,}", "save it as PLY")
     encoding = next((one for mark, one in _MARKS.items() if data.startswith(mark)), None)
     if encoding is not None:
-        data = data.decode(encoding, "replace").encode("ascii", "replace")
+        data = data.decode(encoding, "replace").encode()
     lines = [line.strip(b" \r\n") for line in data.replace(b'"', b"").splitlines()]
     rows = [line for line in lines if line.strip() and not _is_comment(line)]
-    names = next((found for line in lines[:100] if _is_comment(line) and (found := _names(line))), [])
+    heads = [line.decode("utf-8", "replace") for line in lines[:100] if _is_comment(line)]
     try:
         if rows and len(number_words(rows[0].translate(_SPACES))) == 1:  # the number of points
             rows = rows[1:]
@@ -68,25 +84,90 @@ def points_of_text(data: bytes, path: Path) -> NDArray[np.float64]:
         raise InputError(
             path, "", f"text that is no cloud ({reason})", "lines of x, y and z, and equal columns"
         ) from None
+    names = next((found for line in heads if (found := _names(line, columns))), [])
+    unit = _unit(heads, path)
     if not names:
-        return table[:, :3]
+        _check_no_counters(table, path)
+        return table[:, :3], unit
     if len(names) != columns or not set("xyz") <= set(names):
         shown = f"the names {', '.join(names)[:80]} of {columns} columns"
         raise InputError(path, "", shown, "names of all columns, among them x, y and z")
-    return table[:, [names.index(axis) for axis in "xyz"]]
+    return table[:, [names.index(axis) for axis in "xyz"]], unit
 
 
 def _is_comment(line: bytes) -> bool:
-    """Return whether a line is a comment or the names of the columns; NaN is a number."""
-    return line.startswith((b"#", b"/")) or (line[:1].isalpha() and not line[:3].lower().startswith((b"nan", b"inf")))
+    """Return whether a line is a comment, the names of the columns or their units; NaN is a number."""
+    low = line[:3].lower()
+    return line.startswith((b"#", b"/", b"[", b"(")) or (line[:1].isalpha() and not low.startswith((b"nan", b"inf")))
 
 
-def _names(line: bytes) -> list[str]:
-    """Return the names of columns in small letters, without units; none if the line does not name x, y or z."""
-    without_units = re.sub(r"[\[(][^\])]*[\])]", "", line.decode("ascii", "replace"))
-    words = re.split(r"[,;\t ]+", without_units.strip("#/ \t").lower())
+def _names(line: str, columns: int) -> list[str]:
+    """Return the names of columns in small letters, without units; none if the line does not name x, y or z.
+
+    In a comment, words between x, y and z make a sentence about the axes.
+    """
+    text = _BRACKETS.sub("", line).lower()
+    comment = text.startswith(("#", "/"))
+    text = text.strip("#/ \t")
+    words = _words(text)
+    if comment and len(words) != columns:
+        words = _words(_BEFORE_NAMES.sub("", text))
     names = [found[1] if (found := _NAME.fullmatch(each)) else each for each in words]
-    return names if len(set("xyz") & set(names)) >= 2 else []
+    if len(set("xyz") & set(names)) < 2:
+        return []
+    at = [place for place, name in enumerate(names) if name in "xyz"]
+    sentence = comment and len(names) != columns and at[-1] - at[0] >= len(at)
+    return [] if sentence else names
+
+
+def _words(text: str) -> list[str]:
+    return re.split(r"[,;\t ]+", text.strip())
+
+
+def _unit(heads: list[str], path: Path) -> str | None:
+    """Return the unit of length that the lines before the numbers state; None without one.
+
+    Raises
+    ------
+    InputError
+        If x, y and z have several.
+    """
+    for line in heads:
+        below = [word.strip("[]()") for word in _words(line.lower())]
+        stated = (
+            below if set(below) <= set(UNITS_MM) else [one or other for one, other in _OF_AXIS.findall(line.lower())]
+        )
+        found = {unit_named(word) for word in stated if word in UNITS_MM}
+        if len(found) > 1:
+            raise InputError(path, "", f"coordinates in {' and '.join(sorted(found))}", "one unit of length")
+        if found:
+            return found.pop()
+    return unit_in(heads)
+
+
+def _check_no_counters(table: NDArray[np.float64], path: Path) -> None:
+    """Check that a text without names has x, y and z first.
+
+    Numbers of a row, or of a row and a column, are whole; three columns after them that are not, or that do not vary,
+    are x, y and z.
+
+    Raises
+    ------
+    InputError
+        If the first one or two columns count.
+    """
+    some = table[np.linspace(0, len(table) - 1, min(1000, len(table))).astype(np.intp)]
+    some = some[np.isfinite(some).all(axis=1)]
+    whole = (some % 1 == 0).all(axis=0) if len(some) else np.ones(table.shape[1], bool)
+    varies = (some != some[:1]).any(axis=0) if len(some) else ~whole
+    for count in (1, 2):
+        if table.shape[1] < count + 3:
+            continue
+        lengths = (~whole)[count : count + 3].sum() >= 2 and not (whole & varies)[count : count + 3].any()
+        if whole[:count].all() and varies[:count].any() and lengths:
+            counting = "the first two seem to count" if count == 2 else "the first seems to count"
+            found = f"{table.shape[1]} columns without names, of which {counting}"
+            raise InputError(path, "", found, "x, y and z first, or names", "write the names above: number,x,y,z")
 
 
 def _with_points(rows: list[bytes]) -> list[bytes]:

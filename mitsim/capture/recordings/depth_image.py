@@ -22,11 +22,14 @@ from mitsim.capture.grey_image import read_depths
 from mitsim.capture.npy import NPY_MAGIC
 from mitsim.capture.recordings.array_file import map_in
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
-from mitsim.capture.recordings.organised_cloud import FARTHEST_MM, METRES_UNDER
+from mitsim.capture.recordings.cloud_numbers import FARTHEST_MM, METRES_UNDER
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.png import LONGEST_SIDE_PX
 
 Depth = NDArray[np.float32]
+
+#: share of the pixels with one largest depth, and its ratio to the median of the others, from which it means no depth
+_MARKED, _FAR_BEYOND = 0.01, 10.0
 
 
 def read_depth_image(
@@ -49,9 +52,9 @@ def read_depth_image(
         A preset's name or a file, see :mod:`mitsim.capture.recordings.calibration_file`.
     scale_mm
         Depth of one level [mm]; by default 1, or 1000 for floating point with a median under
-        :data:`~mitsim.capture.recordings.organised_cloud.METRES_UNDER`.
+        :data:`~mitsim.capture.recordings.cloud_numbers.METRES_UNDER`.
     invalid
-        Level of missing depths, beside 0 and the largest one of 16 bits.
+        Level of missing depths, beside 0, the largest one of 16 bits, and those under 0 or far beyond all others.
     camera
         Name of the camera in the calibration; by default the first.
     sensor
@@ -76,34 +79,68 @@ def read_depth_image(
     settings: dict[str, Any] = {"imported_from": path.name}
     if image.dtype.kind == "f":
         invalid = 0 if invalid is None else invalid
-        seen = image[np.isfinite(image) & (image != invalid)]
+    missing, warnings = _missing(image, invalid or 0)
+    if image.dtype.kind == "f":
+        seen = image[~missing]
         in_metres = scale_mm is None and seen.size and float(np.median(seen)) < METRES_UNDER
         scale_mm = 1000.0 if in_metres else scale_mm
     scale_mm, invalid = 1.0 if scale_mm is None else scale_mm, invalid or 0
     settings |= {"depth_scale_mm": float(scale_mm), "depth_invalid": int(invalid)}
-    if (image == invalid).all():
-        raise InputError(path, "", f"an image with only the level {invalid}", "an image with some depths")
+    if warnings:
+        settings["warnings"] = warnings
+    if missing.all():
+        levels = np.unique(image[np.isfinite(image)])
+        only = f"an image with only the level {levels[0]:g}" if len(levels) == 1 else "no depth over 0"
+        raise InputError(path, "", only, "an image with some depths")
     with np.errstate(over="ignore"):
         depth = image.astype(np.float32) * np.float32(scale_mm)
-    depth[(image == invalid) | (image == 0) | ~np.isfinite(depth)] = np.nan
-    full = np.iinfo(np.uint16).max
-    if image.dtype == np.uint16 and (image == full).any():
-        depth[image == full] = np.nan
-        if invalid != full:
-            share = 100 * float(np.mean(image == full))
-            settings["warnings"] = [f"{share:.2g} % of the pixels have the level {full}, the largest: left out"]
-        if np.isnan(depth).all():
-            raise InputError(path, "", f"an image with only the level {full}", "an image with some depths")
+    depth[missing] = np.nan
     read = read_calibration(calibration, (image.shape[1], image.shape[0]))
     return depth_capture(depth, read, path, settings, camera=camera, sensor=sensor)
+
+
+def _missing(image: NDArray[Any], invalid: int) -> tuple[NDArray[np.bool_], list[str]]:
+    """Return the pixels (H, W) of an image without a depth, and warnings about those that the user did not name.
+
+    These have the level ``invalid`` or 0, no finite number, or less than 0; the largest level of 16 bits; or one level
+    far beyond all others, such as 1e10, in many pixels.
+    """
+    missing = (image == invalid) | (image == 0) | ~np.isfinite(image)
+    warnings: list[str] = []
+
+    def leave_out(more: NDArray[np.bool_], which: str) -> None:
+        if more.any():
+            share = 100 * float(np.mean(more))
+            warnings.append(f"{share:.2g} % of the pixels have {which}: left out")
+            missing[more] = True
+
+    full = np.iinfo(np.uint16).max
+    if image.dtype == np.uint16 and invalid != full:
+        leave_out((image == full) & ~missing, f"the level {full}, the largest")
+    elif image.dtype == np.uint16:
+        missing |= image == full
+    under = (image < 0) & ~missing
+    if under.sum() < 0.5 * (~missing).sum() or len(np.unique(image[under])) == 1:
+        leave_out(under, "a depth under 0")
+    if (~missing).any():
+        seen = image[~missing]
+        farthest = seen.max()
+        same = (image == farthest) & ~missing
+        rest = seen[seen < farthest]
+        if (
+            rest.size
+            and same.sum() >= _MARKED * image.size
+            and float(farthest) > _FAR_BEYOND * float(np.median(rest)) > 0
+        ):
+            leave_out(same, f"the same depth of {farthest:g}, far beyond all others")
+    return missing, warnings
 
 
 def _levels(path: Path, frame: int | None) -> NDArray[Any]:
     """Return the numbers (H, W) of an image or a file of NumPy; integers of any size as floating point."""
     data = read_bounded(path, "a depth image")
-    if not data.startswith(NPY_MAGIC) and path.suffix.lower() != ".npz":
-        return read_depths(path)
-    values = map_in(data, path, frame)
+    of_numpy = data.startswith(NPY_MAGIC) or path.suffix.lower() == ".npz"
+    values = map_in(data, path, frame) if of_numpy else read_depths(path)
     if values.ndim != 2 or not all(1 <= side <= LONGEST_SIDE_PX for side in values.shape):
         raise InputError(path, "shape", " x ".join(map(str, values.shape)), "depths of rows x columns")
     if values.dtype.kind == "f" or values.dtype in (np.uint8, np.uint16):

@@ -31,24 +31,18 @@ from mitsim.capture.decoding import Decoding
 from mitsim.capture.npy import NPY_MAGIC
 from mitsim.capture.recordings.array_file import map_in
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
+from mitsim.capture.recordings.cloud_numbers import leave_out_marks, scale_to_mm
 from mitsim.capture.recordings.nxlib_calibration import NxLibTree, link_of, sensor_from_rectified
 from mitsim.capture.recordings.pcd import decode_pcd
 from mitsim.capture.recordings.pinhole_fit import fit_pinhole, grid_of, off_the_rays
 from mitsim.capture.recordings.ply import decode_ply
 from mitsim.capture.recordings.zdf import HDF5_MAGIC, read_zdf
-from mitsim.sensor.calibration_qualifiers import LENGTHS_MM, check_camera
+from mitsim.sensor.calibration_qualifiers import check_camera
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.transforms import Transform
 
 Points = NDArray[np.float32]
 Axes = Literal["opencv", "opengl"]
-
-#: median distance of the points, in the file's numbers, below which the unit is metres. All sensors here measure
-#: between 20 mm and 20 m
-METRES_UNDER = 20.0
-
-#: coordinates beyond this are not measurements [mm]
-FARTHEST_MM = 1e6
 
 #: largest accepted median distance of the points from the pixels of a given camera [px]; assumed
 CAMERA_OFF_PX = 1.0
@@ -64,6 +58,8 @@ class StoredCloud:
     - ``records`` that a capture of them keeps.
     - ``camera`` that the file states; None if it states none.
     - ``grey``: image (H, W) of the grid, uint8; None without one.
+    - ``unit`` that the file states, one of :data:`~mitsim.sensor.calibration_qualifiers.LENGTHS_MM`; None without one.
+    - ``note`` about missing points; empty without one.
     """
 
     path: Path
@@ -72,12 +68,14 @@ class StoredCloud:
     records: dict[str, Any]
     camera: Calibrated | None = None
     grey: NDArray[np.uint8] | None = None
+    unit: str | None = None
+    note: str = ""
 
 
 class NoGridError(InputError):
-    """A cloud that is not organised, where an organised one is needed; ``points`` (n, 3) as in the file."""
+    """A cloud that is not organised, where an organised one is needed; the cloud ``stored`` in the file."""
 
-    points: Points
+    stored: StoredCloud
 
 
 def read_stored_cloud(path: Path) -> StoredCloud:
@@ -99,17 +97,19 @@ def read_stored_cloud(path: Path) -> StoredCloud:
         read = decode_ply(data, path)
         if any(line.startswith("comment mitsim ") and '"grid"' in line for line in read.lines):
             raise InputError(path, "", "a cloud written by mitsim", "a cloud of another program", "it needs no import")
+        note = leave_out_marks(read.points)
         size = read.size or grid_of(read.points)
         found = {} if read.size or size is None else {"grid_from": "the points"}
-        return StoredCloud(path, read.points, size, found)
+        return StoredCloud(path, read.points, size, found, unit=read.unit, note=note)
     if data.startswith(NPY_MAGIC) or path.suffix.lower() == ".npz":
         return _of_npy(path, data)
     if path.suffix.lower() == ".ply" and b"FIELDS" not in data[:4096]:
         raise InputError(path, "", "a file without the header of a PLY", "a PLY file, whose first line is ply")
     points, header = decode_pcd(data, path)
+    note = leave_out_marks(points)
     height, width = points.shape[:2]
     size = (width, height) if height > 1 else grid_of(points.reshape(-1, 3))
-    return StoredCloud(path, points, size, {"viewpoint_of_file": header.get("VIEWPOINT", "")})
+    return StoredCloud(path, points, size, {"viewpoint_of_file": header.get("VIEWPOINT", "")}, note=note)
 
 
 def _of_zdf(path: Path) -> StoredCloud:
@@ -137,7 +137,8 @@ def _of_npy(path: Path, data: bytes) -> StoredCloud:
         raise InputError(path, "shape", found, "points of rows x columns x 3, or depths of rows x columns")
     with np.errstate(over="ignore"):
         points = values.astype(np.float32)
-    return StoredCloud(path, points, (values.shape[1], values.shape[0]), {})
+    note = leave_out_marks(points)
+    return StoredCloud(path, points, (values.shape[1], values.shape[0]), {}, note=note)
 
 
 def read_organised_cloud(
@@ -160,8 +161,8 @@ def read_organised_cloud(
         The camera of the grid, see :mod:`mitsim.capture.recordings.calibration_file`; by default a pinhole is fitted.
         With a rectification, the grid may also be that of the rectified left image, at full or reduced size.
     unit
-        One of :data:`~mitsim.sensor.calibration_qualifiers.LENGTHS_MM`; by default metres if the median distance is
-        under :data:`METRES_UNDER`, else millimetres.
+        One of :data:`~mitsim.sensor.calibration_qualifiers.LENGTHS_MM`; by default that of the file, else metres if the
+        median distance is under :data:`~mitsim.capture.recordings.cloud_numbers.METRES_UNDER`, else millimetres.
     axes
         ``opencv``: x right, y down, z forward; ``opengl``: y up and z backward, which is converted.
     link
@@ -185,7 +186,8 @@ def read_organised_cloud(
     path = stored.path
     points, given = _on_grid(stored, calibration, camera)
     settings: dict[str, Any] = {"imported_from": path.name, "axes_of_file": axes} | stored.records
-    settings["unit_of_file"], _ = scale_to_mm(points, path, unit, "check --unit")
+    points[points[..., 2] == 0] = np.nan  # in the plane of the optical centre
+    settings["unit_of_file"], _ = scale_to_mm(points, path, unit or stored.unit, "check --unit")
     count = int(np.isfinite(points[..., 0]).sum())
     if count < LEAST_POINTS and given is None:
         raise InputError(path, "", f"{count} points", f"{LEAST_POINTS} or more")
@@ -203,8 +205,9 @@ def read_organised_cloud(
     settings |= found
     images = {} if stored.grey is None else {next(iter(rig.cameras)): stored.grey[None]}
     points = rig.reference.sensor_from_camera.points(points).astype(np.float32)
-    if given is not None and "off_the_rays_px" in found and given.notes:
-        settings["warnings"] = list(given.notes)
+    notes = given.notes if given is not None and "off_the_rays_px" in found else ()
+    if warnings := [each for each in (stored.note, *notes) if each]:
+        settings["warnings"] = warnings
     near, far = (given.range_mm if given else None) or (None, None)
     return Capture(
         sensor=sensor or (given.sensor if given else "") or "point-cloud",
@@ -234,50 +237,12 @@ def _on_grid(
         of_pcd = stored.points.ndim == 3
         field, found = ("HEIGHT", "1: a cloud") if of_pcd else ("", f"{count} points")
         error = NoGridError(stored.path, field, f"{found} without a grid", "an organised cloud", hint)
-        error.points = stored.points.reshape(-1, 3)
+        error.stored = replace(stored, points=stored.points.reshape(-1, 3))
         raise error
     if size[0] * size[1] != count:
         allowed = f"{size[0]} x {size[1]}, one for each pixel"
         raise InputError(stored.path, "", f"{count} points", allowed, hint)
     return stored.points.reshape(size[1], size[0], 3).copy(), given
-
-
-def scale_to_mm(points: NDArray[np.floating], path: Path, unit: str | None = None, hint: str = "") -> tuple[str, float]:
-    """Scale points (..., 3) of a file to mm, in place; missing ones, (0, 0, 0) or without a number, become NaN.
-
-    Parameters
-    ----------
-    points
-        As in the file.
-    path
-        The file, for messages.
-    unit
-        One of :data:`~mitsim.sensor.calibration_qualifiers.LENGTHS_MM`; by default metres if the median distance is
-        under :data:`METRES_UNDER`, else millimetres.
-    hint
-        What to do if the points are too far away.
-
-    Returns
-    -------
-    tuple of str and float
-        The unit, and the median distance of the points from the origin in it.
-
-    Raises
-    ------
-    InputError
-        If there is no point, or one is beyond :data:`FARTHEST_MM`.
-    """
-    points[~np.isfinite(points).all(axis=-1) | (points == 0).all(axis=-1)] = np.nan
-    seen = points[np.isfinite(points[..., 0])]
-    if not len(seen):
-        raise InputError(path, "", "no points", "a cloud with x, y and z")
-    distance = float(np.median(np.linalg.norm(seen.astype(float), axis=-1)))
-    unit = unit or ("m" if distance < METRES_UNDER else "mm")
-    farthest = float(np.abs(seen).max()) * LENGTHS_MM[unit]
-    if farthest > FARTHEST_MM:
-        raise InputError(path, "x, y, z", f"{farthest:.3g} mm", f"up to {FARTHEST_MM:g} mm", hint)
-    points *= LENGTHS_MM[unit]
-    return unit, distance
 
 
 def _seen_by(

@@ -101,13 +101,13 @@ def _with_lens(points: NDArray[np.floating], start: tuple[float, float, float, f
 
 
 def grid_of(points: NDArray[np.floating]) -> tuple[int, int] | None:
-    """Return (width, height) [px] of a cloud (n, 3) whose points are in row order, missing ones as NaN or (0, 0, 0).
+    """Return (width, height) [px] of a cloud (n, 3) whose points are in row order, missing ones as NaN or with z = 0.
 
     Every width that divides n is tried; the grid is the one whose points lie on the view rays of a camera at the
     origin, with either direction of the axes. None if there is none, as of a cloud that omits missing points.
     """
     count = len(points)
-    seen = np.isfinite(points).all(axis=-1) & (points != 0).any(axis=-1)
+    seen = np.isfinite(points).all(axis=-1) & (points[:, 2] != 0)
     places = np.flatnonzero(seen)
     if len(places) < LEAST_POINTS:
         return None

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
+from mitsim.capture.recordings.cloud_numbers import unit_in
 from mitsim.capture.recordings.number_text import number_words
 
 _TYPES = {
@@ -45,7 +46,9 @@ _MOST_LISTS = 20_000_000
 
 @dataclass(frozen=True)
 class Ply:
-    """``points`` (n, 3) float32 as in the file; ``size`` (width, height) of the grid if stated; header ``lines``.
+    """``points`` (n, 3) float32 as in the file, and the ``lines`` of its header.
+
+    ``size`` (width, height) of the grid and ``unit`` of length are None if the file does not state them.
 
     Points are in row order, missing ones as NaN or zeros. Points of a range grid, which omits missing ones, have been
     put in their places.
@@ -54,6 +57,7 @@ class Ply:
     points: NDArray[np.float32]
     size: tuple[int, int] | None
     lines: tuple[str, ...]
+    unit: str | None = None
 
 
 @dataclass(frozen=True)
@@ -114,7 +118,7 @@ def decode_ply(data: bytes, where: str | Path) -> Ply:
     grid = tables.get("range_grid")
     if size is not None and isinstance(grid, list):
         points = _placed(points, grid, size, where)
-    return Ply(points, size, lines)
+    return Ply(points, size, lines, unit_in(line for line in lines if line.startswith(("comment", "obj_info"))))
 
 
 def _elements(lines: tuple[str, ...], where: str | Path) -> tuple[str, list[_Element]]:

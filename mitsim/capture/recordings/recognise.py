@@ -75,6 +75,14 @@ _NOT_READ = {
         "a cloud that PhoXi Control saves as organised PLY",
         "open it in PhoXi Control and save it as PLY, in camera space, not unorganised",
     ),
+    **dict.fromkeys(
+        (".e57", ".las", ".laz", ".ptx", ".vtk", ".vtp", ".dae"),
+        ("a cloud in a format that is not read", "PLY, PCD or text", "convert it, as with CloudCompare"),
+    ),
+    **dict.fromkeys(
+        (".stl", ".obj", ".off", ".3mf", ".glb", ".step", ".stp"),
+        ("the file of a part or a mesh", "a cloud: PLY, PCD or text", "mitsim part makes a scene of a part"),
+    ),
     ".mkv": (
         "a video; of Azure Kinect's recordings the depth is not read",
         "its depth images, 16-bit PNG",
@@ -107,6 +115,8 @@ def kind_of(path: str | Path, *, sensor: str | None = None, calibration: str | N
         begin = stream.read(64)
     if path.suffix.lower() == ".npz":
         return "npy"
+    if path.suffix.lower() == ".3mf":  # a zip
+        raise InputError(path, "", *_NOT_READ[".3mf"])
     if begin.startswith(MCAP_MAGIC):
         return _kind_of_mcap(path)
     for mark, kind in _MARKS.items():

@@ -21,6 +21,7 @@ from characterisation.files.errors import InputError, nearest
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.capture.recordings.calibration_file import Calibrated, calibrated_by, camera_of, read_calibration
+from mitsim.capture.recordings.cloud_numbers import leave_out_marks
 from mitsim.capture.recordings.depth_image import depth_capture
 from mitsim.capture.recordings.organised_cloud import StoredCloud
 from mitsim.capture.recordings.recording_files import chosen_frame
@@ -127,15 +128,16 @@ def read_ros_cloud(chosen: Chosen, frame: int | None) -> StoredCloud:
     bag, topic = chosen.bag, chosen.topics[0]
     number = chosen_frame(frame, topic.count, bag.path, f"messages of {topic.name}")
     message = read_message(bag, topic, number)
-    points = points_of(message, label_of(topic, bag.path))
+    points = np.array(points_of(message, label_of(topic, bag.path)))
+    note = leave_out_marks(points)
     height, width = points.shape[:2]
     records = {"topic": topic.name} | _stamp(message)
     if min(height, width) < 2:
-        return StoredCloud(bag.path, points, None, records)
+        return StoredCloud(bag.path, points, None, records, note=note)
     camera = None
     with suppress(InputError):  # then the camera is fitted to the points
         camera = replace(_calibrated(chosen, (width, height), None), nominal=True)
-    return StoredCloud(bag.path, points, (width, height), records, camera)
+    return StoredCloud(bag.path, points, (width, height), records, camera, note=note)
 
 
 def read_ros_depth(

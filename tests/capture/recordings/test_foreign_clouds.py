@@ -94,6 +94,38 @@ def test_zeros_are_no_points(tmp_path):
     np.testing.assert_array_equal(capture.derived["points"], CLOUD)
 
 
+@pytest.mark.parametrize("mark", [(-1.0, -1.0, -1.0), (0.0, 0.0, -1.0), (5.0, 6.0, 0.0), (1e4, 1e4, 1e4)])
+@pytest.mark.parametrize("ending", ["pcd", "ply"])
+def test_points_that_stand_for_missing_ones_leave_the_grid(tmp_path, ending, mark):
+    """Before, a PLY lost its grid by them, and those of a PCD were points."""
+    points = CLOUD.copy()
+    points[np.isnan(CLOUD[..., 0])] = mark
+    if mark[2] == 0:  # pixels without a depth, whose x and y the program keeps
+        points[np.isnan(CLOUD[..., 0]), 0] = np.arange(np.isnan(CLOUD[..., 0]).sum())
+    content = pcd(points, "binary") if ending == "pcd" else ply(points, "binary_little_endian", grid="none")
+    capture = read_organised_cloud(save(tmp_path / f"a.{ending}", content))
+    np.testing.assert_array_equal(capture.derived["points"], CLOUD)
+    assert ("left out, since" in str(capture.settings.get("warnings"))) == (mark[2] != 0)
+
+
+def test_the_unit_in_a_remark_of_a_ply_counts(tmp_path):
+    content = ply(CLOUD * 1000, "ascii").replace(b"\nelement", b"\ncomment units: micrometers\nelement", 1)
+    capture = read_organised_cloud(save(tmp_path / "a.ply", content))
+    assert capture.settings["unit_of_file"] == "um"
+    np.testing.assert_allclose(capture.derived["points"], CLOUD, rtol=1e-6)
+    given = read_organised_cloud(tmp_path / "a.ply", unit="mm")
+    assert given.settings["unit_of_file"] == "mm"
+
+
+def test_options_of_depths_and_of_points_are_told_apart(tmp_path):
+    np.save(tmp_path / "depth.npy", np.full((48, 64), 700.0))
+    with pytest.raises(InputError, match="--unit for an array of depths"):
+        read_recording(tmp_path / "depth.npy", ReadOptions(unit="mm", calibration=str(pinhole(tmp_path))))
+    np.save(tmp_path / "points.npy", CLOUD)
+    with pytest.raises(InputError, match="--scale for an array of points"):
+        read_recording(tmp_path / "points.npy", ReadOptions(scale_mm=0.1))
+
+
 def test_clouds_with_y_up_are_refused_or_turned(tmp_path):
     path = save(tmp_path / "up.pcd", pcd(CLOUD * np.array([1, -1, -1], np.float32), "binary"))
     with pytest.raises(InputError, match=r"behind the camera.*--axes opengl"):
@@ -243,6 +275,42 @@ def test_a_depth_image_becomes_points_on_its_cameras_rays(tmp_path, name, scale,
     columns = np.nonzero(known)[1]
     x = (columns - 31.3) / 60 * levels[known] * scale
     np.testing.assert_allclose(cloud.points[known][:, 0], x, rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("mark", "kind", "warning"),
+    [
+        (-1.0, np.float32, "a depth under 0"),
+        (-9999.0, np.float64, "a depth under 0"),
+        (1e10, np.float32, "the same depth of 1e+10"),
+        (np.finfo(np.float32).max, np.float32, "the same depth of 3.4"),
+        (60000, np.uint16, "the same depth of 60000"),
+        (-1, np.int16, "a depth under 0"),
+        (-1, np.int32, "a depth under 0"),
+        (np.inf, np.float32, None),
+    ],
+)
+def test_levels_that_no_surface_has_are_missing(tmp_path, mark, kind, warning):
+    """Before, most of these were refused, and a depth of 60000 was one of 60 m."""
+    hole = np.isnan(CLOUD[..., 2])
+    levels = np.where(hole, 0, np.rint(CLOUD[..., 2])).astype(kind)
+    levels[hole] = mark
+    assert cv2.imwrite(str(tmp_path / "depth.tif"), levels)
+    capture = read_depth_image(tmp_path / "depth.tif", pinhole(tmp_path))
+    np.testing.assert_array_equal(capture.derived["depth"], np.where(hole, np.nan, np.rint(CLOUD[..., 2])))
+    told = capture.settings.get("warnings", [])
+    assert warning is None or [warning in each for each in told] == [True]
+    assert warning is not None or not told
+
+
+def test_a_wall_far_behind_is_a_surface(tmp_path):
+    levels = np.where(np.isnan(CLOUD[..., 2]), 6500, np.rint(CLOUD[..., 2])).astype(np.uint16)
+    capture = read_depth_image(depth_png(tmp_path, levels), pinhole(tmp_path))
+    assert np.isfinite(capture.derived["depth"]).all()
+    only_behind = np.where(np.isnan(CLOUD[..., 2]), 0, -CLOUD[..., 2])
+    assert cv2.imwrite(str(tmp_path / "behind.tif"), only_behind)
+    with pytest.raises(InputError, match="check --scale"):
+        read_depth_image(tmp_path / "behind.tif", pinhole(tmp_path))
 
 
 def test_what_is_wrong_with_a_depth_image_is_named(tmp_path):

@@ -101,6 +101,9 @@ def test_folders_are_told_by_the_names_in_them(tmp_path):
         kind_of(tmp_path / "i")
     with pytest.raises(InputError, match="no such file or folder"):
         kind_of(tmp_path / "nowhere")
+    for name, told in (("x.e57", "CloudCompare"), ("x.stl", "mitsim part"), ("x.3mf", "mitsim part")):
+        with pytest.raises(InputError, match=told):
+            kind_of(save(tmp_path / name, b"PK\x03\x04" if name == "x.3mf" else b"hello"))
     with pytest.raises(InputError, match=r"unknown kind.*--as"):
         kind_of(save(tmp_path / "x.docx", b"hello"))
 

@@ -120,6 +120,41 @@ def test_pairs_that_cannot_be_measured_are_refused():
         WindowPlan(features, [("distance", "a", "bal")]).check()
 
 
+BALL = sphere([0, 0, 450], 20), plane([0, 0, 470], [0, 0.3, -1])
+ROD = cylinder([0, 0, 470], [1, 0.1, 0.05], 15), plane([0, 0, 490], [0, 0.3, -1])
+PIN = cylinder([0, 0, 470], [0, 1, 0.2], 15), plane([0, 30, 470], [0, 1, 0.2])
+
+
+@pytest.mark.parametrize(
+    ("shape", "seen", "diameter", "margin"),
+    [("sphere", BALL, 40, 0), ("sphere", BALL, 40, 2), ("cylinder", ROD, 30, 0), ("cylinder", PIN, 30, 3)],
+)
+def test_a_window_about_a_ball_or_a_rod_shows_what_is_behind_it(shape, seen, diameter, margin):
+    """Corners of the window made a ball of 50 mm one of 63 mm, and the end of a pin's plate one of 1100 mm."""
+    front, behind = seen
+    cloud = cloud_of(np.fmin(front, behind), 0.02, np.random.default_rng(1))
+    on_it = front < np.where(np.isnan(behind), np.inf, behind)
+    rows, columns = np.nonzero(on_it)
+    left, top = max(columns.min() - margin, 0), max(rows.min() - margin, 0)
+    right, bottom = columns.max() + 1 + margin, rows.max() + 1 + margin
+    window = Roi(left, top, min(right, GRID.width) - left, min(bottom, GRID.height) - top)
+    assert np.mean(on_it[window.slices]) < 0.95
+    found = by_name(measure_windows(cloud, WindowPlan({"it": (shape, window)})))
+    value = found["it diameter"]
+    assert value.value == pytest.approx(diameter, abs=6 * value.uncertainty)
+    assert found["it noise"].value == pytest.approx(0.02, rel=0.2)
+
+
+@pytest.mark.parametrize("step", [-10.0, -3.0, 3.0, 10.0])
+def test_a_step_in_a_third_of_a_window_does_not_turn_the_plane(step):
+    """A step of 10 mm turned the plane by 5 deg, with all points on it and a noise of 3 mm for 0.02 mm."""
+    low, high = plane([0, 0, 500], [0, 0, -1]), plane([0, 0, 500 + step], [0, 0, -1])
+    seen = np.where(np.arange(GRID.width) < 0.3 * GRID.width, high, low)
+    found = by_name(measure_windows(cloud_of(seen, 0.02, np.random.default_rng(1)), WindowPlan({"a": ("plane", None)})))
+    assert abs(found["a normal x"].value) < 6 * found["a normal x"].uncertainty
+    assert found["a noise"].value == pytest.approx(0.02, rel=0.1)
+
+
 @settings(max_examples=30)
 @given(
     lean=st.floats(-0.9, 0.9),

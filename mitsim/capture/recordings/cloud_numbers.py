@@ -1,0 +1,126 @@
+"""Know what the numbers in a cloud's file mean: their unit of length, and the points that stand for missing ones.
+
+Signal chain: numbers of x, y and z, and the words of the file about them -> missing points as NaN -> mm.
+
+Programs mark a missing point by NaN, by (0, 0, 0), or by another point that no surface has, such as (-1, -1, -1): the
+same numbers again and again.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.files.errors import InputError
+from mitsim.sensor.calibration_qualifiers import LENGTHS_MM, UNITS_MM
+
+#: median distance of the points, in the file's numbers, below which the unit is metres. All sensors here measure
+#: between 20 mm and 20 m
+METRES_UNDER = 20.0
+
+#: median distance above which the unit is neither metres nor millimetres, or the coordinates have an offset
+_NEITHER_ABOVE = 20_000.0
+
+#: coordinates beyond this are not measurements [mm]
+FARTHEST_MM = 1e6
+
+#: a point that is repeated this often, and in this share of the points, marks missing ones; noise repeats none
+_LEAST_REPEATS, _LEAST_SHARE = 10, 0.005
+
+#: most points of which a repeated one is looked for
+_SAMPLE = 4000
+
+#: how often the most frequent point occurs at least, over the second most; points on a raster all repeat
+_MORE_THAN_OTHERS = 4
+
+_STATED = re.compile(r"\bunits?\b\s*(?:\bof length\b)?[\s:=,;]*[\"'(\[]?([a-zµμ]+)")
+
+
+def unit_in(lines: Iterable[str]) -> str | None:
+    """Return the unit of length that one of some lines states, such as ``units: mm``; None without one."""
+    for line in lines:
+        for word in _STATED.findall(line.lower()):
+            if word in UNITS_MM:
+                return unit_named(word)
+    return None
+
+
+def unit_named(word: str) -> str:
+    """Return the name of a unit of length in :data:`~mitsim.sensor.calibration_qualifiers.LENGTHS_MM`."""
+    size = UNITS_MM[word]
+    return next(name for name, each in LENGTHS_MM.items() if each == size)
+
+
+def leave_out_marks(points: NDArray[np.floating]) -> str:
+    """Set the points (n, 3) or (H, W, 3) that stand for missing ones to NaN, in place; return a note, or nothing.
+
+    These are (0, 0, 0), points without three finite numbers, and a point that is repeated as no measured one is.
+    """
+    missing = ~np.isfinite(points).all(axis=-1) | (points == 0).all(axis=-1)
+    points[missing] = np.nan
+    places = np.flatnonzero(~missing)
+    if len(places) < _LEAST_REPEATS:
+        return ""
+    flat = points.reshape(-1, 3)
+    chosen = places[np.linspace(0, len(places) - 1, min(_SAMPLE, len(places))).astype(np.intp)]
+    values, counts = np.unique(flat[chosen], axis=0, return_counts=True)
+    order = np.argsort(counts)
+    most, second = counts[order[-1]], counts[order[-2]] if len(counts) > 1 else counts[order[-1]]
+    if most < max(_LEAST_SHARE * len(chosen), 3) or most < _MORE_THAN_OTHERS * second:
+        return ""
+    mark = values[order[-1]]
+    marked = (points == mark).all(axis=-1)
+    count = int(marked.sum())
+    if count < _LEAST_REPEATS:
+        return ""
+    points[marked] = np.nan
+    shown = ", ".join(f"{each:g}" for each in mark)
+    return f"{count} points are all ({shown}): left out, since measured points do not repeat"
+
+
+def scale_to_mm(points: NDArray[np.floating], path: Path, unit: str | None = None, hint: str = "") -> tuple[str, float]:
+    """Scale points (..., 3) of a file to mm, in place; missing ones are NaN or (0, 0, 0), and become NaN.
+
+    Parameters
+    ----------
+    points
+        As in the file.
+    path
+        The file, for messages.
+    unit
+        One of :data:`~mitsim.sensor.calibration_qualifiers.LENGTHS_MM`; by default metres if the median distance is
+        under :data:`METRES_UNDER`, else millimetres.
+    hint
+        What to do if the points are too far away.
+
+    Returns
+    -------
+    tuple of str and float
+        The unit, and the median distance of the points from the origin in it.
+
+    Raises
+    ------
+    InputError
+        If there is no point, one is beyond :data:`FARTHEST_MM`, or the unit is neither given nor plausible.
+    """
+    points[~np.isfinite(points).all(axis=-1) | (points == 0).all(axis=-1)] = np.nan
+    seen = points[np.isfinite(points[..., 0])]
+    if not len(seen):
+        raise InputError(path, "", "no points", "a cloud with x, y and z")
+    distance = float(np.median(np.linalg.norm(seen.astype(float), axis=-1)))
+    if unit is None and distance > _NEITHER_ABOVE:
+        found = f"points at a median distance of {distance:.4g}, in a unit that the file does not state"
+        allowed = f"up to {METRES_UNDER:g} in m, or {_NEITHER_ABOVE:g} in mm, from the sensor at the origin"
+        raise InputError(
+            path, "x, y, z", found, allowed, "name the unit: --unit um; or subtract an offset of the coordinates"
+        )
+    unit = unit or ("m" if distance < METRES_UNDER else "mm")
+    farthest = float(np.abs(seen).max()) * LENGTHS_MM[unit]
+    if farthest > FARTHEST_MM:
+        raise InputError(path, "x, y, z", f"{farthest:.3g} mm", f"up to {FARTHEST_MM:g} mm", hint)
+    points *= LENGTHS_MM[unit]
+    return unit, distance
