@@ -88,8 +88,20 @@ def radius_uncertainty(normals: np.ndarray, areas: np.ndarray) -> float:
 def fitted_chords(faces: list[Any], kinds: list[str], chord: float, others: float, fitted: float) -> np.ndarray:
     """Return the chord (n,) of each meshed face: ``chord``, or more where a radius is fitted with a larger uncertainty.
 
-    ``fitted`` is the chord of a face whose radius has the standard uncertainty 1, as for :func:`mesh`. The result is
-    ``others`` at most, in steps of a factor sqrt(2), since faces of one chord are meshed together.
+    Chords differ in steps of a factor sqrt(2), since faces of one chord are meshed together.
+
+    Parameters
+    ----------
+    faces, kinds
+        Meshed faces, and the kinds of their surfaces.
+    chord, others
+        Least and largest chord.
+    fitted
+        Chord of a face whose radius has the standard uncertainty 1, as for :func:`mesh`.
+
+    See Also
+    --------
+    radius_uncertainty : of a face
     """
     out = np.full(len(faces), chord)
     for number, (face, kind) in enumerate(zip(faces, kinds, strict=True)):
