@@ -61,9 +61,14 @@ def mesh_facts(vertices: Floats, triangles: NDArray[np.int64], merge: float, tex
     longest = np.max([np.linalg.norm(side, axis=1) for side in (b - a, c - b, a - c)], axis=0, initial=0.0)
     degenerate = area <= merge * longest
     regular = triangles[~degenerate]
-    duplicate = len(regular) - len(np.unique(np.sort(regular, axis=1), axis=0)) if len(regular) else 0
-    edges = np.sort(regular[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    edges, count = np.unique(edges, axis=0, return_counts=True) if len(edges) else (edges, np.empty(0, int))
+    low, middle, high = np.sort(regular, axis=1).T
+    # one whole number for each pair of vertices: rows of several numbers take six times as long to sort
+    size = max(len(vertices), 1)
+    first_edges = np.unique(low * size + middle, return_inverse=True)[1]
+    duplicate = len(regular) - len(np.unique(first_edges * size + high))
+    pairs = np.concatenate([low * size + middle, middle * size + high, low * size + high])
+    pairs, count = np.unique(pairs, return_counts=True)
+    edges = np.stack(np.divmod(pairs, size), axis=1)
     open_edges, nonmanifold = int((count == 1).sum()), int((count > 2).sum())
     centre = vertices.mean(axis=0) if len(vertices) else np.zeros(3)
     volume = float(np.einsum("ij,ij->", a - centre, np.cross(b - centre, c - centre)) / 6)

@@ -67,11 +67,15 @@ class Fineness:
     - ``chord_mm`` of faces that a task can measure.
     - ``others_mm`` of tori and free forms; None for the same.
     - ``most`` triangles of a file, beyond which the largest faces become coarser, measured ones first; None: no limit.
+    - ``fitted_mm2``: chord error [mm] of a sphere or cylinder per standard uncertainty of its fitted radius, for one
+      point of noise 1 on each mm^2. Faces of few points have up to ``others_mm``; None: all have ``chord_mm``. It needs
+      ``most``.
     """
 
     chord_mm: float = CHORD_MM
     others_mm: float | None = None
     most: int | None = None
+    fitted_mm2: float | None = None
 
 
 @dataclass(frozen=True)
@@ -119,6 +123,7 @@ def read_step(path: str | Path, fineness: Fineness = _DEFAULT, units: str | None
             repr(scale),
             repr(_requested(fineness.others_mm or fineness.chord_mm)),
             repr(fineness.most or 0),
+            repr((fineness.fitted_mm2 or 0.0) / 2),  # as the others, for what OpenCASCADE exceeds
         ]
         done = run_worker(command, path)
         if "ImportError" in done.stderr or "ModuleNotFoundError" in done.stderr:

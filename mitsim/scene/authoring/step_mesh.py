@@ -1,7 +1,8 @@
 """Mesh faces with OpenCASCADE, as finely as asked, and report the progress on stdout.
 
-Signal chain: faces -> a coarse mesh, which counts triangles -> chord of each face within the number of triangles ->
-meshes, finest first, that share their points on edges -> vertices, normals and triangles of each face.
+Signal chain: faces -> a coarse mesh, which counts triangles and shows how well a radius can be fitted -> chord of each
+face within the number of triangles -> meshes, finest first, that share their points on edges -> vertices, normals and
+triangles of each face.
 
 It imports no other module of ``mitsim``, as :mod:`mitsim.scene.authoring.step_worker`, whose process runs it.
 """
@@ -67,8 +68,59 @@ def triangle_count(face: Any) -> int:
     return 0 if made is None else int(made.NbTriangles())
 
 
+def radius_uncertainty(normals: np.ndarray, areas: np.ndarray) -> float:
+    """Return the standard uncertainty of a fitted radius, for one point of noise 1 per unit of area.
+
+    The points of a sphere or cylinder depend on its radius by 1, and on its centre by their normal n. With their means
+    <.> over the area A the least squares leave the variance of the radius 1 / (A (1 - <n> <n n^T>^-1 <n>)).
+
+    Parameters
+    ----------
+    normals, areas
+        Unit normals (m, 3) of the facets, and their areas (m,).
+    """
+    share = areas / areas.sum()
+    mean, product = share @ normals, (normals * share[:, None]).T @ normals
+    left = 1.0 - mean @ np.linalg.pinv(product, rcond=1e-9) @ mean
+    return float(1 / np.sqrt(areas.sum() * max(left, 1e-9)))
+
+
+def fitted_chords(faces: list[Any], kinds: list[str], chord: float, others: float, fitted: float) -> np.ndarray:
+    """Return the chord (n,) of each meshed face: ``chord``, or more where a radius is fitted with a larger uncertainty.
+
+    Chords differ in steps of a factor sqrt(2), since faces of one chord are meshed together.
+
+    Parameters
+    ----------
+    faces, kinds
+        Meshed faces, and the kinds of their surfaces.
+    chord, others
+        Least and largest chord.
+    fitted
+        Chord of a face whose radius has the standard uncertainty 1, as for :func:`mesh`.
+
+    See Also
+    --------
+    radius_uncertainty : of a face
+    """
+    out = np.full(len(faces), chord)
+    for number, (face, kind) in enumerate(zip(faces, kinds, strict=True)):
+        made = triangles_of(face) if kind in ("sphere", "cylinder") else None
+        if made is None:
+            continue
+        a, b, c = np.moveaxis(made[0][made[2]], 1, 0)
+        across = np.cross(b - a, c - a)
+        length = np.linalg.norm(across, axis=1)
+        facets = length > 0
+        if facets.any():
+            normals = across[facets] / length[facets, None]
+            wanted = np.clip(fitted * radius_uncertainty(normals, length[facets] / 2), chord, others)
+            out[number] = chord * 2.0 ** (np.floor(2 * np.log2(wanted / chord)) / 2)
+    return out
+
+
 def chords(
-    kinds: list[str], counts: np.ndarray, coarse: float, chord: float, others: float, most: int
+    kinds: list[str], counts: np.ndarray, coarse: float, chord: float | np.ndarray, others: float, most: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the chord (n,) of each face, and about how many triangles (n,) it will have.
 
@@ -81,7 +133,7 @@ def chords(
     kinds, counts, coarse
         Kinds (n,) of the surfaces, and their triangles (n,) at the chord ``coarse``.
     chord, others
-        Of faces that a task can measure, and of other faces.
+        Of faces that a task can measure, one or for each face, and of other faces.
     most
         Triangles of all faces.
 
@@ -105,10 +157,17 @@ def chords(
     return out, expected()
 
 
-def mesh(
-    shapes: list[Any], faces: list[Any], kinds: list[str], chord: float, bend: float, others: float, most: int
+def mesh(  # noqa: PLR0913 - one number each
+    shapes: list[Any],
+    faces: list[Any],
+    kinds: list[str],
+    chord: float,
+    bend: float,
+    others: float,
+    most: int,
+    fitted: float = 0.0,
 ) -> float:
-    """Mesh all faces, finest first; return the largest chord of a measured face.
+    """Mesh all faces, finest first; return the chord that the limit of triangles leaves of ``chord``.
 
     If Delabella leaves a face without triangles, the other way meshes it again.
 
@@ -118,6 +177,9 @@ def mesh(
         To be meshed, all faces of them, the kinds of their surfaces, and the angle between facets [rad].
     chord, others, most
         As for :func:`chords`; 0 triangles is no limit.
+    fitted
+        Chord [mm] of a sphere or cylinder whose radius a fit determines with the standard uncertainty 1, for one point
+        of noise 1 on each mm^2; 0: all measured faces have ``chord``.
 
     See Also
     --------
@@ -126,15 +188,17 @@ def mesh(
     if not faces:
         return chord
     measured = np.array([kind in MEASURED for kind in kinds])
-    chord_of, planned = np.where(measured, chord, others), np.ones(len(faces))
+    chord_of, planned, coarsened = np.where(measured, chord, others), np.ones(len(faces)), 1.0
     if most:
         from OCP.BRepTools import BRepTools
 
         mesh_together(faces, _COARSER * chord, _FLAT)
         counts = np.array([triangle_count(face) for face in faces], float)
+        wanted = fitted_chords(faces, kinds, chord, others, fitted) if fitted else np.full(len(faces), chord)
         for shape in shapes:
             BRepTools.Clean_s(shape)
-        chord_of, planned = chords(kinds, counts, _COARSER * chord, chord, others, most)
+        chord_of, planned = chords(kinds, counts, _COARSER * chord, wanted, others, most)
+        coarsened = float((chord_of / wanted)[measured].max(initial=1.0))
     order = np.lexsort((planned, chord_of))
     made, told = np.cumsum(planned[order]), 0.0
     for number, here in enumerate(order):
@@ -147,7 +211,7 @@ def mesh(
     for number, face in enumerate(faces):
         if not triangle_count(face):
             mesh_together([*(one for one in faces if triangle_count(one)), face], float(chord_of[number]), bend, False)
-    return float(chord_of[measured].max(initial=chord))
+    return chord * coarsened
 
 
 def triangles_of(face: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:

@@ -8,7 +8,7 @@ B-splines, extrusions and revolutions within :data:`SAME_MM` of a simple surface
 
 ::
 
-    python -m mitsim.scene.authoring.step_worker PART.step OUT.npz CHORD_MM BEND_RAD UNIT_MM OTHERS_MM MOST
+    python -m mitsim.scene.authoring.step_worker PART.step OUT.npz CHORD_MM BEND_RAD UNIT_MM OTHERS_MM MOST FITTED_MM2
 
 UNIT_MM is the size of the unit that OpenCASCADE takes for mm: 1, except in a file that states no unit. Tori and free
 forms are meshed to OTHERS_MM. The largest faces become coarser where all would have over MOST triangles; 0 is no limit
@@ -211,7 +211,7 @@ class Surfaces:
         return found
 
 
-def convert(
+def convert(  # noqa: PLR0913 - the arguments of the command
     path: str,
     out: str,
     chord_mm: float,
@@ -219,6 +219,7 @@ def convert(
     unit_mm: float = 1.0,
     others_mm: float | None = None,
     most: float = 0,
+    fitted_mm2: float = 0.0,
 ) -> None:
     """Write the faces of a STEP file as an NPZ of arrays and a JSON ``text``.
 
@@ -226,7 +227,7 @@ def convert(
     ----------
     path, out
         The STEP file, and the NPZ.
-    chord_mm, bend, others_mm, most
+    chord_mm, bend, others_mm, most, fitted_mm2
         As for :func:`mesh`.
     unit_mm
         Factor on all lengths.
@@ -267,7 +268,8 @@ def convert(
     shapes = [shape for _, shape, _ in there]
     surfaces = Surfaces(shapes, SAME_MM / unit_mm)
     kinds = [surfaces.of(face)["kind"] for face in surfaces.faces]
-    largest = mesh(shapes, surfaces.faces, kinds, chord_mm / unit_mm, bend, others / unit_mm, int(most))
+    fitted = fitted_mm2 / unit_mm**2
+    largest = mesh(shapes, surfaces.faces, kinds, chord_mm / unit_mm, bend, others / unit_mm, int(most), fitted)
     for name, shape, part_colour in there:
         edges = TopTools_IndexedMapOfShape()
         TopExp.MapShapes_s(shape, TopAbs_EDGE, edges)
@@ -309,4 +311,4 @@ def convert(
 
 
 if __name__ == "__main__":
-    convert(sys.argv[1], sys.argv[2], *map(float, sys.argv[3:8]))
+    convert(sys.argv[1], sys.argv[2], *map(float, sys.argv[3:]))
