@@ -35,6 +35,7 @@ SETTINGS_TO_CHECK = (
     "subpixel_bits",
     "subpixel_bits_from",
     "bits_from",
+    "empty_bits",
     "channel",
 )
 

@@ -21,6 +21,7 @@ from characterisation.files.errors import InputError
 from characterisation.files.threads import in_threads
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
+from mitsim.capture.grey_bits import bits_of, from_bit_0
 from mitsim.capture.grey_image import CHANNELS, SUFFIXES, Image, channel_name, is_colour, read_grey
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.decoder_settings import DecoderSettings
@@ -54,7 +55,9 @@ def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNEL
     count = shown + sensor.ambient_image
     both = len(rig.cameras) == 2 and (decoder.triangulate == "cameras" or len(sensor.images or {}) == 2)
     used = list(rig.cameras) if both else list(rig.cameras)[:1]
-    images, names, colour = {}, {}, False
+    images: dict[str, Image] = {}
+    files: dict[str, list[Path]] = {}
+    names, colour = {}, False
     for name in used:
         found = _files(folder, sensor, name, len(used))
         if len(found) != count:
@@ -65,9 +68,17 @@ def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNEL
                 f"{count}, as the pattern of {sensor.name}",
                 advice(found, name, count, sensor.ambient_image) if found else _content(folder, used),
             )
-        images[name] = _stack(found, rig.cameras[name], sensor.bits, channel)
+        files[name] = found
+        images[name] = _stack(found, rig.cameras[name], channel)
         colour |= is_colour(found[0])
         names[name] = [path.relative_to(folder).as_posix() for path in found]
+    too_large = sensor.bits is not None and any(int(each.max()) >= 2**sensor.bits for each in images.values())
+    empty = 0
+    if sensor.bits is None or too_large:
+        images, empty = from_bit_0(images, sensor.bits)
+    if sensor.bits is not None:
+        for name, stack in images.items():
+            _check_levels(stack, files[name], sensor.bits)
     decoding = Decoding(
         decoder=decoder,
         pattern=described(code),
@@ -84,9 +95,11 @@ def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNEL
         settings["channel"] = channel_name(channel)
     bits = sensor.bits
     if bits is None:
-        bits = max(bits_of(stack) for stack in images.values())
+        bits = bits_of(images.values())
         if bits > 8:
             settings["bits_from"] = "the brightest pixel, since the sensor file has no imager.bits"
+    if empty:
+        settings["empty_bits"] = empty
     return Capture(
         sensor=sensor.name,
         technology=sensor.technology,
@@ -112,13 +125,6 @@ def size_of_images(folder: Path) -> tuple[int, int] | None:
     return None
 
 
-def bits_of(stack: Image) -> int:
-    """Return the bits of a camera from its images: 8 for 8-bit files, else the fewest that hold all levels."""
-    if stack.dtype == np.uint8:
-        return 8
-    return next(bits for bits in (10, 12, 14, 16) if stack.max() < 2**bits)
-
-
 def _files(folder: Path, sensor: Sensor, camera: str, cameras: int) -> list[Path]:
     """Return the image files of one camera, in order."""
     given = (sensor.images or {}).get(camera)
@@ -142,7 +148,7 @@ def _files(folder: Path, sensor: Sensor, camera: str, cameras: int) -> list[Path
     return sorted(own, key=counted)
 
 
-def _stack(files: list[Path], camera: Camera, bits: int | None, channel: int) -> Image:
+def _stack(files: list[Path], camera: Camera, channel: int) -> Image:
     """Return the images (P, H, W) of one camera."""
     first = read_grey(files[0], channel=channel)
     out = np.empty((len(files), camera.height, camera.width), first.dtype)
@@ -155,16 +161,27 @@ def _stack(files: list[Path], camera: Camera, bits: int | None, channel: int) ->
             raise InputError(path, "size", found, f"{camera.width} x {camera.height} px, as the calibration says")
         if image.dtype != first.dtype:
             raise InputError(path, "depth", f"{image.itemsize * 8} bits", f"{first.itemsize * 8}, as {files[0].name}")
-        if bits is not None and image.max() > 2**bits - 1:
-            hint = "set imager.bits to the camera's output; levels must begin at bit 0"
-            raise InputError(path, "grey level", image.max(), f"0 to {2**bits - 1}, since imager.bits is {bits}", hint)
         out[index] = image
 
     in_threads(read, range(len(files)))
-    if bits is not None and bits > 8 * first.itemsize:
+    return out
+
+
+def _check_levels(stack: Image, files: list[Path], bits: int) -> None:
+    """Check that images (P, H, W) have the bits that the sensor file states.
+
+    Raises
+    ------
+    InputError
+        If they have more, or are files of 8 bits that should have more.
+    """
+    for image, path in zip(stack, files, strict=True):
+        if image.max() > 2**bits - 1:
+            hint = "set imager.bits to the camera's output"
+            raise InputError(path, "grey level", image.max(), f"0 to {2**bits - 1}, since imager.bits is {bits}", hint)
+    if bits > 8 * stack.itemsize:
         hint = "set imager.bits to 8, or save the images with 16 bits"
         raise InputError(files[0], "depth", "8 bits", f"more: imager.bits is {bits}", hint)
-    return out
 
 
 def advice(found: list[Path], camera: str, count: int, ambient_image: bool) -> str:

@@ -20,6 +20,7 @@ import numpy as np
 from characterisation.files.errors import InputError, nearest
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
+from mitsim.capture.grey_bits import bits_of, from_bit_0
 from mitsim.capture.recordings.calibration_file import Calibrated, calibrated_by, camera_of, read_calibration
 from mitsim.capture.recordings.cloud_numbers import leave_out_marks
 from mitsim.capture.recordings.depth_image import depth_capture
@@ -246,6 +247,9 @@ def read_ros_pair(
     settings: dict[str, Any] = {"imported_from": bag.path.name, "topic": [left.name, right.name]} | _stamp(first)
     if calibrated.notes:
         settings["warnings"] = list(calibrated.notes)
+    shown, empty = from_bit_0(dict(zip(names, images, strict=True)))
+    if empty:
+        settings["empty_bits"] = empty
     near, far = calibrated.range_mm or (None, None)
     rig = calibrated.rig
     return Capture(
@@ -253,8 +257,8 @@ def read_ros_pair(
         technology="active_stereo",
         source="device",
         rig=Rig({name: rig.cameras[name] for name in names}, rig.projector, rig.rectification),
-        images={name: image[None] for name, image in zip(names, images, strict=True)},
-        bits=8 * images[0].itemsize,
+        images={name: image[None] for name, image in shown.items()},
+        bits=bits_of(shown.values()),
         decoding=Decoding(near_mm=near, far_mm=far),
         settings=settings,
     )

@@ -14,6 +14,7 @@ import numpy as np
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
+from mitsim.capture.grey_bits import bits_of, from_bit_0
 from mitsim.capture.grey_image import CHANNELS, SUFFIXES, channel_name, is_colour, read_grey
 from mitsim.capture.recordings.calibration_file import camera_of, read_calibration
 from mitsim.capture.recordings.image_folder import size_of_images
@@ -84,14 +85,17 @@ def read_stereo_pair(
         settings["channel"] = channel_name(channel)
     if read.notes:
         settings["warnings"] = list(read.notes)
+    shown, empty = from_bit_0(dict(levels))
+    if empty:
+        settings["empty_bits"] = empty
     near, far = read.range_mm or (None, None)
     return Capture(
         sensor=sensor or read.sensor or "stereo-pair",
         technology="active_stereo",
         source="device",
         rig=Rig({name: read.rig.cameras[name] for name in names}, read.rig.projector, read.rig.rectification),
-        images={name: np.asarray(image)[None] for name, image in levels.items()},
-        bits=8 * first.itemsize,
+        images={name: np.asarray(image)[None] for name, image in shown.items()},
+        bits=bits_of(shown.values()),
         decoding=Decoding(near_mm=near, far_mm=far),
         settings=settings,
     )

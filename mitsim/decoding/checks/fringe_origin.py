@@ -42,6 +42,10 @@ _HALF_PIXEL_MARGIN, _HALF_PIXEL_ERROR = 0.2, 0.1
 #: half a pixel, which the description of the fringes may be off, and half of that
 _UNUSUAL = 0.75
 
+#: deviation of a period from the one that the Gray code measures, relative to it, that is reported, in addition to five
+#: standard errors; and the ratio of the two above which the phases do not follow the Gray code at all
+_OTHER_PERIOD, _FOLLOWED = 0.02, 5.0
+
 #: largest gamma of a projector, that of the recording kamino_phaseshift rounded up
 _GAMMA = 2.6
 
@@ -57,12 +61,15 @@ class StripeEdges:
     - ``position`` (n,) of the edges from the projector's edge [projector px].
     - ``cycles`` (periods, n): phase there [cycles].
     - ``rising``: share of the steps of the phases that rise with the stripe's number [1].
+    - ``rates`` (periods,): change of the phase from edge to edge, over that of the position, and their standard errors
+      [cycles/px]; NaN if there are few edges.
     """
 
     by_one: float
     position: Floats
     cycles: Floats
     rising: float
+    rates: tuple[Floats, Floats]
 
     @property
     def bits_fit(self) -> bool:
@@ -83,6 +90,7 @@ def stripe_edges(images: CodeLines, axis: Axis) -> StripeEdges | None:
     shifts = [np.array([image_roles[i].shift for i in each]) for each in numbers]
     threshold = images.settings.minimum_modulation_dn * full_scale / 255
     found: list[tuple[Floats, Floats, Floats, Floats]] = []
+    between: list[Floats] = []
     for way, part in enumerate(images.lines):
         fitted = fit_phases(np.concatenate([part[each] for each in numbers]), shifts)
         white_minus_black = fitted.modulation[-1] / np.float32(code.contrast)
@@ -101,6 +109,7 @@ def stripe_edges(images: CodeLines, axis: Axis) -> StripeEdges | None:
         # the edge lies anywhere between the two pixels, in the middle on average
         middle_cycles = turns[:, :, :-1] + step / 2
         found.append((change[change != 0], position[at_edge], middle_cycles[:, at_edge], (step * change)[:, at_edge]))
+        between.append(_moves(step, clear[:, 1:] & clear[:, :-1] & (np.abs(change) <= 1), at_edge, position))
     changes, positions, cycles, rises = (np.concatenate(each, axis=-1) for each in zip(*found, strict=True))
     enough = len(changes) >= _ENOUGH
     return StripeEdges(
@@ -108,7 +117,34 @@ def stripe_edges(images: CodeLines, axis: Axis) -> StripeEdges | None:
         positions,
         cycles,
         float(np.mean(rises > 0)) if rises.size else float("nan"),
+        _rates(np.concatenate(between, axis=1)),
     )
+
+
+def _moves(step: Floats, clear: NDArray[np.bool_], at_edge: NDArray[np.bool_], position: Floats) -> Floats:
+    """Return the changes of the position and of each phase from one edge to the next along lines, (1 + periods, k).
+
+    ``step`` (periods, n, m) of the phases between neighbouring pixels [cycles]; ``clear``, ``at_edge`` and ``position``
+    (n, m) of the edges there. Edges with an unclear pixel or a jump between them are not compared.
+    """
+    followed = np.cumsum(np.where(clear, step, 0.0), axis=2) - step / 2
+    gaps = np.cumsum(~clear, axis=1)
+    row, _ = np.nonzero(at_edge)
+    together = (np.diff(row) == 0) & (np.diff(gaps[at_edge]) == 0) & (np.diff(position[at_edge]) != 0)
+    moves = np.concatenate([position[at_edge][None], followed[:, at_edge]])
+    return np.asarray(np.diff(moves, axis=1)[:, together])
+
+
+def _rates(moves: Floats) -> tuple[Floats, Floats]:
+    """Return the rates of moves (1 + periods, k), and their standard errors, (periods,) each; NaN if there are few.
+
+    The mean without the outer tenths, not the median: a gamma moves the phase at one edge of a fringe forth, and at the
+    next back.
+    """
+    if moves.shape[1] < _ENOUGH:
+        return (np.full(len(moves) - 1, np.nan),) * 2
+    inner = np.sort(moves[1:] / moves[0], axis=1)[:, moves.shape[1] // 10 : -(moves.shape[1] // 10)]
+    return inner.mean(axis=1), inner.std(axis=1) / np.sqrt(inner.shape[1])
 
 
 @dataclass(frozen=True)
@@ -178,6 +214,18 @@ def origin_in_words(edges: StripeEdges, images: CodeLines, axis: Axis) -> str:
     every = described(code, image_roles, axis)
     if not edges.bits_fit or edges.cycles.shape[1] < _ENOUGH:
         return ""
+    for fringes, rate, error in zip(every, np.abs(edges.rates[0]), edges.rates[1], strict=True):
+        if rate * fringes.period < 1 / _FOLLOWED:
+            return (
+                f"the phases of the fringes of the {axis} at {fringes.period:g} px do not follow the Gray code: check "
+                "that none of their images is missing or repeated"
+            )
+        off = abs(rate * fringes.period - 1) - 5 * error * fringes.period
+        if off > _OTHER_PERIOD:
+            return (
+                f"the fringes of the {axis} at {fringes.period:g} px change by one period over {1 / rate:.3g} px of "
+                "the Gray code: they fit if period_px or stripe_px of [pattern] is corrected"
+            )
     forward = edges.rising > 0.5
     measured = [
         PhaseDeviation.of(edges.position, fringes.period, cycles if forward else -cycles)

@@ -21,6 +21,7 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
 from mitsim.decoding.checks.code_lines import CodeLines, line_slices, lines_of
 from mitsim.decoding.checks.fringe_origin import origin_in_words, stripe_edges
+from mitsim.decoding.checks.fringe_steps import copies_in_words, steps_in_words
 from mitsim.decoding.checks.fringe_wave import wave_in_words
 from mitsim.decoding.checks.gray_origin import beyond_in_words
 from mitsim.decoding.coded_images import CodedImages
@@ -86,12 +87,14 @@ def image_warnings(images: CodedImages, camera: str, decoded: Mapping[Axis, Proj
     shape = stack.shape[1:]
     found = _smoothness([{axis: each.part(way) for axis, each in decoded.items()} for way in line_slices(shape)])
     for axis, own in found.items():
-        warning, order = _unresolved(rows, image_roles, axis, settings, camera), ""
+        warning = copies_in_words(lines, axis) or _unresolved(rows, image_roles, axis, settings, camera)
+        order = ""
         edges = None if warning else stripe_edges(lines, axis)
         if edges is not None:
             warning = origin_in_words(edges, lines, axis)
         elif not warning:
             warning = wave_in_words(lines, axis) or beyond_in_words(lines, axis)
+        warning = warning or steps_in_words(lines, axis)
         if warning and camera not in warning:
             warning = f"{camera}: {warning}"
         if not warning and (own.doubtful or own.evenness < _ASKED):

@@ -431,6 +431,21 @@ def test_a_stereo_pair_and_opencvs_calibration_measure_a_plane(tmp_path, rng):
         read_stereo_pair(tmp_path / "pair", calibration)
 
 
+@pytest.mark.parametrize(("factor", "bits", "empty"), [(16, 12, 0), (256, 8, 8), (4, 10, 0)])
+def test_a_pair_of_more_bits_has_the_contrast_of_one_of_eight(tmp_path, rng, factor, bits, empty):
+    """Before, 12 bits in files of 16 had a sixteenth of the contrast, and saturated pixels were not known."""
+    texture = cv2.GaussianBlur(rng.integers(0, 256, (60, 300)).astype(np.float32), (0, 0), 1.2)
+    texture = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint16)
+    low = 0 if empty else rng.integers(0, factor, texture.shape)
+    levels = (texture * factor + low).astype(np.uint16)
+    (tmp_path / "pair").mkdir()
+    for side, shift in (("left", 0), ("right", 24)):
+        depth_png(tmp_path / "pair", np.repeat(levels, 2, axis=0)[:, 50 + shift : 250 + shift], f"{side}.png")
+    capture = read_stereo_pair(tmp_path / "pair", save(tmp_path / "stereo.yml", STEREO.encode()))
+    assert (capture.bits, capture.settings.get("empty_bits", 0)) == (bits, empty)
+    assert capture.images["left"].max() == (255 if empty else levels[:, 50:250].max())
+
+
 def test_a_damaged_colour_image_is_not_half_read(tmp_path):
     (tmp_path / "pair").mkdir()
     colour = np.random.default_rng(3).integers(0, 256, (120, 200, 3)).astype(np.uint8)

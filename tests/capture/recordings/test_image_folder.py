@@ -127,8 +127,11 @@ def test_twelve_bits_come_in_files_of_sixteen(tmp_path):
     capture = read_image_folder(save(tmp_path / "images", stack), sensor)
     assert capture.bits == 12
     np.testing.assert_array_equal(capture.images["camera"], stack)
+    left = read_image_folder(save(tmp_path / "left", stack * 16), sensor)
+    np.testing.assert_array_equal(left.images["camera"], stack)
+    assert left.settings["empty_bits"] == 4
     with pytest.raises(InputError, match=r"imager.bits is 12"):
-        read_image_folder(save(tmp_path / "left", stack * 16), sensor)
+        read_image_folder(save(tmp_path / "odd", stack * 16 + 1), sensor)
     with pytest.raises(InputError, match=r"image_0.png: depth: found 8 bits"):
         read_image_folder(save(tmp_path / "eight", see_plane(sensor)), sensor)
 

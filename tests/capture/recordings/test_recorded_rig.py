@@ -212,6 +212,22 @@ def test_fringes_without_an_imager_have_the_sigma_of_their_own_noise_and_decode_
     assert np.isfinite(read_cloud(tmp_path / "cloud.ply").sigma).sum() > 5000
 
 
+@pytest.mark.parametrize("empty", [4, 6, 8])
+def test_levels_in_the_upper_bits_have_their_full_scale(tmp_path, empty):
+    """Before, pixels that 12 bits saturate were valid, since 4095 * 16 is not 65535."""
+    text = smallest().partition("[pattern]")[0] + '[pattern]\nkind = "phase_shift"\nperiods_px = [170, 16]\n'
+    file = written(tmp_path, text)
+    full = 2 ** (16 - empty) - 1
+    code = load_sensor(file, "decoding").pattern
+    stack = np.minimum(images_seen(code, CAMERA, PROJECTOR, surface_seen(CAMERA), full=full) * 1.5, full)
+    stack = stack.astype(np.uint16)
+    save_images(tmp_path / "upper", stack << empty)
+    run("import", tmp_path / "upper", "--sensor", file, "-o", tmp_path / "capture")
+    capture = read_capture(tmp_path / "capture")
+    assert (capture.bits, capture.settings["empty_bits"]) == (16 - empty, empty)
+    np.testing.assert_array_equal(capture.images["camera"], stack)
+
+
 def test_a_program_decodes_with_a_rig_and_cannot_simulate_it(tmp_path):
     file = written(tmp_path, smallest())
     rig, truth = ms.load_sensor(file, "decoding"), surface_seen(CAMERA)

@@ -85,6 +85,17 @@ def test_the_advice_for_fringes_beside_a_gray_code_gives_the_surface(stripe, wav
         assert 0.2 < np.mean(off > 100) < 0.35
 
 
+@pytest.mark.parametrize("period", [8, 15, 17, 32])
+@pytest.mark.parametrize("steps", [3, 4])
+def test_fringes_of_another_period_are_noticed_by_the_gray_code(period, steps):
+    """Before, no word was said of 16 px for 17: all pixels were valid, and a tenth of them 180 mm off."""
+    capture = taken(coded(fringes(period=period, steps=steps), stripe=16))
+    words = said(stated(capture, coded(fringes(steps=steps), stripe=16)))
+    told = re.search(r"at 16 px change by one period over ([0-9.]+) px", words)
+    assert told is not None and float(told[1]) == pytest.approx(period, rel=0.03)
+    assert said(capture) == ""
+
+
 @pytest.mark.parametrize("steps", [3, 4, 5])
 @pytest.mark.parametrize("gamma", [1.0, 2.2])
 @pytest.mark.parametrize("stripe", [8, 16])
