@@ -159,6 +159,14 @@ def test_the_command_calibrates_a_table(tmp_path):
     assert 'covariance = "unit.toml"' in done.stderr
 
 
+def test_an_argument_that_is_neither_sensor_nor_recording_is_named(tmp_path):
+    """Before, a path without a file was an unknown preset."""
+    (tmp_path / "board.png").write_bytes(b"an image")
+    for name, told in (("board.png", "found one image; allowed: a folder"), ("none", "no such file or folder")):
+        done = mitsim_here("calibrate", tmp_path / name, "--board", "9x7x20:glass", "-o", tmp_path / "u.toml", code=2)
+        assert told in done.stderr
+
+
 @pytest.mark.parametrize(
     "name, text",
     [
