@@ -160,7 +160,12 @@ class Measurement(Document):
         pair = isinstance(value, list | tuple) and len(value) == 2 and all(_is_number(end) for end in value)
         if not pair or zone or not value[0] < value[1]:
             raise ValueError(f"{wanted}{': it is the width of a zone' if zone else ''}")
-        return float(value[0]), float(value[1])
+        lower, upper = float(value[0]), float(value[1])
+        nominal = info.data.get("nominal") or 0.0
+        if lower > nominal / 2 > 0 and upper - lower < lower:
+            shown = ", ".join(f"{end - nominal:.6g}" for end in (lower, upper))
+            raise ValueError(f"deviations from nominal: as the limits of the value, they are [{shown}]")
+        return lower, upper
 
     @property
     def zone(self) -> bool:

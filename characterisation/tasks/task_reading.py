@@ -17,6 +17,7 @@ from characterisation.files.documents import read_toml
 from characterisation.files.errors import InputError, nearest
 from characterisation.tasks.definitions import AXIS, DEFINITIONS, FLAT, Definition
 from characterisation.tasks.measurement_model import nominal_value
+from characterisation.tasks.places import direction
 from characterisation.tasks.task_file import KEYS, Feature, Nominal, Task
 from characterisation.tasks.zones import ASKEW, frame_fault
 
@@ -195,6 +196,16 @@ def _check_measurement(path: str | Path, task: Task, name: str) -> None:
         raise InputError(path, f"{place}.features", found, f"{_wanted(definition)} for {measurement.kind}")
     if len(set(measurement.features)) < len(measurement.features):
         raise InputError(path, f"{place}.features", list(measurement.features), "different features")
+    if measurement.kind in ("plane_distance", "axis_distance"):
+        lines = [
+            direction(one)
+            for one in map(task.nominal, measurement.features)
+            if isinstance(one, Plane | Cylinder | Cone)
+        ]
+        askew = float(np.linalg.norm(np.cross(*lines)))
+        if askew > ASKEW:
+            found = f"{', '.join(measurement.features)}, {np.degrees(np.arcsin(min(askew, 1.0))):.0f} deg apart"
+            raise InputError(path, f"{place}.features", found, "nearly parallel features: others have no one distance")
     if measurement.unit != definition.unit:
         raise InputError(path, f"{place}.unit", repr(measurement.unit), f"'{definition.unit}'")
     if definition.zone and measurement.nominal != 0:

@@ -10,6 +10,9 @@ import typer
 from characterisation.files.errors import InputError, nearest
 from mitsim.cli.options import Seed, check_file, definitions
 
+#: suffixes of images, one of which is no recording of a board
+_IMAGES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".pgm")
+
 
 def rig(
     sensor: Annotated[
@@ -57,6 +60,10 @@ def rig(
     Example: mitsim calibrate ensenso-n10 -o n10-calibration.toml --board 11x8x30:glass --poses 20
     Example: mitsim calibrate boards/ -o unit-calibration.toml --board 11x8x30:glass
     """
+    if Path(sensor).is_file() and Path(sensor).suffix.lower() in _IMAGES:
+        raise InputError(sensor, "", "one image", "a folder of images of the board, six or more")
+    if ("/" in sensor or "\\" in sensor) and not Path(sensor).exists():
+        raise InputError(sensor, "", "no such file or folder", "a sensor, a folder of images, or a file of corners")
     if _is_recorded(sensor):
         _recorded(Path(sensor), output, board)
         return

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from mitsim.cli.options import OutCloud, check_file, print_reasons
+from mitsim.cli.options import OutCloud, check_cloud_file, print_reasons
 
 
 def decode(
@@ -53,6 +53,7 @@ def decode(
     from mitsim.running.progress import say
 
     read = read_capture(capture)
+    check_cloud_file(output)
     written = written_frame(read, points_in, capture)
     settings, imager = decoder_settings(read, sensor, depth_range)
     settings = with_options(settings, block, contrast)
@@ -62,7 +63,6 @@ def decode(
         say(f"warning: {warning}")
     for note in decoded.notes:
         say(note)
-    check_file(output)
     write_cloud(decoded.cloud, output, written)
     print_reasons(decoded.cloud)
     if not decoded.cloud.valid.any():

@@ -25,6 +25,7 @@ from mitsim.cli.options import (
     Variant,
     Yes,
     asking,
+    check_cloud_file,
     check_file,
     check_folder,
     check_no_workers,
@@ -183,7 +184,7 @@ def predict(
     pose = pose_of(position, target, roll, chosen)
     correlated = noise == "correlated"
     cloud = maps.predict(loaded, chosen, performance_map, pose, seed=seed, correlated=correlated, ask=asking(yes))
-    check_file(output)
+    check_cloud_file(output)
     write_cloud(cloud, output)
     print_reasons(cloud)
     predictor = Predictor.of_sensor(chosen, sensor_geometry(chosen))

@@ -256,6 +256,21 @@ def check_file(file: Path) -> None:
     remove_partial_beside(file)
 
 
+#: formats of clouds and parts that a file of the command that writes PLY must not be named after
+_OTHER_CLOUDS = frozenset(
+    {".pcd", ".e57", ".mcap", ".xyz", ".txt", ".csv", ".asc", ".pts", ".npy", ".npz", ".mat", ".zdf", ".las", ".laz"}
+    | {".stl", ".obj", ".off", ".glb", ".3mf", ".png", ".json"}
+)
+
+
+def check_cloud_file(file: Path) -> None:
+    """Check that a PLY file can be written, and that its name does not promise another format; create its folder."""
+    if file.suffix.lower() in _OTHER_CLOUDS:
+        hint = f"then mitsim export cloud {file.stem}.ply -o ... writes .pcd, .e57 and .mcap"
+        raise InputError("--output", "", f"{file.name}, of another format", f"a PLY file: {file.stem}.ply", hint)
+    check_file(file)
+
+
 def check_unit(unit: str | None) -> None:
     """Check the unit of length of ``--unit``."""
     from mitsim.sensor.calibration_qualifiers import LENGTHS_MM

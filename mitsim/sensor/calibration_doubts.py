@@ -38,20 +38,10 @@ def lens_note(name: str, distortion: NDArray[np.float64]) -> str:
     )
 
 
-def principal_note(name: str, matrix: NDArray[np.float64], width: int, height: int) -> str:
-    """Return a warning about a principal point far from the middle of the images; empty without doubt.
-
-    Parameters
-    ----------
-    name
-        Camera, for the warning.
-    matrix
-        (3, 3) camera matrix [px].
-    width, height
-        Size of its images [px].
-    """
-    centre, size = matrix[:2, 2], np.array([width, height])
-    off = np.abs(centre - (size - 1) / 2) / size
+def principal_note(name: str, matrix: NDArray[np.float64], size: tuple[int, int]) -> str:
+    """Return a warning about a principal point far from the middle of images of a size [px]; empty without doubt."""
+    centre, (width, height) = matrix[:2, 2], size
+    off = np.abs(centre - (np.array(size) - 1) / 2) / size
     if off.min() <= _FAR_FROM_MIDDLE:
         return ""
     return (

@@ -275,7 +275,7 @@ def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[st
                 values.notes.append(f"calibration {matrix.file.name}: {name}: {note}")
         width, height = own.get("width"), own.get("height")
         seen = (width, height) if isinstance(width, int) and isinstance(height, int) else size or values.size
-        if place < 2 and read_out is None and seen and (note := principal_note(name, K, *seen)):
+        if place < 2 and read_out is None and seen and (note := principal_note(name, K, seen)):
             values.notes.append(f"calibration {matrix.file.name}: {note}")
         out |= {"focal_px": [float(K[0, 0]), float(K[1, 1])], "principal_px": [float(K[0, 2]), float(K[1, 2])]}
     if size is not None:

@@ -98,6 +98,7 @@ def read_corners(path: str | Path, board: Board) -> RecordedCorners:
 def _together(path: Path, seen: Seen, sizes: Sizes) -> RecordedCorners:
     """Return the poses whose corners all eyes see; ``seen`` has the pixels (2,) by pose, eye and corner."""
     boards, left_out = [], []
+    used: dict[str, dict[str, Floats]] = {}
     for pose, by_eye in seen.items():
         lacking = [eye for eye in sizes if eye not in by_eye]
         common = sorted(set.intersection(*[set(by_eye[eye]) for eye in sizes])) if not lacking else []
@@ -106,11 +107,40 @@ def _together(path: Path, seen: Seen, sizes: Sizes) -> RecordedCorners:
             left_out.append(f"{pose}: {why}")
             continue
         pixels = {eye: np.array([by_eye[eye][corner] for corner in common]) for eye in sizes}
+        _check_inside(path, pose, pixels, sizes)
+        twin = next((name for name, other in used.items() if _are_equal(pixels, other)), None)
+        if twin is not None:
+            left_out.append(f"{pose}: the same as {twin}")
+            continue
+        used[pose] = pixels
         boards.append(RecordedBoard(np.array(common, np.intp), pixels))
     if not boards:
         found = "; ".join(left_out[:3]) or "no pose"
         raise InputError(path, "", found, f"poses with {_LEAST_CORNERS} corners or more", "check --board")
     return RecordedCorners(boards, sizes, left_out)
+
+
+def _check_inside(path: Path, pose: str, pixels: dict[str, Floats], sizes: Sizes) -> None:
+    """Check that the corners (n, 2) [px] of a pose lie in the images.
+
+    Raises
+    ------
+    InputError
+        If one does not: the size belongs to other images, or x and y are exchanged.
+    """
+    for eye, places in pixels.items():
+        width, height = sizes[eye]
+        outside = (places < -1).any(axis=1) | (places > (width, height)).any(axis=1)
+        if outside.any():
+            x, y = places[outside][0]
+            hint = "are these corners of images of another size, or are x and y exchanged?"
+            found = f"a corner at {x:.1f}, {y:.1f} px"
+            raise InputError(path, f"{eye}, pose {pose}", found, f"corners within {width} x {height} px", hint)
+
+
+def _are_equal(first: dict[str, Floats], second: dict[str, Floats]) -> bool:
+    """Return whether two poses have the same pixels, as a copy of an image has."""
+    return all(np.array_equal(places, second[eye]) for eye, places in first.items())
 
 
 def _of_images(path: Path, board: Board) -> tuple[Seen, Sizes]:

@@ -246,7 +246,10 @@ class _Observations:
             if gained < _SMALL_GAIN * cost and float(step @ normal @ step) < _SMALL_STEP:
                 return rig, places, normal
         found = f"an adjustment that does not converge in {_MOST_STEPS} steps"
-        raise InputError("boards", "", found, "poses that determine it", tilt_hint(places))
+        hint = tilt_hint(places) or (
+            "are the corners of all cameras in the order of --board, COLUMNSxROWS, and of the same pose?"
+        )
+        raise InputError("boards", "", found, "poses that determine it", hint)
 
     def _normal(
         self, rig: Rig, places: list[Transform], noise: Floats, prior: LensPrior

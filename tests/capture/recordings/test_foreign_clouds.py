@@ -34,6 +34,7 @@ from mitsim.sensor.decoder_settings import DeviceMapSettings
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 from tests.capture.recordings.cloud_files_of_others import pcd, pinhole_cloud, ply
+from tests.shell import mitsim_here
 
 CLOUD = pinhole_cloud()
 HEIGHT, WIDTH = CLOUD.shape[:2]
@@ -301,6 +302,17 @@ def test_levels_that_no_surface_has_are_missing(tmp_path, mark, kind, warning):
     told = capture.settings.get("warnings", [])
     assert warning is None or [warning in each for each in told] == [True]
     assert warning is not None or not told
+
+
+@pytest.mark.parametrize("name", ["cloud.pcd", "cloud.stl", "cloud.xyz"])
+def test_a_cloud_is_not_named_after_another_format(tmp_path, name):
+    """Before, a PLY file had the name of an STL or a PCD."""
+    write_capture(
+        read_depth_image(depth_png(tmp_path, np.full((48, 64), 700, np.uint16)), pinhole(tmp_path)), tmp_path / "c"
+    )
+    done = mitsim_here("decode", tmp_path / "c", "-o", tmp_path / name, code=2)
+    assert "allowed: a PLY file: cloud.ply" in done.stderr
+    assert not (tmp_path / name).exists()
 
 
 def test_a_wall_far_behind_is_a_surface(tmp_path):

@@ -295,6 +295,18 @@ def changed(tmp_path, old, new):
             "measurements.point1_point2_distance.tolerance",
             "H7 is its two deviations",
         ),
+        (
+            "nominal = 70.0",
+            "nominal = 70.0\ntolerance = [69.9, 70.2]",
+            "measurements.point1_point2_distance.tolerance",
+            "as the limits of the value, they are [-0.1, 0.2]",
+        ),
+        (
+            "nominal = 70.0",
+            "nominal = 70.0\ntolerance = [70.01, 70.03]",
+            "measurements.point1_point2_distance.tolerance",
+            "as the limits of the value, they are [0.01, 0.03]",
+        ),
         ("nominal = 70.0", "nominale = 70.0", "measurements.point1_point2_distance.nominale", "did you mean 'nominal'"),
     ],
 )

@@ -48,6 +48,19 @@ def slot(text=SLOT):
     return validate("task.toml", tomllib.loads(text), Task)
 
 
+@pytest.mark.parametrize("kind", ["plane_distance", "axis_distance"])
+def test_features_that_are_not_parallel_have_no_one_distance(tmp_path, kind):
+    surface, more = ("plane", "") if kind == "plane_distance" else ("cylinder", ", radius_mm = 5")
+    features = (
+        f'features.{name} = {{ kind = "{surface}", point_mm = [{x}, 0, 0], direction = [{x}, 0, 30]{more} }}\n'
+        for name, x in (("one", -10), ("other", 10))
+    )
+    measured = f'kind = "{kind}"\nfeatures = ["one", "other"]\nnominal = 20\nunit = "mm"\n'
+    (tmp_path / "task.toml").write_text("".join(features) + "[measurements.width]\n" + measured)
+    with pytest.raises(InputError, match=r"37 deg apart; allowed: nearly parallel features"):
+        read_task(tmp_path / "task.toml")
+
+
 def lean(angle, toward=X):
     return np.cos(angle) * Z + np.sin(angle) * toward
 

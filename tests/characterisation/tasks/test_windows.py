@@ -48,6 +48,14 @@ def test_the_distance_of_parallel_planes_is_their_offset():
     assert found.value == pytest.approx(20 / np.sqrt(1.04), abs=1e-3)
 
 
+def test_planes_and_axes_that_lean_have_no_one_distance():
+    """Before, planes at 30 deg had a distance, with an uncertainty of micrometres."""
+    plan = WindowPlan({"a": ("plane", LEFT), "b": ("plane", RIGHT)}, [("distance", "a", "b")])
+    found = by_name(measure_windows(cloud_of(corner()), plan))["a-b distance"]
+    assert not found.possible
+    assert "30 deg apart" in found.reason
+
+
 def test_balls_and_pins_without_noise_are_as_they_were_made():
     ball, pin = sphere([-30, 0, 450], 20), cylinder([40, 0, 470], [0.1, 1, 0.05], 15)
     cloud = cloud_of(np.where(np.arange(GRID.width) < 100, ball, pin))

@@ -80,6 +80,32 @@ def test_every_form_gives_the_same_corners(tmp_path):
                 np.testing.assert_allclose(board.pixels[name], pixels[name][number], rtol=1e-12, err_msg=file.name)
 
 
+def test_corners_outside_the_images_are_refused(tmp_path):
+    """Before, images of half the size had a calibration with the principal point in their corner."""
+    pixels = pixels_of(1)
+    for wrong, size in ((pixels, (640, 480)), ({name: each[..., ::-1] for name, each in pixels.items()}, SIZE)):
+        np.savez(tmp_path / "c.npz", imgpoints_l=wrong["left"], imgpoints_r=wrong["right"], image_size=size)
+        with pytest.raises(InputError, match=r"a corner at .* px; allowed: corners within"):
+            read_corners(tmp_path / "c.npz", BOARD)
+
+
+def test_a_pose_that_is_there_twice_counts_once(tmp_path):
+    """Before, copies of poses lowered the uncertainty, and the two halves of one pose agreed."""
+    pixels = {name: np.concatenate([each, each[2:5]]) for name, each in pixels_of(1).items()}
+    write_table(tmp_path / "c.csv", pixels)
+    found = read_corners(tmp_path / "c.csv", BOARD)
+    assert len(found.boards) == 10
+    assert found.left_out == ["10: the same as 2", "11: the same as 3", "12: the same as 4"]
+
+
+def test_corners_in_the_order_of_another_board_are_said(tmp_path):
+    mixed = {
+        name: each.reshape(-1, 6, 8, 2).transpose(0, 2, 1, 3).reshape(-1, 48, 2) for name, each in pixels_of(1).items()
+    }
+    with pytest.raises(InputError, match="in the order of --board, COLUMNSxROWS"):
+        calibrate_checked(boards_of(mixed), BOARD, {"left": SIZE, "right": SIZE}, "x")
+
+
 def test_images_of_ros_give_the_corners_of_the_board(tmp_path):
     squares = np.kron(np.indices((7, 9)).sum(axis=0) % 2, np.ones((40, 40)))
     for pose, angle in enumerate((0.0, 8.0)):
@@ -131,6 +157,14 @@ def test_the_command_calibrates_a_table(tmp_path):
     assert "two halves of the poses agree" in done.stdout
     assert (tmp_path / "unit.toml").is_file() and (tmp_path / "unit.yml").is_file()
     assert 'covariance = "unit.toml"' in done.stderr
+
+
+def test_an_argument_that_is_neither_sensor_nor_recording_is_named(tmp_path):
+    """Before, a path without a file was an unknown preset."""
+    (tmp_path / "board.png").write_bytes(b"an image")
+    for name, told in (("board.png", "found one image; allowed: a folder"), ("none", "no such file or folder")):
+        done = mitsim_here("calibrate", tmp_path / name, "--board", "9x7x20:glass", "-o", tmp_path / "u.toml", code=2)
+        assert told in done.stderr
 
 
 @pytest.mark.parametrize(
