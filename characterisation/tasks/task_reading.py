@@ -197,12 +197,9 @@ def _check_measurement(path: str | Path, task: Task, name: str) -> None:
     if len(set(measurement.features)) < len(measurement.features):
         raise InputError(path, f"{place}.features", list(measurement.features), "different features")
     if measurement.kind in ("plane_distance", "axis_distance"):
-        lines = [
-            direction(one)
-            for one in map(task.nominal, measurement.features)
-            if isinstance(one, Plane | Cylinder | Cone)
-        ]
-        askew = float(np.linalg.norm(np.cross(*lines)))
+        nominals = map(task.nominal, measurement.features)
+        along, other = (direction(one) for one in nominals if isinstance(one, Plane | Cylinder | Cone))
+        askew = float(np.linalg.norm(np.cross(along, other)))
         if askew > ASKEW:
             found = f"{', '.join(measurement.features)}, {np.degrees(np.arcsin(min(askew, 1.0))):.0f} deg apart"
             raise InputError(path, f"{place}.features", found, "nearly parallel features: others have no one distance")

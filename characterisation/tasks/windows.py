@@ -256,7 +256,8 @@ def _pair_result(
     function, swapped = selected
     ordered = inputs[::-1] if swapped else inputs
     if function in (plane_distance, axis_distance):
-        askew = float(np.linalg.norm(np.cross(*(direction(fit) for fit in inputs if not isinstance(fit, SphereFit)))))
+        one, other = (direction(fit) for fit in inputs if not isinstance(fit, SphereFit))
+        askew = float(np.linalg.norm(np.cross(one, other)))
         if askew > ASKEW:
             angle = f"{np.degrees(np.arcsin(min(askew, 1.0))):.0f} deg"
             return failed(label, unit, f"they are {angle} apart, so they have no one distance")
