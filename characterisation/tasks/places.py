@@ -21,6 +21,9 @@ Geometry = Plane | Axis | PointLike
 #: lines and planes within about this angle [rad] of parallel have no intersection
 PARALLEL = 1e-4
 
+#: largest angle [deg] between two planes or axes that have one distance
+MOST_ASKEW_DEG = 6.0
+
 
 def place(feature: PointLike) -> Array:
     """Return the point (3,) [mm] that represents a feature: its centre, point of an edge, or intersection."""
@@ -32,6 +35,14 @@ def place(feature: PointLike) -> Array:
 def direction(feature: Plane | Axis) -> Array:
     """Return the unit normal (3,) of a plane, or the axis (3,)."""
     return feature.normal if isinstance(feature, Plane) else feature.axis
+
+
+def askew_deg(features: Sequence[object]) -> float:
+    """Return the angle [deg], 0 to 90, between the lines of two planes or axes; 0 of anything else."""
+    lines = [direction(one) for one in features if isinstance(one, Plane | Cylinder | Cone)]
+    if len(lines) != 2:
+        return 0.0
+    return float(np.degrees(np.arcsin(min(float(np.linalg.norm(np.cross(lines[0], lines[1]))), 1.0))))
 
 
 def intersection(features: Sequence[Plane | Axis]) -> Point:

@@ -17,7 +17,7 @@ from characterisation.files.documents import read_toml
 from characterisation.files.errors import InputError, nearest
 from characterisation.tasks.definitions import AXIS, DEFINITIONS, FLAT, Definition
 from characterisation.tasks.measurement_model import nominal_value
-from characterisation.tasks.places import direction
+from characterisation.tasks.places import MOST_ASKEW_DEG, askew_deg
 from characterisation.tasks.task_file import KEYS, Feature, Nominal, Task
 from characterisation.tasks.zones import ASKEW, frame_fault
 
@@ -197,11 +197,9 @@ def _check_measurement(path: str | Path, task: Task, name: str) -> None:
     if len(set(measurement.features)) < len(measurement.features):
         raise InputError(path, f"{place}.features", list(measurement.features), "different features")
     if measurement.kind in ("plane_distance", "axis_distance"):
-        nominals = map(task.nominal, measurement.features)
-        along, other = (direction(one) for one in nominals if isinstance(one, Plane | Cylinder | Cone))
-        askew = float(np.linalg.norm(np.cross(along, other)))
-        if askew > ASKEW:
-            found = f"{', '.join(measurement.features)}, {np.degrees(np.arcsin(min(askew, 1.0))):.0f} deg apart"
+        angle = askew_deg([task.nominal(feature) for feature in measurement.features])
+        if angle > MOST_ASKEW_DEG:
+            found = f"{', '.join(measurement.features)}, {angle:.0f} deg apart"
             raise InputError(path, f"{place}.features", found, "nearly parallel features: others have no one distance")
     if measurement.unit != definition.unit:
         raise InputError(path, f"{place}.unit", repr(measurement.unit), f"'{definition.unit}'")

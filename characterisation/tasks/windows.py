@@ -37,10 +37,9 @@ from characterisation.tasks.definitions import (
     point_plane_distance,
 )
 from characterisation.tasks.measurement_model import evaluate
-from characterisation.tasks.places import direction
+from characterisation.tasks.places import MOST_ASKEW_DEG, askew_deg
 from characterisation.tasks.places_in_frame import PLACE_QUANTITIES, place_functions
 from characterisation.tasks.result import Result, failed
-from characterisation.tasks.zones import ASKEW
 
 Shape = Literal["plane", "sphere", "cylinder"]
 PairKind = Literal["angle", "distance"]
@@ -256,11 +255,9 @@ def _pair_result(
     function, swapped = selected
     ordered = inputs[::-1] if swapped else inputs
     if function in (plane_distance, axis_distance):
-        one, other = (direction(fit) for fit in inputs if not isinstance(fit, SphereFit))
-        askew = float(np.linalg.norm(np.cross(one, other)))
-        if askew > ASKEW:
-            angle = f"{np.degrees(np.arcsin(min(askew, 1.0))):.0f} deg"
-            return failed(label, unit, f"they are {angle} apart, so they have no one distance")
+        angle = askew_deg(inputs)
+        if angle > MOST_ASKEW_DEG:
+            return failed(label, unit, f"they are {angle:.0f} deg apart, so they have no one distance")
     if function is plane_distance:
         value, uncertainty = evaluate(lambda a, b: plane_distance(a, b, nominal=ordered), ordered)
     else:

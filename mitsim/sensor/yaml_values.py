@@ -66,7 +66,9 @@ def read_yaml(file: Path, data: bytes, allowed: str) -> list[dict[str, Any]]:
         raise NotYamlError(file, "", f"text that is not YAML ({problem}{line})", allowed) from None
     maps = [document for document in documents if isinstance(document, dict) and document]
     if not maps:
-        raise InputError(file, "", "text without names" if any(documents) else "nothing in it", allowed)
+        # a matrix has no truth value
+        there = any(isinstance(document, np.ndarray) or document for document in documents)
+        raise InputError(file, "", "text without names" if there else "nothing in it", allowed)
     return maps
 
 

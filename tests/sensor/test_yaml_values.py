@@ -86,6 +86,7 @@ def test_the_dialect_of_opencv_has_the_numbers_that_opencv_reads(tmp_path, flags
         ("a: &a [*a]", "alias of an unknown value"),
         ("a: &a0 [1, 1]\n" + "".join(f"b{k}: &a{k + 1} [*a{k}, *a{k}]\n" for k in range(40)), "values; allowed: up to"),
         ("- 1\n", "without names"),
+        ("!!opencv-matrix {rows: 1, cols: 2, dt: d, data: [1.0, 2.0]}\n", "without names"),
         ("", "nothing in it"),
     ],
 )

@@ -9,12 +9,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Settings
 from mitsim.decoding.checks.pair_sanity import Findings, row_error_warnings
 from mitsim.decoding.checks.sanity import (
     code_findings,
+    pair_contradiction,
     pair_row_error,
     row_error_in_words,
     uncalibrated_in_words,
@@ -75,6 +78,8 @@ def checked_cloud(
     found = Findings() if images is None else code_findings(images, capture.rig, capture.source == "device", pair)
     matched = pair_row_error(capture, cloud, pair)
     warnings = [*capture.settings.get("warnings", []), *found.warnings, *row_error_warnings(matched)]
+    if not np.isfinite(matched) and (contradiction := pair_contradiction(capture, pair)):
+        warnings.append(contradiction)
     if lost := uncalibrated_in_words(cloud):
         warnings.append(lost)
     beyond = surface_beyond(capture, cloud, settings)

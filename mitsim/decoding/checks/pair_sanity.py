@@ -92,6 +92,30 @@ def pair_findings(images: CodedImages, rig: Rig, geometry: StereoGeometry) -> Fi
     return Findings(row_error_warnings(offset), offset, source) if np.isfinite(offset) else Findings()
 
 
+def plain_pair_warning(images: tuple[Floats, Floats], rig: Rig, geometry: StereoGeometry) -> str:
+    """Return a warning if two images (H, W) [DN] without a code contradict the calibration of their cameras, or "".
+
+    Parameters
+    ----------
+    images
+        Of the first and the second camera.
+    rig
+        The calibration.
+    geometry
+        Of its rectified pair.
+    """
+    names = " and ".join(list(rig.cameras)[:2])
+    if images[0].shape == images[1].shape and np.array_equal(*images):
+        return f"the images of {names} are the same: one is a copy of the other"
+    everywhere = np.zeros(images[0].shape), np.zeros(images[1].shape)
+    contradiction, other_order = _texture_contradiction(images, everywhere, rig, geometry)
+    if not contradiction:
+        return ""
+    if other_order and geometry.raw_size[0] == geometry.raw_size[1]:
+        return f"the images of {names} fit the calibration if they are exchanged: check whether they are"
+    return f"{contradiction}: check that the calibration belongs to these images, and that R and T are not inverted"
+
+
 def _texture_contradiction(
     textures: tuple[Floats, Floats], columns: tuple[Floats, Floats], rig: Rig, geometry: StereoGeometry
 ) -> tuple[str, bool]:

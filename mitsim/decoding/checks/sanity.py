@@ -15,7 +15,7 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Settings
 from mitsim.decoding.checks.gray_origin import gray_origin_warning
 from mitsim.decoding.checks.image_sanity import image_warnings
-from mitsim.decoding.checks.pair_sanity import Findings, pair_findings
+from mitsim.decoding.checks.pair_sanity import Findings, pair_findings, plain_pair_warning
 from mitsim.decoding.checks.rig_sanity import baseline_warning, camera_warnings
 from mitsim.decoding.checks.row_texture import measured_row_error
 from mitsim.decoding.cloud import decoder_settings
@@ -84,6 +84,17 @@ def pair_row_error(capture: Capture, cloud: PointCloud, geometry: StereoGeometry
         return float("nan")
     left, right = (stack[0] for stack in list(capture.images.values())[:2])
     return measured_row_error((left, right), geometry or stereo_geometry(capture.rig), cloud)
+
+
+def pair_contradiction(capture: Capture, geometry: StereoGeometry | None = None) -> str:
+    """Return a warning if the images of a recorded pair contradict its calibration, or ""; see :func:`pair_row_error`.
+
+    ``geometry`` of the pair, if it is prepared already.
+    """
+    if capture.technology != "active_stereo" or capture.source != "device" or len(capture.images) < 2:
+        return ""
+    left, right = (np.asarray(stack[0], float) for stack in list(capture.images.values())[:2])
+    return plain_pair_warning((left, right), capture.rig, geometry or stereo_geometry(capture.rig))
 
 
 def row_error_in_words(capture: Capture, settings: Settings, found: Findings, matched: float) -> str:
