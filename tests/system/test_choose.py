@@ -106,7 +106,7 @@ def test_a_finished_comparison_is_kept_and_overwritten_on_request_from_its_own_t
 def test_page_and_sheet(chosen):
     folder, _, _ = chosen
     page = (folder / "out" / "choice.html").read_text()
-    assert page.count("<svg") == 1 and "fits 3 of 3 tolerances" in page
+    assert page.count("<svg") == 2 and "fits 3 of 3 tolerances" in page
     assert "screened only: fewer measurements possible" in page and "2 of 3 measurements possible" in page
     done = mitsim_here("report", folder / "out", "--pdf")
     assert done.returncode == 0, done.stderr

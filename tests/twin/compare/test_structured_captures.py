@@ -154,5 +154,8 @@ def test_a_window_without_a_plane_that_can_be_seen_is_one_message(david, folder,
         points, np.full(points.shape[:2], Status.VALID, np.uint8), grid, "s", "device", np.array([1.0, 0, 0])
     )
     monkeypatch.setattr(specimen, "capture_cloud", lambda *args, **kwargs: cloud)
-    with pytest.raises(InputError, match=r"--window: found .* points are seen at grazing incidence; allowed: a plane"):
+    with pytest.raises(
+        InputError,
+        match=r"--window: found .* points are seen at grazing incidence from the sensor, .*; allowed: a plane",
+    ):
         specimen.specimen_place(capture, david.settings, Roi(20, 20, 300, 200), "real")
