@@ -50,7 +50,7 @@ KINDS = {
     "axis_distance": ("bore pin", "DistanceBetween", "DistanceBetween"),
     "point_distance": ("ball corner", "DistanceBetween", "DistanceBetween"),
     "point_plane_distance": ("rim side", "DistanceBetween", "DistanceBetween"),
-    "plane_distance": ("base side", "DistanceBetween", "DistanceBetween"),
+    "plane_distance": ("far side", "DistanceBetween", "DistanceBetween"),
     "plane_axis_angle": ("base bore", "AngleBetween", "AngleBetween"),
     "axis_angle": ("bore pin", "AngleBetween", "AngleBetween"),
     "plane_angle": ("base side", "AngleBetween", "AngleBetween"),
