@@ -21,3 +21,9 @@ def in_blocks(work: Callable[[list[slice]], None], count: int) -> None:
     blocks = [slice(start, start + BLOCK) for start in range(0, count, BLOCK)]
     workers = max(min(thread_count(), len(blocks) // 2), 1)
     in_threads(work, [blocks[len(blocks) * k // workers : len(blocks) * (k + 1) // workers] for k in range(workers)])
+
+
+def row_bands(height: int, width: int) -> list[slice]:
+    """Return bands of rows of an image that stay in the processor's cache."""
+    band = max(1, BLOCK // width)
+    return [slice(top, top + band) for top in range(0, height, band)]

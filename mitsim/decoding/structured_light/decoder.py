@@ -27,7 +27,6 @@ from mitsim.decoding.grid_cloud import cloud_on_grid
 from mitsim.decoding.image_context import ImageContext
 from mitsim.decoding.structured_light.geometry import (
     StructuredLightGeometry,
-    evaluate,
     exact_inverse_depth,
     structured_light_geometry,
 )
@@ -39,6 +38,7 @@ from mitsim.decoding.structured_light.gray_code import (
     interpolated_columns,
     stripe_coordinate,
 )
+from mitsim.decoding.structured_light.newton_polynomial import evaluate
 from mitsim.decoding.structured_light.phase_shift import Fringes, decode_fringes
 from mitsim.decoding.structured_light.projector_coordinate import ProjectorCoordinate
 from mitsim.sensor.camera import Camera, Rig

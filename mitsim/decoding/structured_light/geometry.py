@@ -17,7 +17,7 @@ distortion has no ray. Both are ``undetermined``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 from characterisation.files.errors import InputError, nearest
 from characterisation.files.threads import in_threads
 from characterisation.point_cloud import ViewGrid
-from mitsim.decoding.blocks import BLOCK
+from mitsim.decoding.blocks import row_bands
+from mitsim.decoding.structured_light.newton_polynomial import evaluate, monotony, polynomial
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.distortion_fold import inverse_fold_radii
 from mitsim.sensor.image_role import Axis
@@ -168,8 +169,8 @@ def _prepared(
     # every seventh pixel in both directions suffices to determine the number of points
     sample = np.s_[::7, ::7]
     for count in _POINT_COUNTS:
-        nodes, differences = _polynomial(coordinate, ray[sample], low[sample], high[sample], count)
-        usable = seen[sample] & _monotonic(np.diff(nodes, axis=0))
+        nodes, differences = polynomial(coordinate, ray[sample], low[sample], high[sample], count)
+        usable = seen[sample] & monotony(nodes, MINIMUM_CHANGE_PX)[0]
         tested = low[sample] + (high - low)[sample] * np.linspace(0.02, 0.98, 2 * count + 1)[:, None, None]
         exact = np.stack([coordinate(w, ray[sample]) for w in tested])
         fitted, slope = zip(*(evaluate(nodes, differences, u) for u in exact), strict=True)
@@ -178,8 +179,8 @@ def _prepared(
         iterated = not float(error.max(initial=0.0)) < TARGET_ERROR_PX
         if not iterated:
             break
-    nodes, differences = _polynomial(coordinate, ray, low, high, _START_COUNT if iterated else count)
-    monotonic, changes = _shape(nodes)
+    nodes, differences = polynomial(coordinate, ray, low, high, _START_COUNT if iterated else count)
+    monotonic, changes = monotony(nodes, MINIMUM_CHANGE_PX)
     undetermined = ~known | (seen & ~monotonic & changes)
     seen &= monotonic & changes
     if not seen.any():
@@ -278,7 +279,7 @@ def _shorten(
             places = camera.centre + ray[rows] / end[rows][..., None]
             leaves[rows] |= np.isnan(projector.project(places)).any(axis=-1)
 
-    in_threads(find, _bands(*seen.shape))
+    in_threads(find, row_bands(*seen.shape))
     outside = np.nonzero(seen & leaves)
     if not outside[0].size:
         return
@@ -355,65 +356,3 @@ def _projected_component(projector: Camera, points: Floats, component: int) -> F
             projector.matrix[component, component] * (local[..., component] / depth) + projector.matrix[component, 2]
         )
     return projector.project(points)[..., component]
-
-
-def _polynomial(
-    coordinate: Callable[[Floats, Floats], Floats], ray: Floats, low: Floats, high: Floats, count: int
-) -> tuple[Floats, Floats]:
-    """Return Newton's polynomial w(u) through ``count`` exact points of each ray: its nodes and divided differences."""
-    # Chebyshev-Lobatto points, which include both ends
-    fraction = (1 - np.cos(np.pi * np.arange(count) / (count - 1))) / 2
-    nodes, differences = np.empty((count, *low.shape)), np.empty((count, *low.shape))
-
-    @np.errstate(invalid="ignore", divide="ignore")
-    def solve(rows: slice) -> None:
-        u, w = nodes[:, rows], differences[:, rows]
-        w[:] = low[rows] + (high[rows] - low[rows]) * fraction[:, None, None]
-        for node, inverse_depth in zip(u, w, strict=True):
-            node[:] = coordinate(inverse_depth, ray[rows])
-        for order in range(1, count):
-            for k in range(count - 1, order - 1, -1):  # in place: w[k - 1] is still that of the order before
-                w[k] -= w[k - 1]
-                w[k] /= u[k] - u[k - order]
-
-    in_threads(solve, _bands(*low.shape))
-    return nodes, differences
-
-
-def _bands(height: int, width: int) -> list[slice]:
-    """Return bands of rows of an image that stay in the processor's cache."""
-    band = max(1, BLOCK // width)
-    return [slice(top, top + band) for top in range(0, height, band)]
-
-
-def _shape(nodes: Floats) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return where (H, W) the coordinates of the nodes only rise or only fall, and where they change enough."""
-    monotonic, changes = np.empty(nodes.shape[1:], bool), np.empty(nodes.shape[1:], bool)
-
-    @np.errstate(invalid="ignore")
-    def judge(rows: slice) -> None:
-        monotonic[rows] = _monotonic(np.diff(nodes[:, rows], axis=0))
-        changes[rows] = np.ptp(nodes[:, rows], axis=0) > MINIMUM_CHANGE_PX
-
-    in_threads(judge, _bands(*nodes.shape[1:]))
-    return monotonic, changes
-
-
-def evaluate(nodes: Floats, differences: Floats, u: Floats) -> tuple[Floats, Floats]:
-    """Return w(u) and dw/du by Horner's scheme.
-
-    ``nodes`` and ``differences`` (K, ...) are those of :class:`StructuredLightGeometry`, ``u`` (...) [projector px].
-    """
-    value, slope = differences[-1].copy(), np.zeros_like(u)
-    for node, difference in zip(nodes[-2::-1], differences[-2::-1], strict=True):
-        step = u - node
-        slope *= step
-        slope += value
-        value *= step
-        value += difference
-    return value, slope
-
-
-def _monotonic(change: Floats) -> NDArray[np.bool_]:
-    """Return where all steps (K - 1, H, W) have the same sign."""
-    return np.asarray((change > 0).all(axis=0) | (change < 0).all(axis=0))

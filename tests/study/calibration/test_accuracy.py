@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from characterisation.files.errors import InputError
-from mitsim.decoding.structured_light.geometry import evaluate, structured_light_geometry
+from mitsim.decoding.structured_light.geometry import structured_light_geometry
+from mitsim.decoding.structured_light.newton_polynomial import evaluate
 from mitsim.sensor.drift import SOURCES, Drift, drift_modes, with_drift
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.rig_covariance import RigCovariance
