@@ -7,8 +7,8 @@ each number, with the uncertainty at its low and its high values -> one sentence
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Protocol
 
+from characterisation.statements.size_dependence import SizeDependence
 from mitsim.running.numbers import percent, quantity
 
 #: phrases for low and for high values of a number, by group and name
@@ -49,31 +49,7 @@ REMEDIES = {
 }
 
 
-class Dependence(Protocol):
-    """Dependence of the size of an error on a drawn number; pairs are for its low and its high values."""
-
-    @property
-    def group(self) -> str:
-        """Return the group of unknowns."""
-
-    @property
-    def name(self) -> str:
-        """Return the name of the number."""
-
-    @property
-    def of(self) -> str:
-        """Return the thing that has the number; empty for none."""
-
-    @property
-    def uncertainty(self) -> tuple[float, float]:
-        """Return root mean square errors about the bias."""
-
-    @property
-    def inside(self) -> tuple[float, float]:
-        """Return shares of the errors inside the stated interval."""
-
-
-def dependences_in_words(rows: Iterable[tuple[str, str, Dependence | None]]) -> list[str]:
+def dependences_in_words(rows: Iterable[tuple[str, str, SizeDependence | None]]) -> list[str]:
     """Return a sentence for each measurement whose error has a size that depends on a drawn number.
 
     ``rows`` have the name, the unit and the dependence of each measurement.
@@ -81,14 +57,14 @@ def dependences_in_words(rows: Iterable[tuple[str, str, Dependence | None]]) -> 
     return [_sentence(name, unit, one) for name, unit, one in rows if one is not None]
 
 
-def remedies_in_words(dependences: Iterable[Dependence | None]) -> str:
+def remedies_in_words(dependences: Iterable[SizeDependence | None]) -> str:
     """Return what a user can do to know the numbers of some dependences; empty without any."""
     groups = dict.fromkeys(one.group for one in dependences if one is not None)
     words = ". ".join(REMEDIES[group] for group in groups if group in REMEDIES)
     return f"{words}." if words else ""
 
 
-def _sentence(name: str, unit: str, one: Dependence) -> str:
+def _sentence(name: str, unit: str, one: SizeDependence) -> str:
     phrases = _PHRASES.get((one.group, one.name), (f"low {one.name}", f"high {one.name}"))
     of = f" of {one.of}" if one.of else ""
     (low, high), (held_low, held_high) = one.uncertainty, one.inside

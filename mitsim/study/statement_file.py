@@ -10,6 +10,7 @@ from pydantic import Field
 
 from characterisation.files.checked_files import read_json_object
 from characterisation.files.documents import Document, validate
+from characterisation.statements.size_dependence import SizeDependence
 from characterisation.statements.statement import ANY_PART
 from mitsim.study.maker_accuracy import below_the_maker
 
@@ -54,16 +55,6 @@ class LossEntry(PartialDocument):
     count: int = Field(ge=0)
 
 
-class SizeDependenceEntry(PartialDocument):
-    """Drawn number on which the size of an error depends most, with pairs for its low and its high values."""
-
-    group: str
-    name: str
-    of: str
-    uncertainty: tuple[float, float]
-    inside: tuple[float, float]
-
-
 class StatedMeasurement(PartialDocument):
     """One measurement of ``statement.json``."""
 
@@ -87,7 +78,7 @@ class StatedMeasurement(PartialDocument):
     losses: list[LossEntry] = Field(default_factory=list)
     errors_of: str = ANY_PART
     maker_sigma: float | None = None
-    size_depends_on: SizeDependenceEntry | None = None
+    size_depends_on: SizeDependence | None = None
 
     @property
     def expanded_uncertainty(self) -> float | None:
