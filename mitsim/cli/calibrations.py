@@ -10,9 +10,6 @@ import typer
 from characterisation.files.errors import InputError, nearest
 from mitsim.cli.options import Seed, check_file, definitions
 
-#: suffixes of images, one of which is no recording of a board
-_IMAGES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".pgm")
-
 
 def rig(
     sensor: Annotated[
@@ -60,7 +57,9 @@ def rig(
     Example: mitsim calibrate ensenso-n10 -o n10-calibration.toml --board 11x8x30:glass --poses 20
     Example: mitsim calibrate boards/ -o unit-calibration.toml --board 11x8x30:glass
     """
-    if Path(sensor).is_file() and Path(sensor).suffix.lower() in _IMAGES:
+    from mitsim.capture.grey_image import SUFFIXES
+
+    if Path(sensor).is_file() and Path(sensor).suffix.lower() in SUFFIXES:
         raise InputError(sensor, "", "one image", "a folder of images of the board, six or more")
     if ("/" in sensor or "\\" in sensor) and not Path(sensor).exists():
         raise InputError(sensor, "", "no such file or folder", "a sensor, a folder of images, or a file of corners")

@@ -24,7 +24,7 @@ from mitsim.report.placement_figure import face_verdicts, placement_figure
 from mitsim.report.pose_texts import pose_of_view, pose_words
 from mitsim.report.set_words import with_sets
 from mitsim.report.style import Picture, as_svg
-from mitsim.running.numbers import NONE, count, or_nan, with_degree_signs
+from mitsim.running.numbers import NONE, count, how_many, or_nan, with_degree_signs
 from mitsim.study.choice_document import ChoiceDocument, SensorEntry, judged
 from mitsim.study.remedies.entries import remedies_in_words
 from mitsim.study.run_folder import Run
@@ -148,7 +148,7 @@ def _without_statement(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
         for name, one in about.measurements.items()
     ]
     verdicts = face_verdicts({name: (one.faces, "not decided") for name, one in about.measurements.items()})
-    made = f"{about.race_trials} virtual measurement{'' if about.race_trials == 1 else 's'}"
+    made = how_many(about.race_trials, "virtual measurement")
     return FirstScreen(
         f"View {leader} leads so far, by {made}; no uncertainty is stated yet",
         "warn",

@@ -86,6 +86,5 @@ def _lines(items: Iterable[Item], label: str, total: int | None, report: Callabl
             left = f", {time_left(finished, total)}" if total else ""
             report(f"{label}: {len(finished)}/{total or '?'}{left}")
             last = now
-    done = len(finished)
     if report is say:
-        say(f"{label}: {done} done in {time.monotonic() - start:.1f} s")
+        say(f"{label}: {len(finished)} done in {time.monotonic() - start:.1f} s")

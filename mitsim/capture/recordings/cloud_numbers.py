@@ -60,7 +60,7 @@ def leave_out_marks(points: NDArray[np.floating]) -> str:
 
     These are (0, 0, 0), points without three finite numbers, and a point that is repeated as no measured one is.
     """
-    missing = ~np.isfinite(points).all(axis=-1) | (points == 0).all(axis=-1)
+    missing = _without_place(points)
     points[missing] = np.nan
     places = np.flatnonzero(~missing)
     if len(places) < _LEAST_REPEATS:
@@ -80,6 +80,11 @@ def leave_out_marks(points: NDArray[np.floating]) -> str:
     points[marked] = np.nan
     shown = ", ".join(f"{each:g}" for each in mark)
     return f"{count} points are all ({shown}): left out, since measured points do not repeat"
+
+
+def _without_place(points: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Return which points (..., 3) have no three finite numbers, or are (0, 0, 0)."""
+    return np.asarray(~np.isfinite(points).all(axis=-1) | (points == 0).all(axis=-1))
 
 
 def scale_to_mm(points: NDArray[np.floating], path: Path, unit: str | None = None, hint: str = "") -> tuple[str, float]:
@@ -107,7 +112,7 @@ def scale_to_mm(points: NDArray[np.floating], path: Path, unit: str | None = Non
     InputError
         If there is no point, one is beyond :data:`FARTHEST_MM`, or the unit is neither given nor plausible.
     """
-    points[~np.isfinite(points).all(axis=-1) | (points == 0).all(axis=-1)] = np.nan
+    points[_without_place(points)] = np.nan
     seen = points[np.isfinite(points[..., 0])]
     if not len(seen):
         raise InputError(path, "", "no points", "a cloud with x, y and z")
