@@ -82,9 +82,9 @@ def camera_paths(
 def _records(
     one: Tracer, walk: Walk | None, step: Callable[[Tracer, Walk, int], tuple[Walk | None, Candidates | None]]
 ) -> Iterator[Candidates]:
-    """Yield the records of paths from surface to surface."""
+    """Yield the records of paths from surface to surface; none start where the projector emits nothing."""
     for number in range(1, one.tracing.depth + 1):
-        if walk is None:
+        if walk is None or not dr.width(walk.lane):
             return
         walk, record = step(one, walk, number)
         if record is not None:

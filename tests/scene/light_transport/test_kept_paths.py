@@ -7,6 +7,7 @@ import pytest
 
 from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import mi
+from mitsim.scene.light_transport import kept_tracing
 from mitsim.scene.light_transport.kept_paths import Candidates, KeptPaths, broad, light_of, mattering
 from mitsim.scene.light_transport.kept_tracing import camera_paths, photon_paths
 from mitsim.scene.light_transport.kept_walks import Tracing
@@ -196,3 +197,23 @@ def test_a_scene_that_does_not_light_itself_keeps_nothing():
     bsdfs = distinct_bsdfs(scene)
     kept = mattering([every], [bsdfs], roi, 100, 1)
     assert len(kept) == 0 and not KeptPaths(kept, roi).codes(bsdfs, light).any()
+
+
+def test_a_batch_of_photons_that_all_pass_beside_the_image_of_the_projector_is_no_light(corner, monkeypatch):
+    # the rectangle that photons pass through has a margin about the image: the last photon is in it
+    rays, image = CameraRays(pinhole(WIDTH, HEIGHT, 110.0)), np.ones((1, 140, 200))
+    light = ProjectedPatterns(image, Projector(pinhole(200, 140, 700.0, BESIDE), 1.0))
+    started = []
+    start = kept_tracing._photon_start
+
+    def counted(one, first, count):
+        walk = start(one, first, count)
+        started.append(len(walk.lane))
+        return walk
+
+    monkeypatch.setattr(kept_tracing, "_photon_start", counted)
+    whole, _ = candidates(corner, rays, light, 3, samples=4)
+    monkeypatch.setattr(kept_tracing, "_AT_ONCE", 240 * 240 - 1)
+    split, _ = candidates(corner, rays, light, 3, samples=4)
+    assert started[-1] == 0
+    assert len(split) == len(whole) and split.weight.sum() == pytest.approx(whole.weight.sum(), rel=1e-5)
