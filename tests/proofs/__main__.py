@@ -68,6 +68,9 @@ def statements(
     scheduler: Scheduler = None,
     processes: Processes = 1,
     variant: Variant = None,
+    coverage_only: Annotated[
+        bool, typer.Option("--coverage-only", help="Do not judge the choices of races: about half the time.")
+    ] = False,
 ) -> None:
     """Compare statements of uncertainty, and choices of views, with independent virtual measurements.
 
@@ -84,7 +87,9 @@ def statements(
     workers = requested_workers(scheduler, processes)
     chosen = read_part_cases(cases, only or ())
     check_folder(output)
-    page, sensors = write_statement_page(run_cases(chosen, output, workers), output, described(cases, chosen))
+    page, sensors = write_statement_page(
+        run_cases(chosen, output, workers, not coverage_only), output, described(cases, chosen)
+    )
     print(sensors, end="")
     say(f"page: {page}")
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from characterisation.statements.statement import Statement
 from mitsim.running.executor import Executor
 from mitsim.running.progress import say
-from mitsim.study import StatementTable, Study
+from mitsim.study import Study
 from mitsim.study.session import Session
 from mitsim.study.virtual.race import ALL, Raced
 from mitsim.views import View
@@ -30,7 +30,6 @@ from tests.proofs.case_trials import (
     keep_trials,
     measure_worlds,
     measured_choice,
-    measured_truth,
     trials_by_kind,
 )
 from tests.proofs.part_cases import PartCase
@@ -56,30 +55,30 @@ class JudgedView:
 class JudgedCase:
     """Results of a case.
 
-    ``sensor`` is its name. ``views`` (v,) are the numbers of all candidates. ``truth`` (measurement, v, world) are
-    errors, infinite where a view was not measured in a world. ``scores`` are those of screening. ``raced`` is the race,
-    and ``choice`` (measurement, candidate, world) are the errors that judge its choices; both are None if the case is
-    not raced.
+    ``sensor`` is its name. ``views`` (v,) are the numbers of all candidates. ``scores`` are those of screening.
+    ``raced`` is the race, None if the case is not raced. ``choice`` (measurement, candidate, world) are the errors that
+    judge its choices, None if they are not judged.
     """
 
     case: PartCase
     sensor: str
     measurements: tuple[str, ...]
     views: NDArray[np.int64]
-    truth: Floats
     scores: xr.Dataset
     raced: Raced | None
     choice: Floats | None
     stated: tuple[JudgedView, ...]
 
 
-def run_cases(cases: Sequence[PartCase], folder: str | Path, workers: Executor | None = None) -> list[JudgedCase]:
-    """Measure and judge all cases; reuse trials in the folder or in the cases file."""
-    return [run_case(case, Path(folder), workers) for case in cases]
+def run_cases(
+    cases: Sequence[PartCase], folder: str | Path, workers: Executor | None = None, judge_choices: bool = True
+) -> list[JudgedCase]:
+    """Measure and judge all cases, with ``judge_choices`` their races too; reuse trials in folder or cases file."""
+    return [run_case(case, Path(folder), workers, judge_choices) for case in cases]
 
 
-def run_case(case: PartCase, folder: Path, workers: Executor | None = None) -> JudgedCase:
-    """Measure and judge one case."""
+def run_case(case: PartCase, folder: Path, workers: Executor | None = None, judge_choices: bool = True) -> JudgedCase:
+    """Measure and judge one case; ``judge_choices`` also measures its candidates in other worlds than its race."""
     say(f"case: {case.name}")
     study = case.open()
     trials_of_kind = trials_by_kind(case, study, folder, workers)
@@ -88,14 +87,13 @@ def run_case(case: PartCase, folder: Path, workers: Executor | None = None) -> J
     raced = None
     if case.table.raced:
         raced = tool.race(scores.sel(view=[view.number for view in study.views[: case.file.raced_candidates]]))
-    truth = measured_truth(case, trials_of_kind["truth"])
-    choice = None if raced is None else measured_choice(case, trials_of_kind["choice"])
+    choice = measured_choice(case, trials_of_kind["choice"]) if judge_choices and raced is not None else None
     chosen = None if raced is None else raced.leaders().get(ALL)
     stated = [_stated(case, trials_of_kind, view, why) for view, why in _to_state(case, study, scores, chosen)]
     keep_trials(case, folder, trials_of_kind)
     numbers = np.array([view.number for view in study.views])
     return JudgedCase(
-        case, study.sensor.name, tuple(study.task.measurements), numbers, truth, scores, raced, choice, tuple(stated)
+        case, study.sensor.name, tuple(study.task.measurements), numbers, scores, raced, choice, tuple(stated)
     )
 
 
@@ -118,8 +116,7 @@ def _to_state(case: PartCase, study: Study, scores: xr.Dataset, chosen: int | No
 
 def _stated(case: PartCase, trials_of_kind: dict[str, Session], view: View, why: str) -> JudgedView:
     tool, apart, count = trials_of_kind["tool"], trials_of_kind["apart"], case.file.stated_worlds
-    table = StatementTable(trials=tool.study.file.statement.trials)
-    stated = tool.state(view, table)
+    stated = tool.state(view)
     measure_worlds(case, "apart", apart, [view], {view.number: days(count)})
     errors = apart.trials.stated_errors(view.number, days(count))
     return JudgedView(view.number, why, tuple(stated.statements), errors)

@@ -86,7 +86,7 @@ def test_kept_trials_are_not_made_again_and_judge_alike(cases, tmp_path):
     (tmp_path / "run" / name).rename(tmp_path / "measured" / name)
     again = run_cases(read_part_cases(cases), tmp_path / "other")
     assert KnownMaker.made == made > 1000
-    assert np.array_equal(again[0].truth, first[0].truth.astype(np.float32).astype(float))
+    assert np.array_equal(again[0].choice, first[0].choice.astype(np.float32).astype(float))
     assert [one.view for one in again[0].stated] == [one.view for one in first[0].stated]
 
 
