@@ -38,8 +38,9 @@ from mitsim.running.progress import say, track
 from mitsim.running.time_limit import TimeLimit, stopped_by_user
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import Study
+from mitsim.study.early_answers import Answers, Clock
 from mitsim.study.remedies.change import Shortfall
-from mitsim.study.remedies.confirm import all_changes, find_remedies, remedies_document
+from mitsim.study.remedies.confirm import Remedies, all_changes, find_remedies, of_missed, remedies_document
 from mitsim.study.run_record import draw_clouds, write_record
 from mitsim.study.scoring import score_study, write_raced
 from mitsim.study.session import Session
@@ -65,21 +66,6 @@ SHOWN = 3
 
 #: time of the render noise of a view, in pictures of it
 _RESIDUAL_PICTURES = 8
-
-#: time after which a run writes its first report [s], and at least that between later ones
-FIRST_ANSWER_S = 50.0
-
-
-class _Clock:
-    """Wall time of each step [s]."""
-
-    def __init__(self) -> None:
-        self.steps: dict[str, float] = {}
-        self.last = time.monotonic()
-
-    def lap(self, step: str) -> None:
-        now = time.monotonic()
-        self.steps[step], self.last = round(now - self.last, 2), now
 
 
 def run_study(
@@ -139,7 +125,7 @@ def run_within(
     plan = time_plan(whole or 0.0, len(study.views), _seeks_remedies(study))
     if whole is not None:
         say(plan.in_words())
-    session, clock = Session(study, folder, workers), _Clock()
+    session, clock = Session(study, folder, workers), Clock()
     folder, twin = session.folder, session.renderer
     session.claim("run")
     (folder / "clouds").mkdir(parents=True, exist_ok=True)
@@ -150,7 +136,7 @@ def run_within(
 
     scores, chosen, search = score_study(session, performance_map, plan.screening_limit(limit))
     clock.lap("score")
-    answers = _Answers(session, performance_map, scores, limit, clock, report)
+    answers = Answers(session, performance_map, scores, limit, clock, report)
     minutes_of_race = study.file.race.minutes
     race_limit = plan.race_limit(limit) if whole is not None else TimeLimit(minutes_of_race and 60 * minutes_of_race)
     raced = session.race(scores, None, race_limit, answers.improve)
@@ -171,10 +157,17 @@ def run_within(
     if stated is not None and not limit.over():
         twin = None  # its memory is for the changed studies
         own = study.file.remedies.minutes
-        allowed = TimeLimit(60 * own) if limit.end is None else plan.remedies_limit(limit)
+        allowed = TimeLimit(60 * own) if limit.end is None else plan.rest_limit(limit)
         remedies = _remedies(session, stated, scores, raced, search, allowed)
         twin = session.renderer
     clock.lap("remedies")
+    if stated is not None and limit.end is not None and not limit.over():
+        # in the time that the remedies left
+        stated = session.state(stated.view, None, plan.rest_limit(limit))
+        write_json(folder / "statement.json", statement_document(session, stated))
+        if _seeks_remedies(study):
+            remedies = of_missed(remedies, Shortfall(session, stated, scores, raced, search, folder).missed)
+    clock.lap("state further")
     tried = [] if limit.over() else _confirm(session, chosen, search)
     chosen = tried[-1].chosen if tried else chosen
     clock.lap("confirm")
@@ -206,7 +199,7 @@ def run_within(
         render_residual=None if largest is None else asdict(largest),
         faces_in_sight=in_sight,
         view_sets=[] if chosen is None else [_set_record(study, chosen, tried)],
-        remedies=remedies,
+        remedies=None if remedies is None else remedies_document(remedies),
         seconds=clock.steps,
         lacks=lacking(study, scores, raced, stated, limit),
         finished=not limit.over(),
@@ -251,45 +244,6 @@ def lacking(study: Study, scores: xr.Dataset, raced: Raced, stated: StatedView |
     return out
 
 
-class _Answers:
-    """Answers before the end of a run: its folder and report, first after a minute and then as they improve."""
-
-    def __init__(
-        self,
-        session: Session,
-        performance_map: PerformanceMap,
-        scores: xr.Dataset,
-        limit: TimeLimit,
-        clock: _Clock,
-        report: Callable[[], object] | None,
-    ) -> None:
-        self.session, self.map, self.scores = session, performance_map, scores
-        self.limit, self.clock, self.report = limit, clock, report
-        self.next_s = FIRST_ANSWER_S
-        self.drawn: set[int] = set()
-
-    def improve(self, raced: Raced, stated: StatedView | None = None) -> None:
-        """Write the answer so far, if it is time for one. Each takes at most a tenth of the time since the last."""
-        if self.report is None or self.limit.elapsed < self.next_s or self.limit.over():
-            return
-        began = time.monotonic()
-        session, folder = self.session, self.session.folder
-        write_raced(session, self.scores, raced)
-        if stated is not None:
-            write_json(folder / "statement.json", statement_document(session, stated))
-        leader = raced.leader(ALL)
-        if leader not in self.drawn:
-            draw_clouds(session, self.map, [leader])
-            self.drawn.add(leader)
-        lacks = ["the run goes on", *([] if stated is not None else ["no statement of uncertainty yet"])]
-        record: dict[str, Any] = {"seconds": self.clock.steps, "lacks": lacks, "finished": False}
-        write_record(session, self.map, raced, [leader], [], stated=stated is not None, **record)
-        self.report()
-        first = self.next_s == FIRST_ANSWER_S
-        say(f"{'first answer' if first else 'answer'} after {self.limit.elapsed:.0f} s: view {leader}, report.html")
-        self.next_s = self.limit.elapsed + max(FIRST_ANSWER_S, 10 * (time.monotonic() - began))
-
-
 def _confirm(session: Session, chosen: ViewSet | None, search: Search) -> list[TriedSet]:
     """Measure sets of views virtually, if there are any, until one keeps its limits; the best set comes last."""
     table = session.study.file.set
@@ -319,13 +273,13 @@ def _seeks_remedies(study: Study) -> bool:
 
 def _remedies(
     session: Session, stated: StatedView, scores: xr.Dataset, raced: Raced, search: Search, limit: TimeLimit
-) -> dict[str, Any] | None:
-    """Return the changes with which the measurements fit that do not, as JSON values; None if all fit."""
+) -> Remedies | None:
+    """Return the changes with which the measurements fit that do not; None if all fit."""
     now = Shortfall(session, stated, scores, raced, search, session.folder / "remedies")
     if not now.missed or not _seeks_remedies(session.study):
         return None
     trials = session.study.file.remedies.trials
-    return remedies_document(find_remedies(now.missed, all_changes(now, limit), trials, limit))
+    return find_remedies(now.missed, all_changes(now, limit), trials, limit)
 
 
 def _best(scores: xr.Dataset) -> list[int]:

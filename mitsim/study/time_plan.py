@@ -69,8 +69,8 @@ class TimePlan:
         both = self.statement + self.remedies
         return limit.part(1.0 - (self.remedies / both if both > 0 else 0.0), self._pictures(limit))
 
-    def remedies_limit(self, limit: TimeLimit) -> TimeLimit:
-        """Return the limit of the remedies, which start now."""
+    def rest_limit(self, limit: TimeLimit) -> TimeLimit:
+        """Return the limit of what starts now and may take all time but that of pictures and report."""
         return limit.part(1.0, self._pictures(limit))
 
     def _pictures(self, limit: TimeLimit) -> float:

@@ -56,4 +56,4 @@ def test_the_remedies_get_what_the_statement_leaves_but_for_pictures_and_report(
     with_them, without = time_plan(600.0, 102, True), time_plan(600.0, 102)
     limit = TimeLimit(600.0, time.monotonic() - 300.0)
     assert with_them.statement_limit(limit).left < without.statement_limit(limit).left
-    assert with_them.statement_limit(limit).left < with_them.remedies_limit(limit).left < limit.left
+    assert with_them.statement_limit(limit).left < with_them.rest_limit(limit).left < limit.left

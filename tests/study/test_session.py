@@ -119,6 +119,8 @@ def test_a_statement_ends_when_time_is_over_and_continues_where_it_ended(study, 
     assert [one.statements[0].trials for one in seen] == [BATCH]
     assert whole.statements[0].trials == BATCH + 5
     assert (tmp_path / "trials/view_0000.jsonl").read_text().count('"day"') == BATCH + 5
+    # out of time at its start, it still has all that was made
+    assert limited.state(study.views[0], None, TimeLimit(0.0)).statements[0].trials == BATCH + 5
 
 
 def test_a_settled_statement_needs_no_more_trials():

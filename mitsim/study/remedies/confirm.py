@@ -13,7 +13,7 @@ from __future__ import annotations
 import gc
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from characterisation.files.atomic_io import json_values
@@ -124,6 +124,18 @@ def find_remedies(
     if limit.over() and found.open and "sensor" not in kinds:
         found.untried.append("with another sensor")
     return found
+
+
+def of_missed(found: Remedies | None, missed: dict[str, Statement]) -> Remedies | None:
+    """Return remedies for the measurements that a longer statement misses; None if it misses none.
+
+    Nothing was tried for a measurement that only the longer statement misses.
+    """
+    if not missed:
+        return None
+    before = Remedies({}) if found is None else found
+    untried = [f"changes for {name}" for name in missed if name not in before.missed]
+    return replace(before, missed=missed, untried=[*before.untried, *untried])
 
 
 def all_changes(now: Shortfall, limit: TimeLimit) -> Iterator[Change]:

@@ -117,9 +117,12 @@ def state_view(
     made, rules = list[Trial](), table or study.file.statement
     by_known = table is None and limit.end is None and "trials" not in rules.model_fields_set
     least = max(rules.trials, least_trials(study, rules.known_to))
-    for count in batches(rules, table is None, limit):
+    counts = batches(rules, table is None, limit)
+    for count in counts:
         wanted = statement_trials(count)
         complete(trials, runner, [Job(view, trial) for trial in wanted], label, limit.over)
+        if limit.over():  # all that an earlier statement made
+            wanted = statement_trials(counts[-1])
         made = [trial for trial in wanted if trial in trials.known(view.number)]
         so_far = StatedView(view, _statements(study, trials, view, made), planned)
         if limit.over() or (table is None and count > BATCH and _settled(so_far.statements)):

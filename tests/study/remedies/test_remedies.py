@@ -17,7 +17,7 @@ from characterisation.tasks.decision_table import Decision
 from mitsim.running.time_limit import TimeLimit
 from mitsim.study.remedies.bounds import EXPOSURE, Effect, can_fit, least_shares, least_uncertainty
 from mitsim.study.remedies.change import Change, changed_file
-from mitsim.study.remedies.confirm import Remedies, find_remedies, remedies_document
+from mitsim.study.remedies.confirm import Remedies, find_remedies, of_missed, remedies_document
 from mitsim.study.remedies.entries import RemediesEntry, remedies_in_words
 from mitsim.study.tables import StudyFile
 
@@ -150,6 +150,19 @@ def test_without_time_nothing_is_confirmed_and_the_changes_are_named() -> None:
     assert not good.asked and found.open == ["a"]
     lines = remedies_in_words(RemediesEntry.model_validate(remedies_document(found)))
     assert lines == ["a: not tried", "not tried for lack of time: with spray; with another sensor"]
+
+
+def test_a_longer_statement_takes_remedies_away_and_names_what_was_not_tried() -> None:
+    spray = Fake("spray", ("a", "b"), a=0.02, b=0.02)
+    found = find_remedies(missed("a", "b"), [spray.change], 40)
+    assert of_missed(found, {}) is None and of_missed(None, {}) is None
+    longer = of_missed(found, missed("b", "c"))
+    assert longer is not None
+    assert remedies_in_words(RemediesEntry.model_validate(remedies_document(longer))) == [
+        "with spray: b (u 0.020 mm, before 0.80 mm) fits (40 virtual measurements)",
+        "c: not tried",
+        "not tried for lack of time: changes for c",
+    ]
 
 
 def test_the_nearest_of_insufficient_changes_is_named() -> None:
