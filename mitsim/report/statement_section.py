@@ -41,7 +41,8 @@ def statement_section(document: StatementDocument) -> dict[str, Any]:
         "included": [one.model_dump() for one in document.influences if one.included],
         "open_lines": any(not line.settled for one in document.measurements.values() for line in one.budget),
         "depends": dependences_in_words(
-            (name, one.unit, one.size_depends_on) for name, one in document.measurements.items()
+            (name, one.unit, one.size_depends_on, None if one.decision is None else one.decision.needed)
+            for name, one in document.measurements.items()
         ),
         "find_out": remedies_in_words(one.size_depends_on for one in document.measurements.values()),
         "undrawn": [

@@ -49,12 +49,13 @@ REMEDIES = {
 }
 
 
-def dependences_in_words(rows: Iterable[tuple[str, str, SizeDependence | None]]) -> list[str]:
+def dependences_in_words(rows: Iterable[tuple[str, str, SizeDependence | None, float | None]]) -> list[str]:
     """Return a sentence for each measurement whose error has a size that depends on a drawn number.
 
-    ``rows`` have the name, the unit and the dependence of each measurement.
+    ``rows`` have the name, the unit and the dependence of each measurement, and the uncertainty with which it fits its
+    tolerance, None without one.
     """
-    return [_sentence(name, unit, one) for name, unit, one in rows if one is not None]
+    return [_sentence(name, unit, one, needed) for name, unit, one, needed in rows if one is not None]
 
 
 def remedies_in_words(dependences: Iterable[SizeDependence | None]) -> str:
@@ -64,11 +65,14 @@ def remedies_in_words(dependences: Iterable[SizeDependence | None]) -> str:
     return f"{words}." if words else ""
 
 
-def _sentence(name: str, unit: str, one: SizeDependence) -> str:
+def _sentence(name: str, unit: str, one: SizeDependence, needed: float | None) -> str:
     phrases = _PHRASES.get((one.group, one.name), (f"low {one.name}", f"high {one.name}"))
     of = f" of {one.of}" if one.of else ""
     (low, high), (held_low, held_high) = one.uncertainty, one.inside
+    # where the tolerance lies between both ends, the number decides whether the measurement fits
+    between = needed is not None and min(low, high) <= needed < max(low, high)
+    limit = f", and {quantity(needed, unit)} is needed" if needed is not None and between else ""
     return (
-        f"{name}: u is {quantity(low, unit)} with {phrases[0]}{of}, {quantity(high, unit)} with {phrases[1]}; "
+        f"{name}: u is {quantity(low, unit)} with {phrases[0]}{of}, {quantity(high, unit)} with {phrases[1]}{limit}; "
         f"{percent(held_low)} and {percent(held_high)} of these errors are inside the interval"
     )

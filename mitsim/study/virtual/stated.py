@@ -254,7 +254,10 @@ def statement_table(stated: Sequence[Statement]) -> str:
         )
     lost = lost_features((one.measurement, one.trials, one.losses) for one in stated)
     lines = [f"no value in {one.in_words()}" for one in lost]
-    lines += dependences_in_words((one.measurement, one.unit, one.size_depends_on) for one in stated)
+    lines += dependences_in_words(
+        (one.measurement, one.unit, one.size_depends_on, None if one.decided is None else one.decided.needed)
+        for one in stated
+    )
     return "\n".join([*aligned(rows), *lines])
 
 
