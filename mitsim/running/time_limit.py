@@ -19,6 +19,10 @@ from mitsim.running.progress import say
 _stopped = False
 
 
+class OutOfTimeError(Exception):
+    """Time ended within a step that has no result before its end."""
+
+
 class TimeLimit:
     """A moment at which work has to end; ``seconds`` after ``began`` (monotonic clock), None for no limit."""
 

@@ -185,7 +185,7 @@ class Session:
         limit = TimeLimit() if limit is None else limit
         return run_race(self.study.views, scores, self.race_runner, self.race_trials, rules, limit.over, after_round)
 
-    def exposures(self, view: View) -> PlannedExposure | None:
+    def exposures(self, view: View, limit: TimeLimit | None = None) -> PlannedExposure | None:
         """Return the exposures of a view: those of the study, or planned ones; None for the sensor's own rule.
 
         Raises
@@ -201,7 +201,7 @@ class Session:
         if table.exposures_s is not None:
             return stated_exposures(self.study, table.exposures_s, table.power)
         rules = PlanRules(table.most, table.within)
-        return kept_plan(renderer, view, rules, self.folder / "exposures", self.digest)
+        return kept_plan(renderer, view, rules, self.folder / "exposures", self.digest, limit)
 
     def trials_of(self, view: View) -> TrialsOfView:
         """Return what makes the trials of a statement of a view at its exposures, and where they are kept."""

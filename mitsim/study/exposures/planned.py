@@ -21,6 +21,7 @@ from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
 from mitsim.running.progress import say
 from mitsim.running.text_table import aligned
+from mitsim.running.time_limit import TimeLimit
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import Study
 from mitsim.study.exposures.exposure_plan import ExposurePlan, PlanRules, plan_exposures
@@ -46,13 +47,18 @@ class _StoredPlan(PartialDocument):
 
 
 def kept_plan(
-    renderer: RenderedMeasurements, view: View, rules: PlanRules, folder: Path, digest: str
+    renderer: RenderedMeasurements,
+    view: View,
+    rules: PlanRules,
+    folder: Path,
+    digest: str,
+    limit: TimeLimit | None = None,
 ) -> PlannedExposure:
     """Return the planned exposures of a view, and keep the plan in a folder for the next call.
 
     Parameters
     ----------
-    renderer, view, rules
+    renderer, view, rules, limit
         As of :func:`plan_view`.
     folder
         Of the plans of a study.
@@ -72,21 +78,36 @@ def kept_plan(
             stored = None
         if stored is not None and stored.digest == digest_of_plan:
             return PlannedExposure(tuple(stored.exposures_s), stored.power)
-    plan = plan_view(renderer, view, rules)
+    plan = plan_view(renderer, view, rules, limit)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, plan_document(renderer.study, plan) | {"digest": digest_of_plan})
     say(f"view {view.number}: {plan_in_words(plan)}")
     return plan.exposure
 
 
-def plan_view(renderer: RenderedMeasurements, view: View, rules: PlanRules) -> ExposurePlan:
-    """Plan the exposures of one view; its light is traced once."""
+def plan_view(
+    renderer: RenderedMeasurements, view: View, rules: PlanRules, limit: TimeLimit | None = None
+) -> ExposurePlan:
+    """Plan the exposures of one view; its light is traced once.
+
+    Parameters
+    ----------
+    renderer, view, rules
+        Virtual measurements, view, and rules of the plan.
+    limit
+        Time; none by default.
+
+    Raises
+    ------
+    OutOfTimeError
+        If time ends before the plan.
+    """
     sensor = renderer.study.sensor
     policy = sensor.exposure
     if policy.limits_s == _NO_LIMITS:
         say(f"{sensor.name} states no exposure limits: any exposure is allowed")
     own = PlannedExposure(policy.exposures(None, float(sensor.imager.full_well)))
-    sweep = ExposureSweep(renderer, view)
+    sweep = ExposureSweep(renderer, view, limit)
     if not sensor.merges_exposures:
         say(f"{sensor.name} cannot merge exposures: the plan has one exposure")
         rules = PlanRules(1, rules.within)

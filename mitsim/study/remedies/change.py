@@ -103,11 +103,18 @@ class ChangedStudy:
         self.session: Session | None = None
 
     def state(self, count: int, limit: TimeLimit) -> list[Statement]:
-        """State every measurement from a number of trials, or those within a limit."""
+        """State every measurement from a number of trials, or those within a limit.
+
+        Raises
+        ------
+        OutOfTimeError
+            If exposures are planned, and time ends before the plan.
+        """
         if self.session is None:
             self.now.session.release()
             self.session = Session(self.study(), self.now.folder / self.name, self.now.session.workers)
         view = self.view(self.session.study)
+        self.session.exposures(view, limit)  # planned ones are kept
         return self.session.state(view, StatementTable(trials=count), limit).statements
 
     def release(self) -> None:

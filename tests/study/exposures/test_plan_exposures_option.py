@@ -11,7 +11,11 @@ import pytest
 import typer.main
 
 from mitsim.cli.program import app
+from mitsim.running.time_limit import OutOfTimeError, TimeLimit
+from mitsim.study import open_study
 from mitsim.study.exposures import exposure_plan, planned
+from mitsim.study.reading import with_plan
+from mitsim.study.session import Session
 from tests.plain_pages import without_pictures
 from tests.shell import mitsim_here
 from tests.small_study import few_measurements, small_study
@@ -29,7 +33,7 @@ def invoked(*arguments):
         return mitsim_here(*arguments, code=(0, 1))
 
 
-def asked(renderer, view, rules):
+def asked(renderer, view, rules, *_limit):
     """What a plan follows from: two that agree in it are the same to the last bit."""
     study = renderer.study
     light = {"scene", "parameters", "task", "seed", "unknowns", "measure", "exposure"}
@@ -114,6 +118,16 @@ def test_state_and_choose_plan_as_run_does(chosen, plans, command):
     if command == "choose":
         captured = json.loads((folder / "choose/choice.json").read_text())["sensors"][0]["capture"]
         assert captured["exposures_s"] == stated["exposure"]["exposures_s"]
+
+
+def test_a_plan_ends_with_its_time_and_is_not_kept(chosen):
+    folder, _, view = chosen
+    study = open_study(folder / "study.toml")
+    planned_study = with_plan(study, True)
+    here = Session(planned_study, folder / "late")
+    with pytest.raises(OutOfTimeError):
+        here.exposures(study.view(view), TimeLimit(0.0))
+    assert not (folder / "late/exposures").exists()
 
 
 def test_without_the_option_the_sensors_own_exposure_holds(chosen):

@@ -14,7 +14,7 @@ from characterisation.statements.budget import BudgetLine
 from characterisation.statements.decision import demand, plus_minus
 from characterisation.statements.statement import Statement, statement
 from characterisation.tasks.decision_table import Decision
-from mitsim.running.time_limit import TimeLimit
+from mitsim.running.time_limit import OutOfTimeError, TimeLimit
 from mitsim.study.remedies.bounds import EXPOSURE, Effect, can_fit, least_shares, least_uncertainty
 from mitsim.study.remedies.change import Change, changed_file
 from mitsim.study.remedies.confirm import Remedies, find_remedies, of_missed, remedies_document
@@ -163,6 +163,15 @@ def test_a_longer_statement_takes_remedies_away_and_names_what_was_not_tried() -
         "c: not tried",
         "not tried for lack of time: changes for c",
     ]
+
+
+def test_a_change_that_cannot_be_prepared_in_time_is_not_tried() -> None:
+    def too_long(_count: int, _limit: TimeLimit) -> list[Statement]:
+        raise OutOfTimeError
+
+    planned, good = Change("exposure", "with exposures", {}, (1,), {"a": 0.0}, too_long), Fake("spray", ("a",), a=0.02)
+    found = find_remedies(missed("a"), [planned, good.change], 40)
+    assert found.untried == ["with exposures"] and [one.change.kind for one in found.tried] == ["spray"]
 
 
 def test_the_nearest_of_insufficient_changes_is_named() -> None:
