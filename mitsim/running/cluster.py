@@ -16,7 +16,7 @@ import re
 import time
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any, TypeVar
 
 from characterisation.files.checked_files import is_file
@@ -67,9 +67,15 @@ class Cluster:
         weakref.finalize(self, self.client.close).atexit = False  # Dask closes it at the end of the process
 
     def distribute(
-        self, items: Sequence[Item], order: Callable[[Item], Plain], work: Callable[[Plain], Result]
+        self,
+        items: Sequence[Item],
+        order: Callable[[Item], Plain],
+        work: Callable[[Plain], Result],
+        prepared: Callable[[Item], Hashable] | None = None,
     ) -> Iterator[tuple[Item, Result]]:
         """Yield items with their results, see :meth:`~mitsim.running.executor.Executor.distribute`.
+
+        The scheduler chooses the worker, whatever it has ``prepared``.
 
         Raises
         ------
@@ -83,11 +89,12 @@ class Cluster:
         _compare_builds(self.client, self.address, own)
         executor = self.client.get_executor(pure=False, retries=DEATHS)
         try:
+            running: dict[Any, Item] = {}
             yield from finished_orders(
                 deque(items),
-                {},
+                running,
                 lambda item: executor.submit(_of_same_build, self.address, own, work, order(item)),
-                lambda: AHEAD * max(sum(self.client.ncores().values()), 1),
+                lambda: 0 if len(running) < AHEAD * max(sum(self.client.ncores().values()), 1) else None,
                 _Watch(self.client, self.address).check,
                 _POLL_S,
             )

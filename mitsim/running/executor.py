@@ -6,7 +6,8 @@ views and comparisons of sensors all use it.
 
 A result depends on its order alone, so the whole is the same for any number of workers. The caller keeps each result
 before it asks for the next, so a stop loses only the orders in work. A dead worker is replaced and its orders are
-repeated, at most :data:`DEATHS` times in a row.
+repeated, at most :data:`DEATHS` times in a row. Orders may name what a worker prepares for them: they go to a worker
+that has prepared it, unless another would be idle.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ import multiprocessing
 import os
 import signal
 import sys
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -46,9 +47,22 @@ class Executor(Protocol):
     """Distributes work: :class:`Pool`, or :class:`mitsim.running.cluster.Cluster`."""
 
     def distribute(
-        self, items: Sequence[Item], order: Callable[[Item], Plain], work: Callable[[Plain], Result]
+        self,
+        items: Sequence[Item],
+        order: Callable[[Item], Plain],
+        work: Callable[[Plain], Result],
+        prepared: Callable[[Item], Hashable] | None = None,
     ) -> Iterator[tuple[Item, Result]]:
         """Yield items with the results of ``work``, a module-level function, on their orders, as they are finished.
+
+        Parameters
+        ----------
+        items
+            What there is to do.
+        order, work
+            Plain value of an item, and the function of it.
+        prepared
+            Name of what a worker prepares for an item and keeps; by default nothing.
 
         Raises
         ------
@@ -81,7 +95,7 @@ def finished_orders(
     waiting: deque[Item],
     running: dict[Future[Result], Item],
     submit: Callable[[Item], Future[Result]],
-    room: Callable[[], int],
+    next_of: Callable[[], int | None],
     idle: Callable[[], None] = lambda: None,
     idle_s: float | None = None,
 ) -> Iterator[tuple[Item, Result]]:
@@ -92,8 +106,8 @@ def finished_orders(
     waiting, running
         Items that wait, and those in work by their futures; both are changed. After an error, ``running`` has the items
         without a result. Their futures are cancelled.
-    submit, room
-        Start the work on an item; return how many items may be in work.
+    submit, next_of
+        Start the work on an item; return the place of the next one among those that wait, None without room.
     idle, idle_s
         Called when no item was finished for ``idle_s`` [s].
 
@@ -103,9 +117,10 @@ def finished_orders(
     """
     try:
         while waiting or running:
-            while waiting and len(running) < room():
-                running[submit(waiting[0])] = waiting[0]
-                waiting.popleft()
+            while waiting and (place := next_of()) is not None:
+                item = waiting[place]
+                running[submit(item)] = item
+                del waiting[place]
             done = wait(running, idle_s, FIRST_COMPLETED).done
             if not done:
                 idle()
@@ -122,26 +137,41 @@ class Pool:
 
     def __init__(self, processes: int) -> None:
         self.processes = processes
-        self._pool: ProcessPoolExecutor | None = None
+        self._workers: dict[int, ProcessPoolExecutor] = {}
+        self._prepared: dict[int, set[Hashable]] = {}
 
     def distribute(
-        self, items: Sequence[Item], order: Callable[[Item], Plain], work: Callable[[Plain], Result]
+        self,
+        items: Sequence[Item],
+        order: Callable[[Item], Plain],
+        work: Callable[[Plain], Result],
+        prepared: Callable[[Item], Hashable] | None = None,
     ) -> Iterator[tuple[Item, Result]]:
         """Yield items with their results, see :meth:`Executor.distribute`; dead processes are replaced."""
-        waiting, deaths = deque(items), 0
+        name_of, deaths = prepared or (lambda _: None), 0
+        waiting: deque[Item] = deque(items)
         running: dict[Future[Result], Item] = {}
+        worker_of: dict[Future[Result], int] = {}
+        chosen = 0
+
+        def next_of() -> int | None:
+            nonlocal chosen
+            place, chosen = self._next(waiting, name_of, Counter(worker_of[one] for one in running))
+            return place
+
+        def submit(item: Item) -> Future[Result]:
+            future = self._ready(chosen).submit(work, order(item))
+            self._prepared[chosen].add(name_of(item))
+            worker_of[future] = chosen
+            return future
+
         while waiting or running:
             try:
-                for finished in finished_orders(
-                    waiting,
-                    running,
-                    lambda item: self._ready().submit(work, order(item)),
-                    lambda: AHEAD * self.processes,
-                ):
+                for finished in finished_orders(waiting, running, submit, next_of):
                     deaths = 0
                     yield finished
             except BrokenProcessPool:
-                self._pool = None
+                self.close(wait=False)
                 waiting.extendleft(reversed(running.values()))
                 running.clear()
                 deaths += 1
@@ -152,18 +182,42 @@ class Pool:
                     ) from None
                 say("a worker process died; its work is repeated")
 
-    def close(self) -> None:
-        """End the processes after their current orders."""
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
-            self._pool = None
+    def close(self, wait: bool = True) -> None:
+        """End the processes after their current orders; ``wait`` for these."""
+        workers = list(self._workers.values())
+        self._workers.clear()
+        self._prepared.clear()
+        for one in workers:
+            one.shutdown(wait=False, cancel_futures=True)
+        for one in workers if wait else ():
+            one.shutdown()
 
-    def _ready(self) -> ProcessPoolExecutor:
-        if self._pool is None:
+    def _next(
+        self, waiting: deque[Item], name_of: Callable[[Item], Hashable], orders: Counter[int]
+    ) -> tuple[int | None, int]:
+        """Return the place of the next of the waiting items, and its worker; None without room.
+
+        ``orders`` are those in work at each worker. A worker takes what it has prepared, or nobody has; an idle one
+        takes any.
+        """
+        anywhere = set().union(*self._prepared.values())
+        free = [worker for worker in range(self.processes) if orders[worker] < AHEAD]
+        for worker in sorted(free, key=lambda one: orders[one]):
+            mine = self._prepared.get(worker, set())
+            for place, name in enumerate(map(name_of, waiting)):
+                if name in mine or name not in anywhere:
+                    return place, worker
+            if not orders[worker]:
+                return 0, worker
+        return None, 0
+
+    def _ready(self, worker: int) -> ProcessPoolExecutor:
+        if worker not in self._workers:
             threads = max(1, usable_cores() // self.processes)
             context = multiprocessing.get_context("spawn")  # a forked process with Dr.Jit's threads hangs
-            self._pool = ProcessPoolExecutor(self.processes, context, _start_worker, (threads, os.getpid()))
-        return self._pool
+            self._workers[worker] = ProcessPoolExecutor(1, context, _start_worker, (threads, os.getpid()))
+            self._prepared[worker] = set()
+        return self._workers[worker]
 
 
 def _start_worker(threads: int, parent: int) -> None:

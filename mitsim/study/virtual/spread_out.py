@@ -25,8 +25,8 @@ from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.trials import Outcome
 from mitsim.study.virtual.world import Unknowns
 
-#: largest number of jobs in one order; a worker that dies loses at most these
-_IN_A_ROW = 8
+#: largest number of jobs in one order; a worker that dies loses at most these, and some workers wait for as many
+_IN_A_ROW = 4
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class SpreadMeasurements:
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, Outcome]]:
         """Yield the outcome of every virtual measurement, job by job as they arrive."""
         orders = [replace(self._order, jobs=some) for some in self._rows(jobs)]
-        for order, results in self.workers.distribute(orders, lambda one: one, make_trials):
+        for order, results in self.workers.distribute(orders, lambda one: one, make_trials, _light_of):
             yield from zip(order.jobs, results, strict=True)
 
     def _rows(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, ...]]:
@@ -86,6 +86,11 @@ class SpreadMeasurements:
             row = tuple(some)
             for first in range(0, len(row), _IN_A_ROW):
                 yield row[first : first + _IN_A_ROW]
+
+
+def _light_of(order: TrialOrder) -> tuple[str, Rendering, int]:
+    """Return the name of the light that the trials of an order share."""
+    return order.digest, order.rendering, order.jobs[0].view.number
 
 
 #: digest of a study, and its measurements with the light paths of the last order

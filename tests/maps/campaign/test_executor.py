@@ -3,7 +3,9 @@
 import os
 import pickle
 import signal
+from concurrent.futures import Future
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -72,6 +74,44 @@ def test_who_stops_asking_leaves_nothing_in_work(pool):
     next(asked)
     asked.close()
     assert dict(pool.distribute([5], lambda n: n, squared)) == {5: 25}
+
+
+class Here:
+    """A worker that is this process: it notes its orders, and finishes the first when it is asked to."""
+
+    def __init__(self):
+        self.made, self.left = [], []
+
+    def submit(self, work, value):
+        self.made.append(value)
+        self.left.append((Future(), work(value)))
+        return self.left[-1][0]
+
+    def finish(self):
+        future, result = self.left.pop(0)
+        future.set_result(result)
+
+
+def test_orders_go_to_the_worker_that_prepared_for_them_unless_one_is_idle(monkeypatch):
+    """Two views of a race: each is prepared by one worker, until a worker has nothing of its own left."""
+    pool, workers = Pool(2), [Here(), Here()]
+
+    def ready(number):
+        pool._prepared.setdefault(number, set())
+        return workers[number]
+
+    def wait(running, *_):
+        next(one for one in workers if one.left and one.left[0][0] in running).finish()
+        return SimpleNamespace(done=[one for one in running if one.done()])
+
+    monkeypatch.setattr(pool, "_ready", ready)
+    monkeypatch.setattr(executor, "wait", wait)
+    orders = ["a1", "a2", "a3", "b1", "b2", "b3", "b4", "b5", "b6", "b7", "b8"]
+    found = dict(pool.distribute(orders, lambda one: one, str.upper, lambda one: one[0]))
+    assert found == {one: one.upper() for one in orders}
+    first, second = (one.made for one in workers)
+    assert first[:3] == ["a1", "a2", "a3"] and second[:2] == ["b1", "b2"]  # the first finishes all that it has
+    assert set(first[3:]) | set(second) == {one for one in orders if one[0] == "b"} and first[3:]
 
 
 def test_a_process_that_dies_loses_no_work(pool, tmp_path, capsys):

@@ -33,7 +33,7 @@ def study(tmp_path_factory):
 class _Here:
     """Workers that make each order in this process."""
 
-    def distribute(self, orders, _, make):
+    def distribute(self, orders, _order, make, _prepared):
         return ((order, make(order)) for order in orders)
 
 
