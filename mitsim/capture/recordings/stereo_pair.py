@@ -69,9 +69,9 @@ def read_stereo_pair(
     known = read_calibration(calibration, size_of_images(folder))
     names = list(known.rig.cameras)[:2]
     if len(names) < 2 or known.unrelated:
-        shown = f"{', '.join(names)}{', without the pose of the second' if known.unrelated else ''}"
+        stated = f"{', '.join(names)}{', without the pose of the second' if known.unrelated else ''}"
         hint = "; ".join([*known.notes, _POSE])
-        raise InputError(calibration, "cameras", shown, "two cameras with R and T: a stereo pair", hint)
+        raise InputError(calibration, "cameras", stated, "two cameras with R and T: a stereo pair", hint)
     files = {name: pair_files(folder, name, (images or {}).get(name)) for name in names}
     counts = [len(found) for found in files.values()]
     if counts[0] != counts[1] or counts[0] == 0:
