@@ -271,6 +271,12 @@ def test_a_matrix_that_is_none_is_refused(tmp_path):
         read_calibration(saved(tmp_path / "a.yaml", {"K": bad.tolist(), "D": D}), SIZE)
 
 
+def test_a_list_of_cameras_is_no_file_of_an_ensenso(tmp_path):
+    """Of calib.io's JSON the message asked for the baseline of an Ensenso."""
+    with pytest.raises(InputError, match=r"the file has Calibration\.cameras"):
+        read_calibration(saved(tmp_path / "a.json", {"Calibration": {"cameras": [{"model": {"f": 600.0}}]}}))
+
+
 def test_arrays_of_python_objects_are_left_out(tmp_path):
     np.savez(tmp_path / "a.npz", mtx=K, dist=D, about=np.array({"rms": 0.2}, dtype=object))
     sees(read_calibration(tmp_path / "a.npz", SIZE).rig.reference, K, D)
