@@ -7,9 +7,9 @@ A camera matrix is a matrix under a usual name (:mod:`mitsim.sensor.calibration_
 ``fy``, ``cx``, ``cy`` (``ppx``, ``ppy`` of librealsense); or two lists, such as ``focal_length`` and
 ``principal_point``; or one list of four beside a lens model or an image size (Kalibr, EuRoC). Distortion and pose stand
 in the same map, in a map inside it, or in those around it that have no other eye; size and model in any map around it.
-``T_cn_cnm1`` of Kalibr takes coordinates of the camera before to this one, in metres. A pose in the map of each camera
-takes coordinates of one common frame to the camera. Nine numbers of a rotation are by rows; those of librealsense
-(``rs2_extrinsics``) are by columns, and its lengths in metres.
+``T_cn_cnm1`` of Kalibr takes coordinates of the camera before to this one, ``T_cam_imu`` those of the IMU, in metres. A
+pose in the map of each camera takes coordinates of one common frame to the camera. Nine numbers of a rotation are by
+rows; those of librealsense (``rs2_extrinsics``) are by columns, and its lengths in metres.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ _LENSES = frozenset(name.lower() for name in (*USUAL_NAMES["distortion"][0], "co
 _BENT = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "taux", "tauy")
 _FISHEYE = ("k1", "k2", "k3", "k4")
 
-#: name of Kalibr for the pose of a camera from the one before it
-_STEP = "T_cn_cnm1"
+#: names of Kalibr for the pose of a camera from the one before it, and from the IMU
+_STEP, _COMMON = "T_cn_cnm1", "T_cam_imu"
 
 #: names under which maps state the model of a lens
 LENS_MODELS = ("camera_model", "distortion_model", "camera_type", "lens_model", "model_type", "model", "type")
@@ -301,9 +301,10 @@ def _pose(maps: list[_Named]) -> dict[str, Composed]:
     """Return R and T from the first camera to this eye, if its maps state them; those of no map need no search."""
     of_librealsense = any("ppx" in table for _, table in maps)
     for name, table in maps:
-        step = vector(table.get(_STEP), 16)
+        key = _STEP if _STEP in table else _COMMON
+        step = vector(table.get(key), 16)
         if step is not None:
-            motion, metres, source = step.reshape(4, 4), {"unit": "m"}, (_dotted(name, _STEP),)
+            motion, metres, source = step.reshape(4, 4), {"unit": "m"}, (_dotted(name, key),)
             return {
                 "rotation": Composed(motion[:3, :3], source, metres),
                 "translation": Composed(motion[:3, 3], source, metres),

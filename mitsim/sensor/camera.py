@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.errors import InputError
 from characterisation.files.threads import in_threads
 from mitsim.sensor.distortion_fold import before_fold, inverse_fold_radii
 from mitsim.sensor.transforms import Transform
@@ -321,8 +322,16 @@ def stereo_rectification(left: Camera, right: Camera) -> Rectification:
 
     OpenCV finds the centre of the rectified image by undistorting its corners. That iteration can diverge for strong
     distortion. Rotations and focal length do not depend on it; a diverged centre is replaced.
+
+    Raises
+    ------
+    InputError
+        If both cameras stand in the same place.
     """
     right_from_left = right.sensor_from_camera.inverse() @ left.sensor_from_camera
+    if not right_from_left.translation.any():
+        found = "both cameras of the pair in the same place"
+        raise InputError("rig", "cameras", found, "a distance between them", "give the pose of the second camera")
     r1, r2, p1, p2, *_ = cv2.stereoRectify(
         left.matrix,
         left.distortion,

@@ -309,11 +309,13 @@ def _pose(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[s
     file = ", ".join(dict.fromkeys(map(str, values.tree.files)))
     pair = rectified_pair(values.tables[0], values.tables[-1])
     needed = pair is None
-    shapes = ((3, 3), (9,), (3,), (3, 1), (1, 3))
+    motions = ((4, 4), (3, 4))
+    shapes = ((3, 3), (9,), (3,), (3, 1), (1, 3), *motions)
     rotation = values.find(name, place, "rotation", shapes, needed and "rotation_deg" not in own)
-    translation = values.find(name, place, "translation", ((3,),), needed and "position_mm" not in own)
+    translation = values.find(name, place, "translation", ((3,), *motions), needed and "position_mm" not in own)
     if rotation is not None and translation is not None:
         R, T = rotation.value, translation.value
+        R, T = R[:3, :3] if R.shape in motions else R, T[:3, 3] if T.shape in motions else T
         stated = unit_mm(translation.table, translation.file)
     elif pair is not None:
         (R, T), stated = pair, 1000.0

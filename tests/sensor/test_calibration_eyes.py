@@ -90,6 +90,10 @@ def test_the_size_beside_a_matrix_suffices(tmp_path):
     assert (read.rig.reference.width, read.rig.reference.height) == SIZE
 
 
+def motion(rotation, translation):
+    return np.vstack([np.column_stack([rotation, translation]), [0, 0, 0, 1]]).tolist()
+
+
 PAIRS = {
     "nine numbers of a rotation": {
         "K1": K.ravel().tolist(),
@@ -121,6 +125,10 @@ PAIRS = {
     "both in a common frame": {
         "left": {"K": K.tolist(), "D": D, "R": R_LEFT.tolist(), "T": T_LEFT.tolist()},
         "right": {"K": K2.tolist(), "D": D, "R": (R @ R_LEFT).tolist(), "T": (R @ T_LEFT + T).tolist()},
+    },
+    "Kalibr, of both from the IMU": {
+        "cam0": {"K": K.tolist(), "D": D, "T_cam_imu": motion(R_LEFT, T_LEFT / 1000)},
+        "cam1": {"K": K2.tolist(), "D": D, "T_cam_imu": motion(R @ R_LEFT, (R @ T_LEFT + T) / 1000)},
     },
     "numbers, and a map of the pose": {
         "cameras": {"cam1": {"K": K2.tolist(), "D": D}, "cam0": {"K": K.tolist(), "D": D}},
@@ -192,6 +200,18 @@ def test_a_camera_and_a_projector_in_maps(tmp_path):
     assert (sensor.projector.optics.width, sensor.projector.optics.height, sensor.notes) == (912, 570, ())
 
 
+def test_a_pose_as_one_matrix_that_a_toml_names(tmp_path):
+    cameras = {"left": {"K": K.tolist(), "D": D}, "right": {"K": K2.tolist(), "D": D}}
+    saved(tmp_path / "a.json", cameras | {"left_to_right": motion(R, T)})
+    (tmp_path / "a.toml").write_text(
+        '[calibration]\nfile = "a.json"\ncameras = ["left", "right"]\nprojector = false\n[calibration.keys.right]\n'
+        'rotation = "left_to_right"\ntranslation = "left_to_right"\n'
+    )
+    read = read_calibration(tmp_path / "a.toml", SIZE)
+    sees(read.rig.cameras["left"], K, D)
+    sees(read.rig.cameras["right"], K2, D, OM, T)
+
+
 def colour_and_depth(size):
     colour = {"fx": 900.0, "fy": 900.0, "ppx": 331.0, "ppy": 245.0, "width": size[0], "height": size[1]}
     return {"color": colour, "depth": OF_LIBREALSENSE | {"coeffs": D}}
@@ -249,6 +269,12 @@ def test_a_matrix_that_is_none_is_refused(tmp_path):
     bad = np.array([[FX, 0, 0], [0, FY, 0], [CX, CY, 2]])
     with pytest.raises(InputError, match="matrix of camera"):
         read_calibration(saved(tmp_path / "a.yaml", {"K": bad.tolist(), "D": D}), SIZE)
+
+
+def test_a_list_of_cameras_is_no_file_of_an_ensenso(tmp_path):
+    """Of calib.io's JSON the message asked for the baseline of an Ensenso."""
+    with pytest.raises(InputError, match=r"the file has Calibration\.cameras"):
+        read_calibration(saved(tmp_path / "a.json", {"Calibration": {"cameras": [{"model": {"f": 600.0}}]}}))
 
 
 def test_arrays_of_python_objects_are_left_out(tmp_path):

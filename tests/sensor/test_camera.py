@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Camera, Rectification, Rig, stereo_rectification
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import Transform
@@ -128,3 +129,10 @@ def test_the_baseline_points_to_the_second_eye(n10):
     direction = n10.rig.baseline_direction
     assert np.allclose(direction, [np.cos(np.radians(4.15)), 0, np.sin(np.radians(4.15))], atol=1e-4)
     assert np.array_equal(Rig({"one": n10.rig.reference}).baseline_direction, [1, 0, 0])
+
+
+def test_a_pair_in_one_place_is_refused():
+    """OpenCV's assertion ended the program."""
+    camera = Camera(np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]), np.zeros(5), 640, 480)
+    with pytest.raises(InputError, match="both cameras of the pair in the same place"):
+        stereo_rectification(camera, camera)

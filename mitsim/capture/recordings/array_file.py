@@ -7,6 +7,7 @@ The axis of x, y and z is the last: (n, 3), (rows, columns, 3); or the first, as
 from __future__ import annotations
 
 import io
+import re
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
@@ -20,6 +21,10 @@ from mitsim.capture.recordings.recording_files import chosen_frame
 
 #: most values of a point: x, y, z, normal and colour
 _MOST_VALUES = 9
+
+#: names of arrays of points, and of others that have three values of a pixel as well
+_POINTS = re.compile(r"point|xyz|vert|cloud|location|pos", re.IGNORECASE)
+_NO_POINTS = re.compile(r"normal|colou?r|rgb|bgr|image|img|texture", re.IGNORECASE)
 
 #: largest unpacked archive [bytes]
 _LARGEST_ARCHIVE = 4 * 1024**3
@@ -94,6 +99,9 @@ def map_in(data: bytes, where: Path, frame: int | None = None) -> NDArray[Any]:
         return points
     flat = {name: one[..., 0] if one.ndim == 3 and one.shape[2] == 1 else one for name, one in arrays.items()}
     depths = {name: one for name, one in flat.items() if one.ndim in (2, 3) and one.dtype.kind in "fiu"}
+    if depths and all(map(is_disparity, depths)):
+        raise disparities(where)
+    depths = {name: one for name, one in depths.items() if not is_disparity(name)}
     named = {name: one for name, one in depths.items() if "depth" in name.lower()} or depths
     if len(named) != 1 or points is not None:
         shapes = ", ".join(f"{name} {' x '.join(map(str, one.shape))}".strip() for name, one in arrays.items())[:300]
@@ -103,8 +111,22 @@ def map_in(data: bytes, where: Path, frame: int | None = None) -> NDArray[Any]:
     return depth if depth.ndim == 2 else depth[chosen_frame(frame, len(depth), where, "images of depths")]
 
 
+def is_disparity(name: str) -> bool:
+    """Return whether a file or an array is named after disparities."""
+    return re.search(r"disparit|(?<![a-z])disp(?![a-z])", name.lower()) is not None
+
+
+def disparities(where: str | Path) -> InputError:
+    """Return the error of a file that is named after disparities."""
+    hint = "depth = f B / disparity, with the focal length f [px] and the baseline B [mm]; save it under another name"
+    return InputError(where, "", "disparities, by the name", "depths", hint)
+
+
 def points_among(arrays: dict[str, NDArray[Any]]) -> NDArray[Any] | None:
-    """Return the largest array of points (n, 3) or (rows, columns, 3) among arrays; None without one."""
+    """Return the array of points (n, 3) or (rows, columns, 3) among arrays; None without one.
+
+    Of several, one that is named so comes first, then the largest; colours and normals are none.
+    """
     fields = {
         name: one[name] for one in arrays.values() if one.dtype.names for name in one.dtype.names if name in "xyzXYZ"
     }
@@ -114,8 +136,12 @@ def points_among(arrays: dict[str, NDArray[Any]]) -> NDArray[Any] | None:
     if first is not None and all(one is not None and one.shape == first.shape for one in named):
         joined = np.stack([np.asarray(one, np.float64) for one in named], axis=-1)
         return joined.reshape(-1, 3) if joined.ndim == 2 or 1 in joined.shape[:-1] else joined
-    turned = [points for one in real.values() if (points := _with_points_last(one)) is not None]
-    return max(turned, key=lambda one: one.size, default=None)
+    turned = [
+        (_POINTS.search(name) is not None, points.size, points)
+        for name, one in real.items()
+        if (_POINTS.search(name) or not _NO_POINTS.search(name)) and (points := _with_points_last(one)) is not None
+    ]
+    return max(turned, key=lambda one: one[:2], default=(False, 0, None))[2]
 
 
 def _with_points_last(array: NDArray[Any]) -> NDArray[Any] | None:

@@ -99,7 +99,7 @@ def _read(source: str | Path, size: tuple[int, int] | None) -> Calibrated:
     if is_depthai_calibration(table):
         read = read_depthai_calibration(path)
         return Calibrated(read.rig(*size) if size else read.rig(), read.name)
-    if isinstance(table, dict) and isinstance(table.get("Calibration"), dict):
+    if isinstance(table, dict) and isinstance(table.get("Calibration"), dict) and "cameras" not in table["Calibration"]:
         tree = NxLibTree(read_bounded(path, "a calibration"), str(path))
         return Calibrated(nxlib_rig(tree, None if tree.has("Sensor/Size") else size), str(tree.get("ModelName", "")))
     if isinstance(table, dict) and _is_of_capture(table.get("cameras")):

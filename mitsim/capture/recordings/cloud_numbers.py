@@ -23,7 +23,7 @@ from mitsim.sensor.calibration_qualifiers import LENGTHS_MM, UNITS_MM
 METRES_UNDER = 20.0
 
 #: median distance above which the unit is neither metres nor millimetres, or the coordinates have an offset
-_NEITHER_ABOVE = 20_000.0
+NEITHER_ABOVE = 20_000.0
 
 #: coordinates beyond this are not measurements [mm]
 FARTHEST_MM = 1e6
@@ -117,9 +117,9 @@ def scale_to_mm(points: NDArray[np.floating], path: Path, unit: str | None = Non
     if not len(seen):
         raise InputError(path, "", "no points", "a cloud with x, y and z")
     distance = float(np.median(np.linalg.norm(seen.astype(float), axis=-1)))
-    if unit is None and distance > _NEITHER_ABOVE:
+    if unit is None and distance > NEITHER_ABOVE:
         found = f"points at a median distance of {distance:.4g}, in a unit that the file does not state"
-        allowed = f"up to {METRES_UNDER:g} in m, or {_NEITHER_ABOVE:g} in mm, from the sensor at the origin"
+        allowed = f"up to {METRES_UNDER:g} in m, or {NEITHER_ABOVE:g} in mm, from the sensor at the origin"
         raise InputError(
             path, "x, y, z", found, allowed, "name the unit: --unit um; or subtract an offset of the coordinates"
         )

@@ -148,25 +148,27 @@ def _unit(heads: list[str], path: Path) -> str | None:
 def _check_no_counters(table: NDArray[np.float64], path: Path) -> None:
     """Check that a text without names has x, y and z first.
 
-    Numbers of a row, or of a row and a column, are whole; three columns after them that are not, or that do not vary,
-    are x, y and z.
+    Numbers of a row, or of a row and a column, are whole, and three of a colour up to 255; three columns after them
+    that are not, or that do not vary, are x, y and z.
 
     Raises
     ------
     InputError
-        If the first one or two columns count.
+        If the first one or two columns count, or the first three are colours.
     """
     some = table[np.linspace(0, len(table) - 1, min(1000, len(table))).astype(np.intp)]
     some = some[np.isfinite(some).all(axis=1)]
     whole = (some % 1 == 0).all(axis=0) if len(some) else np.ones(table.shape[1], bool)
     varies = (some != some[:1]).any(axis=0) if len(some) else ~whole
-    for count in (1, 2):
+    for count in (1, 2, 3):
         if table.shape[1] < count + 3:
             continue
+        if count == 3 and not (((some[:, :3] >= 0) & (some[:, :3] <= 255)).all() and np.abs(some[:, 3:6]).max() > 1):
+            continue  # whole coordinates, or normals after them
         lengths = (~whole)[count : count + 3].sum() >= 2 and not (whole & varies)[count : count + 3].any()
         if whole[:count].all() and varies[:count].any() and lengths:
-            counting = "the first two seem to count" if count == 2 else "the first seems to count"
-            found = f"{table.shape[1]} columns without names, of which {counting}"
+            counting = ("the first seems to count", "the first two seem to count", "the first three seem to be colours")
+            found = f"{table.shape[1]} columns without names, of which {counting[count - 1]}"
             raise InputError(path, "", found, "x, y and z first, or names", "write the names above: number,x,y,z")
 
 

@@ -20,9 +20,9 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_image import read_depths
 from mitsim.capture.npy import NPY_MAGIC
-from mitsim.capture.recordings.array_file import map_in
+from mitsim.capture.recordings.array_file import disparities, is_disparity, map_in
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
-from mitsim.capture.recordings.cloud_numbers import FARTHEST_MM, METRES_UNDER
+from mitsim.capture.recordings.cloud_numbers import FARTHEST_MM, METRES_UNDER, NEITHER_ABOVE
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.png import LONGEST_SIDE_PX
 
@@ -65,13 +65,16 @@ def read_depth_image(
     Raises
     ------
     InputError
-        If the image or the calibration cannot be read, the image has 8 bits, or its size differs from the camera's.
+        If the image or the calibration cannot be read, the image has 8 bits, its size differs from the camera's, or it
+        has disparities or an unknown unit.
 
     See Also
     --------
     depth_capture : the capture of a depth image
     """
     path = Path(path)
+    if is_disparity(path.stem):
+        raise disparities(path)
     image = _levels(path, frame)
     if image.dtype == np.uint8:
         hint = "an 8-bit picture has lost its depths: save the device's 16 bits"
@@ -80,11 +83,9 @@ def read_depth_image(
     if image.dtype.kind == "f":
         invalid = 0 if invalid is None else invalid
     missing, warnings = _missing(image, invalid or 0)
-    if image.dtype.kind == "f":
-        seen = image[~missing]
-        in_metres = scale_mm is None and seen.size and float(np.median(seen)) < METRES_UNDER
-        scale_mm = 1000.0 if in_metres else scale_mm
-    scale_mm, invalid = 1.0 if scale_mm is None else scale_mm, invalid or 0
+    median = 0.0 if missing.all() else float(np.median(image[~missing]))
+    in_metres = image.dtype.kind == "f" and median < METRES_UNDER
+    scale_mm, invalid, assumed = scale_mm or (1000.0 if in_metres else 1.0), invalid or 0, scale_mm is None
     settings |= {"depth_scale_mm": float(scale_mm), "depth_invalid": int(invalid)}
     if warnings:
         settings["warnings"] = warnings
@@ -92,6 +93,10 @@ def read_depth_image(
         levels = np.unique(image[np.isfinite(image)])
         only = f"an image with only the level {levels[0]:g}" if len(levels) == 1 else "no depth over 0"
         raise InputError(path, "", only, "an image with some depths")
+    if assumed and median > 0 and not METRES_UNDER <= median * scale_mm <= NEITHER_ABOVE:
+        found = f"a median of {median:.4g}, in a unit that the file does not state"
+        allowed = f"{METRES_UNDER:g} to {NEITHER_ABOVE:g} mm from the camera"
+        raise InputError(path, "depth", found, allowed, "name the depth of one level in mm: --scale 0.001")
     with np.errstate(over="ignore"):
         depth = image.astype(np.float32) * np.float32(scale_mm)
     depth[missing] = np.nan

@@ -22,6 +22,13 @@ from mitsim.capture.recordings.recording_files import chosen_frame, frame_of
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.projector_images import counted
 
+#: what to do without a pose of the second camera
+_POSE = (
+    "name the values in a TOML beside the file: [calibration] with file, cameras, projector = false and "
+    "[calibration.keys.NAME], where rotation and translation take points of the first camera to the second (also both "
+    "the same 3 x 4 or 4 x 4 matrix); of rectified images R is the unit matrix and T = [-baseline, 0, 0]"
+)
+
 
 def read_stereo_pair(
     folder: str | Path,
@@ -59,9 +66,12 @@ def read_stereo_pair(
     pair_files : the images of one camera
     """
     folder = Path(folder)
-    names = list(read_calibration(calibration, size_of_images(folder)).rig.cameras)[:2]
-    if len(names) < 2:
-        raise InputError(calibration, "cameras", ", ".join(names), "two cameras: a stereo pair")
+    known = read_calibration(calibration, size_of_images(folder))
+    names = list(known.rig.cameras)[:2]
+    if len(names) < 2 or known.unrelated:
+        stated = f"{', '.join(names)}{', without the pose of the second' if known.unrelated else ''}"
+        hint = "; ".join([*known.notes, _POSE])
+        raise InputError(calibration, "cameras", stated, "two cameras with R and T: a stereo pair", hint)
     files = {name: pair_files(folder, name, (images or {}).get(name)) for name in names}
     counts = [len(found) for found in files.values()]
     if counts[0] != counts[1] or counts[0] == 0:
@@ -69,8 +79,8 @@ def read_stereo_pair(
         hint = f"or name them: --images {names[0]}='cam0_*.png' --images {names[1]}='cam1_*.png'"
         allowed = "as many of each, named after the camera: left_0.png, right_0.png"
         raise InputError(folder, "images", found, allowed, hint)
-    known = [file.stem for file in files[names[0]]]
-    number = chosen_frame(frame_of(frame, folder, known), counts[0], folder, f"pairs, {known[0]} to {known[-1]}")
+    stems = [file.stem for file in files[names[0]]]
+    number = chosen_frame(frame_of(frame, folder, stems), counts[0], folder, f"pairs, {stems[0]} to {stems[-1]}")
     chosen = {name: each[number] for name, each in files.items()}
     levels = {name: read_grey(file, channel=channel) for name, file in chosen.items()}
     first = levels[names[0]]

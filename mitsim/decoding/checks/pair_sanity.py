@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from mitsim.decoding.checks.rig_sanity import COARSE, half_stripe
-from mitsim.decoding.checks.row_texture import rectified, textured_row_error, uniform_light_mean
+from mitsim.decoding.checks.row_texture import LARGEST_SPREAD, rectified, textured_row_error, uniform_light_mean
 from mitsim.decoding.coded_images import CodedImages
 from mitsim.decoding.matching.stereo import StereoGeometry
 from mitsim.decoding.matching.texture_matches import LEAST_PAIRS, texture_matches
@@ -31,9 +31,8 @@ Floats = NDArray[np.float64]
 #: largest row error of a pair [px]; a stereo matcher begins to lose points at about this
 LARGEST_ROW_ERROR = 0.3
 
-#: least share of the first camera's decoded pixels that the second has in the same rows; allowed variation of the row
-#: error over the image [px]
-_LEAST_MATCHED, _LARGEST_SPREAD = 0.1, 0.5
+#: least share of the first camera's decoded pixels that the second has in the same rows
+_LEAST_MATCHED = 0.1
 
 #: row error [px] of a rig that has moved; beyond, the calibration is of another rig
 _MOVED = 6.0
@@ -113,7 +112,10 @@ def plain_pair_warning(images: tuple[Floats, Floats], rig: Rig, geometry: Stereo
         return ""
     if other_order and geometry.raw_size[0] == geometry.raw_size[1]:
         return f"the images of {names} fit the calibration if they are exchanged: check whether they are"
-    return f"{contradiction}: check that the calibration belongs to these images, and that R and T are not inverted"
+    doubt = (
+        "check that the calibration belongs to these images, that they are as the cameras gave them (not undistorted)"
+    )
+    return f"{contradiction}: {doubt}, and that R and T are not inverted"
 
 
 def _texture_contradiction(
@@ -144,7 +146,7 @@ class _RowErrors:
     def fits(self) -> bool:
         """Return whether the calibration, or that of a rig that has moved since, explains the matches."""
         varying = np.sqrt(max(self.spread**2 - self.median**2, 0.0))
-        return self.behind <= 0.5 and abs(self.median) <= _MOVED and varying <= _LARGEST_SPREAD + 0.5 * abs(self.median)
+        return self.behind <= 0.5 and abs(self.median) <= _MOVED and varying <= LARGEST_SPREAD + 0.5 * abs(self.median)
 
     def __str__(self) -> str:
         if self.behind > 0.5:
@@ -227,7 +229,7 @@ class _Matches:
     @property
     def doubtful(self) -> bool:
         """Return whether the matches contradict this calibration."""
-        return self.matched < _LEAST_MATCHED or self.behind > 0.5 or self.spread > _LARGEST_SPREAD + abs(self.row_error)
+        return self.matched < _LEAST_MATCHED or self.behind > 0.5 or self.spread > LARGEST_SPREAD + abs(self.row_error)
 
     def __str__(self) -> str:
         if self.behind > 0.5:

@@ -38,6 +38,9 @@ _MATCHED = 0.5
 #: least number of patches, and largest number for a decoded cloud
 _LEAST, _MOST = 8, 80
 
+#: allowed variation of the row error over the image [px]
+LARGEST_SPREAD = 0.5
+
 #: largest standard error of the median of patches [px], and the share of the median that is added to it: a rotated
 #: camera has an uneven row error
 _OF_ALL, _UNEVEN = 0.06, 0.05
@@ -69,7 +72,7 @@ def rectified(values: Floats, positions: NDArray[np.float32], seen: NDArray[np.b
 
 
 def measured_row_error(images: tuple[Levels, Levels], geometry: StereoGeometry, cloud: PointCloud) -> float:
-    """Return the median row error [px] of the right image of a decoded pair; NaN with too few patches.
+    """Return the median row error [px] of the right image of a decoded pair; NaN with too few patches, or uneven ones.
 
     ``images`` (H, W) raw left and right [DN], with texture; ``cloud`` on the rectified left grid.
     """
@@ -77,7 +80,7 @@ def measured_row_error(images: tuple[Levels, Levels], geometry: StereoGeometry, 
     disparity = np.where(cloud.valid, geometry.rectification.disparity(local[..., 2]), np.nan)
     left, right = (image.astype(float) for image in images)
     errors = _of_patches(left, right, geometry, disparity, MAXIMUM_ROWS)
-    return float(np.median(errors)) if len(errors) >= _LEAST else float("nan")
+    return float(np.median(errors)) if len(errors) >= _LEAST and _spread(errors) <= LARGEST_SPREAD else float("nan")
 
 
 def textured_row_error(
@@ -95,9 +98,13 @@ def textured_row_error(
     if len(errors) < _LEAST:
         return float("nan")
     middle = float(np.median(errors))
-    spread = 1.4826 * float(np.median(np.abs(errors - middle)))
-    agreed = 1.2533 * spread / np.sqrt(len(errors)) <= _OF_ALL + _UNEVEN * abs(middle)
+    agreed = 1.2533 * _spread(errors) / np.sqrt(len(errors)) <= _OF_ALL + _UNEVEN * abs(middle)
     return middle if agreed else float("nan")
+
+
+def _spread(errors: Floats) -> float:
+    """Return the standard deviation of errors (n,), from the median of their deviations."""
+    return 1.4826 * float(np.median(np.abs(errors - np.median(errors))))
 
 
 def _of_patches(left: Floats, right: Floats, geometry: StereoGeometry, disparity: Floats, reach: int) -> Floats:

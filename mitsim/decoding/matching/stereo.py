@@ -109,7 +109,7 @@ def stereo_geometry(rig: Rig) -> StereoGeometry:
             "cameras",
             f"the second camera at {np.round(to_right, 1).tolist()} mm from the first, rectified",
             "a second camera to the right (+x) of the first",
-            "name the left camera first",
+            "name the left camera first; or R and T are inverted: they take points of the first camera to the second",
         )
     map_left, seen_left = _rectifying_map(left, rectification.matrix_left, rectification.rotation_left, rectification)
     map_right, seen_right = _rectifying_map(

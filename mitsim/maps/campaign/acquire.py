@@ -31,7 +31,9 @@ from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decoding.cloud import Geometry, capture_cloud, capture_geometry, sensor_geometry
 from mitsim.decoding.depth_range import depths_of, range_warning
 from mitsim.maps.campaign.plan import Campaign, Shot, view_axes
+from mitsim.maps.campaign.pose_doubt import pose_doubt
 from mitsim.maps.campaign.store import Finished
+from mitsim.running.progress import say
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 
@@ -133,7 +135,10 @@ def measured(capture: Capture, shot: Shot, geometry: Geometry, sensor: Sensor, k
     coupon = shot.series.sample.at(coupon_place(capture, shot))
     if own_sensor(capture, sensor) is not sensor:
         geometry = capture_geometry(capture, sensor.settings)
-    patches = measure_patches(coupon_cloud(capture, coupon, geometry, sensor), coupon)
+    cloud = coupon_cloud(capture, coupon, geometry, sensor)
+    if capture.source != "simulated" and (doubt := pose_doubt(cloud, coupon)):
+        say(f"warning: {shot.series.name}, {shot.name}: {doubt}")
+    patches = measure_patches(cloud, coupon)
     if not keep_images:
         return Finished(patches, capture.source)
     shown = {
@@ -213,13 +218,20 @@ def found_shots(folder: str | Path, campaign: Campaign) -> dict[Path, Shot]:
     Raises
     ------
     InputError
-        If there is no capture, or one whose sample or distance is not in the campaign.
+        If there is no capture, one whose sample or distance is not in the campaign, or two of one pose.
     """
     folder = Path(folder)
     places = sorted(path.parent for path in folder.rglob("capture.json"))
     if not places:
         raise InputError(folder, "", "no captures", "a folder with captures of coupons")
-    return {place: _found_shot(place, campaign) for place in places}
+    found: dict[tuple[str, str], Path] = {}
+    shots = {place: _found_shot(place, campaign) for place in places}
+    for place, shot in shots.items():
+        other = found.setdefault((shot.series.name, shot.name), place)
+        if other != place:
+            hint = "the pose was not written anew, or keep one capture of each orientation"
+            raise InputError(place / "pose.json", "", f"the orientation of {other}", "another for each capture", hint)
+    return shots
 
 
 def out_of_range(campaign: Campaign, found: dict[Path, Shot] | None = None) -> list[str]:

@@ -101,9 +101,14 @@ class Verification:
         if self.usable:
             return "Use it: all errors are within the 95 % limits of the stated calibration."
         words = {"lengths": "the error of lengths", "rows": "the difference of rows"}
+        spacing = (
+            f" First check the spacing of the points: it measures {1 + self.length_error:.4f} times the one given."
+            if "lengths" in self.too_large
+            else ""
+        )
         return (
             f"Calibrate again: {' and '.join(words[one] for one in self.too_large)} exceeds the 95 % limits of the "
-            "stated calibration."
+            f"stated calibration.{spacing}"
         )
 
     def rows(self) -> list[str]:

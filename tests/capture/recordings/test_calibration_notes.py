@@ -45,6 +45,21 @@ def test_an_unread_distortion_is_told(tmp_path, name):
     assert "bent_glass" in read_capture(tmp_path / "out").settings["warnings"][0]
 
 
+@pytest.mark.parametrize(
+    "pose", [{}, {"baseline": 60.0}, {"right_to_left": {"R": np.eye(3).tolist(), "T": [60, 0, 0]}}]
+)
+def test_a_pair_without_the_pose_of_its_second_camera_is_refused(tmp_path, pose):
+    """Both cameras stood in the same place, without a word; mitsim decode then ended with a traceback."""
+    recordings(tmp_path)
+    camera = {"K": [[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]], "D": [0.0] * 5}
+    (tmp_path / "calib.json").write_text(json.dumps({"left": camera, "right": camera | {"D": [0.1] * 5}} | pose))
+    arguments = ["import", tmp_path / "pair", "--calibration", tmp_path / "calib.json", "-o", tmp_path / "out"]
+    done = CliRunner().invoke(app, [str(each) for each in arguments])
+    assert isinstance(done.exception, InputError), done.output
+    assert "found left, right, without the pose of the second" in str(done.exception)
+    assert not (tmp_path / "out").exists()
+
+
 def _camera_of_cloud():
     from mitsim.capture.recordings.pinhole_fit import fit_pinhole
 

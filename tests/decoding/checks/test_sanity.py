@@ -8,6 +8,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from pydantic import TypeAdapter
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
@@ -43,6 +44,12 @@ def camera(x=0.0, turn=(0.0, 0.0, 0.0), y=0.0):
     K = np.array([[260.0, 0, 110.3], [0, 260, 84.6], [0, 0, 1]])
     place = Transform.from_degrees(turn, (x, y, 0.0))
     return Camera(K, np.array([-0.1, 0.03, 0.0, 0.0, 0.0]), 220, 170, place)
+
+
+def larger(eye):
+    """Return a camera with three times as many pixels, and a lens that distorts more."""
+    matrix, bent = np.diag([3.0, 3.0, 1.0]) @ eye.matrix, np.array([-0.3, 0.1, 0.0, 0.0, 0.0])
+    return replace(eye, matrix=matrix, width=3 * eye.width, height=3 * eye.height, distortion=bent)
 
 
 def projector(position=(100.0, 3.0, 5.0), turn=(0.5, -11.0, 0.3)):
@@ -279,7 +286,7 @@ def test_cameras_exchanged(turn):
 def test_a_second_camera_to_the_left():
     capture = taken(BOTH, pair())
     cameras = dict(zip(("left", "right"), list(pair().values())[::-1], strict=True))
-    assert "name the left camera first" in said(with_rig(capture, cameras), PAIRED)
+    assert "name the left camera first; or R and T are inverted" in said(with_rig(capture, cameras), PAIRED)
 
 
 @pytest.mark.parametrize("off", [-1.2, -0.5, -0.15, 0.15, 0.5, 1.2])
@@ -398,6 +405,26 @@ def test_rows_of_two_cameras_by_the_texture(off):
     found = measured_row_error((look(cameras["left"]), look(turned)), geometry, cloud)
     assert abs(found - off) < 0.1
     assert bool(row_error_warnings(found)) == (abs(off) > 0.3)
+
+
+@pytest.mark.parametrize("bent", [True, False])
+def test_undistorted_images_of_a_pair_contradict_its_lenses(bent):
+    """The median row error is near 0, so that a plane at 600 mm was at 583 mm without a word."""
+    cameras = {"left": larger(camera()), "right": larger(camera(60.0))}
+    seen_by = cameras if bent else {name: replace(eye, distortion=np.zeros(5)) for name, eye in cameras.items()}
+    specks = gaussian_filter(np.random.default_rng(0).normal(size=(1024, 1024)), 2.0, mode="wrap")
+    images = {}
+    for name, eye in seen_by.items():
+        x, y, _ = np.moveaxis(surface_seen(eye, ball=False, tilt=0.0), -1, 0)
+        printed = map_coordinates(specks / specks.std(), [y / 0.4 + 512, x / 0.4 + 512], order=1, mode="grid-wrap")
+        images[name] = np.rint(np.clip(120 + 40 * printed, 0, 254)).astype(np.uint8)[None]
+    settings = MatcherSettings(near_mm=400, far_mm=650)
+    capture = Capture(
+        "pair", "active_stereo", "device", Rig(cameras), images, decoding=Decoding(near_mm=400, far_mm=650)
+    )
+    found = checked_cloud(capture, settings, None).warnings
+    assert bool(found) != bent, found
+    assert bent or "not undistorted" in found[0]
 
 
 @pytest.mark.parametrize("paired", [False, True])

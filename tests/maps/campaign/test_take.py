@@ -13,12 +13,22 @@ from typer.testing import CliRunner
 from characterisation.files.errors import InputError
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.decoding.cloud import capture_geometry
 from mitsim.maps.campaign import store
-from mitsim.maps.campaign.acquire import NAMED, found_shots, found_source, in_turn, out_of_range, simulated_source
+from mitsim.maps.campaign.acquire import (
+    NAMED,
+    found_shots,
+    found_source,
+    in_turn,
+    measured,
+    out_of_range,
+    simulated_source,
+)
 from mitsim.maps.campaign.plan import covering
 from mitsim.maps.campaign.run import measure_captures, run_campaign
 from mitsim.maps.campaign.store import shot_folder
 from mitsim.sensor.preset import load_sensor, presets
+from mitsim.sensor.transforms import Transform
 from tests.smaller_sensors import coarse_sensor
 
 
@@ -197,3 +207,36 @@ def test_distances_that_nobody_named_cover_the_range(name):
     assert distances[0] == pytest.approx(near, rel=1e-3)
     assert distances[-1] == pytest.approx(far, rel=1e-3)
     assert (distances[1:] / distances[:-1]).max() <= 1.6 * 1.001
+
+
+def test_two_captures_of_one_pose_are_refused(tmp_path, kept):
+    """The last was measured twice, and the map counted it as two."""
+    plan, folder = kept
+    place = next(iter(found_shots(folder, plan)))
+    for name in ("0", "1"):
+        shutil.copytree(place, tmp_path / name)
+    with pytest.raises(InputError, match="found the orientation of"):
+        found_shots(tmp_path, plan)
+
+
+@pytest.mark.parametrize(
+    ("turn", "shift", "told"),
+    [
+        ((0, 0, 0), 0.0, False),
+        ((10, 0, 0), 0.0, True),
+        ((0, 9, 0), 0.0, True),
+        ((0, 0, 30), 0.0, False),
+        ((0, 0, 0), 20.0, True),
+        ((2, 0, 0), 1.0, False),
+    ],
+)
+def test_a_pose_that_contradicts_the_points_is_told(kept, capfd, turn, shift, told):
+    """With all poses turned by 10 deg the map was 10 deg wrong; with all 20 mm too near, F was 0. Both in silence."""
+    plan, folder = kept
+    shots = found_shots(folder, plan)
+    place, shot = min(shots.items(), key=lambda one: -one[1].normal[2])
+    capture = read_capture(place)
+    moved = Transform.from_degrees(turn, (0.0, 0.0, shift)) @ capture.world_from_sensor
+    capture = replace(capture, source="device", world_from_sensor=moved)
+    measured(capture, shot, capture_geometry(capture, plan.sensor.settings), plan.sensor, False)
+    assert ("from the coupon at its pose: check the pose" in capfd.readouterr().err) == told

@@ -114,6 +114,8 @@ def test_the_command_says_use_or_calibrate_again(good, turned, tmp_path):
     write_capture(turned, tmp_path / "bad")
     done = mitsim_here("calibrate", "verify", tmp_path / "bad", "--board", "9x6x18:glass", code=1)
     assert done.stdout.splitlines()[-1].startswith("Calibrate again")
+    done = mitsim_here("calibrate", "verify", tmp_path / "good", "--board", "9x6x15:glass", code=1)
+    assert "First check the spacing of the points: it measures 1.20" in done.stdout.splitlines()[-1]
     mitsim_here("calibrate", "verify", tmp_path / "bad", code=2)
 
 

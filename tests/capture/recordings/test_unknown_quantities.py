@@ -1,0 +1,69 @@
+"""Numbers that are no depths and no points, or have no known unit, are refused or left out: they were measured."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from characterisation.files.errors import InputError
+from mitsim.capture.recordings.array_file import map_in
+from mitsim.capture.recordings.cloud_text import points_of_text
+from mitsim.capture.recordings.depth_image import read_depth_image
+from tests.capture.recordings.cloud_files_of_others import pinhole_cloud
+
+CLOUD = pinhole_cloud()
+
+
+def pinhole(folder):
+    """Return a calibration of images of 64 x 48 px."""
+    path = folder / "camera.json"
+    path.write_text('{"fx": 60, "fy": 60, "cx": 31.5, "cy": 23.5, "width": 64, "height": 48}')
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "depth", "message"),
+    [
+        ("left_disp.tif", np.full((48, 64), 66.0, np.float32), "found disparities, by the name"),
+        ("inverse.tif", np.full((48, 64), 0.0017, np.float32), r"depth: found a median of 0\.0017, in a unit"),
+        ("um.tif", np.full((48, 64), 6e5, np.float32), r"depth: found a median of 6e\+05, in a unit"),
+        ("levels.png", np.full((48, 64), 30000, np.uint16), r"depth: found a median of 3e\+04, in a unit"),
+    ],
+)
+def test_depths_of_an_unknown_quantity_are_refused(tmp_path, name, depth, message):
+    """They were 66 mm, 1.7 mm, 600 m and 30 m."""
+    cv2.imwrite(str(tmp_path / name), depth)
+    with pytest.raises(InputError, match=message):
+        read_depth_image(tmp_path / name, pinhole(tmp_path))
+    if "unit" in message:
+        capture = read_depth_image(tmp_path / name, pinhole(tmp_path), scale_mm=0.01)
+        assert capture.derived["depth"].max() == pytest.approx(depth[0, 0] / 100)
+
+
+def test_disparities_beside_depths_are_left_out(tmp_path):
+    np.savez(tmp_path / "a.npz", disparity=np.full((48, 64), 66.0))
+    with pytest.raises(InputError, match="found disparities, by the name"):
+        read_depth_image(tmp_path / "a.npz", pinhole(tmp_path))
+    np.savez(tmp_path / "a.npz", disparity=np.full((48, 64), 66.0), z=np.full((48, 64), 700.0))
+    assert read_depth_image(tmp_path / "a.npz", pinhole(tmp_path)).derived["depth"].max() == 700
+
+
+@pytest.mark.parametrize("other", ["rgb", "normals", "image"])
+def test_colours_and_normals_of_an_archive_are_no_points(tmp_path, other):
+    """The largest array was measured, or the first: colours put a plane at 500 mm at 212 mm."""
+    values = np.random.default_rng(0).uniform(0, 255, (*CLOUD.shape[:2], 3))
+    np.savez(tmp_path / "a.npz", **{other: np.concatenate([values, values]), "p3d": CLOUD})
+    assert np.array_equal(map_in((tmp_path / "a.npz").read_bytes(), tmp_path / "a.npz"), CLOUD, equal_nan=True)
+
+
+def test_colours_before_the_points_of_a_text_are_refused():
+    rows = [(200, 10 + i % 7, i % 256, 0.37 * i - 3.2, 0.11 * i, 500.25 + 0.3 * i) for i in range(50)]
+    text = "\n".join(" ".join(map(str, row)) for row in rows).encode()
+    with pytest.raises(InputError, match="the first three seem to be colours"):
+        points_of_text(text, Path("a.xyz"))
+    whole = [(i % 9, i // 9, 200 - i, 0.6, 0.0, -0.8) for i in range(50)]
+    text = "\n".join(" ".join(map(str, row)) for row in whole).encode()
+    assert points_of_text(text, Path("a.xyz"))[0][-1].tolist() == [4, 5, 151]
