@@ -13,7 +13,7 @@ from characterisation.plots.statements import GROUPS
 from characterisation.statements.losses import Loss, lost_features
 from characterisation.statements.statement import AT_THE_LIMIT, FAR_FROM_NOMINAL
 from mitsim.report.unknowns_words import unknowns_in_words
-from mitsim.running.numbers import NONE, SPACE, listed, percent, quantity, rounded
+from mitsim.running.numbers import NONE, SPACE, interval_text, listed, percent, quantity
 from mitsim.study.dependence_words import dependences_in_words, remedies_in_words
 from mitsim.study.statement_file import BudgetEntry, ExposureEntry, StatedMeasurement, StatementDocument
 
@@ -134,9 +134,6 @@ def _share_interval(line: BudgetEntry) -> str:
 
 
 def interval_words(ends: tuple[float | None, float | None], unit: str) -> str:
-    """Write both ends of an interval with as many decimal places as two digits of the larger need."""
+    """Write both ends of an interval with their unit; a dash without one."""
     low, high = ends
-    if low is None or high is None:
-        return NONE
-    digits = max(0, 1 - math.floor(math.log10(max(abs(low), abs(high), 1e-12))))
-    return f"{rounded(low, digits)} to {rounded(high, digits)}{'°' if unit == 'deg' else ' mm'}"
+    return NONE if low is None or high is None else f"{interval_text(low, high)}{'°' if unit == 'deg' else ' mm'}"

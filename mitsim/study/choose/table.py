@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from characterisation.files.atomic_io import json_values
-from characterisation.statements.decision import WORDS, Verdict, decide, mostly_lost, needed, tolerance_of
+from characterisation.statements.decision import Verdict, decide, mostly_lost, needed, tolerance_of
 from characterisation.statements.statement import Statement
 from characterisation.statements.verdict_words import result_in_words
 from mitsim.running.text_table import aligned
@@ -65,7 +65,7 @@ def document(
             tolerance=one.tolerance,
             features=list(one.features),
             kind=one.kind,
-            rule="" if one.tolerance is None else WORDS[task.decision_of(name).rule],
+            rule="" if one.tolerance is None else task.decision_of(name).in_words,
         )
         for name, one in task.measurements.items()
     }
