@@ -24,7 +24,7 @@ from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.decision import tolerance_of
 from characterisation.statements.losses import losses
 from characterisation.statements.statement import Statement, statement
-from mitsim.running.numbers import beside
+from mitsim.running.numbers import beside, two_digits
 from mitsim.running.progress import say, track
 from mitsim.running.text_table import aligned
 from mitsim.study import SetTable
@@ -135,7 +135,8 @@ def _missed(tried: TriedSet, limits: dict[str, float]) -> str:
     """Return text such as ``radius missed, 1.3 times its limit``."""
     stated = {one.measurement: one for one in tried.stated}
     ratios = {name: _excess(one, limits[name]) for name, one in stated.items() if name in limits}
-    words = [f"{name} missed, {ratio:.2g} times its limit" for name, ratio in ratios.items() if 1 < ratio < math.inf]
+    missed = {name: two_digits(ratio) for name, ratio in ratios.items() if 1 < ratio < math.inf}
+    words = [f"{name} missed, {ratio} times its limit" for name, ratio in missed.items()]
     return "; ".join(words + [f"{name} without a value" for name, ratio in ratios.items() if ratio == math.inf])
 
 
