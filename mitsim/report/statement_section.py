@@ -12,6 +12,7 @@ from typing import Any
 from characterisation.plots.statements import GROUPS
 from characterisation.statements.losses import Loss, lost_features
 from characterisation.statements.statement import AT_THE_LIMIT, FAR_FROM_NOMINAL
+from mitsim.report.first_rows import bias_words
 from mitsim.report.unknowns_words import unknowns_in_words
 from mitsim.running.numbers import NONE, SPACE, interval_text, listed, percent, quantity
 from mitsim.study.dependence_words import dependences_in_words, remedies_in_words
@@ -81,7 +82,7 @@ def _row(name: str, one: StatedMeasurement) -> dict[str, str]:
     known = one.bias is not None and one.standard_uncertainty is not None
     return {
         "name": name,
-        "bias": quantity(one.bias, one.unit),
+        "bias": bias_words(one.bias, one.bias_uncertainty, one.unit),
         "bias_uncertainty": quantity(one.bias_uncertainty, one.unit),
         "uncertainty": quantity(one.standard_uncertainty, one.unit),
         "uncorrected": quantity(math.hypot(one.bias or 0, one.standard_uncertainty or 0) if known else None, one.unit),

@@ -24,7 +24,7 @@ from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.decision import tolerance_of
 from characterisation.statements.losses import losses
 from characterisation.statements.statement import Statement, statement
-from mitsim.running.numbers import beside, two_digits
+from mitsim.running.numbers import beside, percent, two_digits
 from mitsim.running.progress import say, track
 from mitsim.running.text_table import aligned
 from mitsim.study import SetTable
@@ -244,6 +244,6 @@ def set_table(table: SetTable, tried: TriedSet) -> str:
         kept = "-" if limit is None else "yes" if one.root_mean_square <= limit else "no"
         wanted = ("-", "-") if limit is None else (f"{limit:g}", digits(expected[one.measurement]))
         u = one.standard_uncertainty
-        numbers = plain(beside(one.bias, u)), digits(u), f"{100 * one.without_value:.0f} %"
+        numbers = plain(beside(one.bias, u)), digits(u), plain(percent(one.without_value))
         rows.append((one.measurement, one.unit, *wanted, *numbers, kept))
     return "\n".join(aligned(rows))

@@ -22,7 +22,7 @@ from characterisation.statements.size_dependence import DrawnNumber, size_depend
 from characterisation.statements.statement import Statement, statement
 from characterisation.statements.verdict_words import Judged
 from characterisation.tasks.decision_table import BIAS_SUBTRACTED
-from mitsim.running.numbers import MINUS, NONE, accepted_text, beside, interval_text, two_digits
+from mitsim.running.numbers import MINUS, NONE, SPACE, accepted_text, beside, interval_text, percent, two_digits
 from mitsim.running.text_table import aligned
 from mitsim.running.time_limit import TimeLimit
 from mitsim.sensor.exposure import PlannedExposure
@@ -245,7 +245,7 @@ def statement_table(stated: Sequence[Statement]) -> str:
                 digits(one.standard_uncertainty),
                 _interval(one.interval),
                 _interval(one.interval_corrected),
-                f"{100 * one.without_value:.0f} %",
+                plain(percent(one.without_value)),
                 _largest(one),
                 _accepted(one),
                 one.verdict,
@@ -291,8 +291,8 @@ def _largest(one: Statement) -> str:
 
 
 def plain(text: str) -> str:
-    """Return a number in words of a page for a terminal: with hyphens for a minus and for no number."""
-    return text.replace(MINUS, "-").replace(NONE, "-")
+    """Return a number of a page for a terminal: with hyphens for a minus and for no number, and plain spaces."""
+    return text.replace(MINUS, "-").replace(NONE, "-").replace(SPACE, " ")
 
 
 def digits(value: float) -> str:

@@ -24,6 +24,11 @@ def test_large_numbers_have_no_exponents():
     assert row(134.0 + 120 * NORMAL, 600.0).startswith("m mm 134 120 -106 to 374 -240 to 240")
 
 
+def test_a_few_lost_values_are_not_none_and_many_are_not_all():
+    assert " 0.5 % " in row(np.append(NORMAL[:199], np.nan), 5.0)
+    assert " > 99 % " in row(np.append(np.full(997, np.nan), NORMAL[:3]), 5.0)
+
+
 def test_readings_that_are_accepted_after_a_correction_say_so():
     assert "69.821 to 70.179, bias subtracted" in row(5 + 0.09 * NORMAL, 0.36, subtract_bias=True)
     assert "bias subtracted" not in row(0.09 * NORMAL, 0.36)
