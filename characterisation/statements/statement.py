@@ -323,13 +323,15 @@ def _within(errors: Floats, day: NDArray[np.int64]) -> float:
 def _error_of_mean(errors: Floats, related: NDArray[np.int64]) -> float:
     """Return the standard error of the mean of errors (n,), of which those with the same number are not independent.
 
-    It follows from the sums of related errors (Liang and Zeger 1986), which need no model of their dependence.
+    It follows from the sums of related errors (Liang and Zeger 1986), which need no model of their dependence, and is
+    at least that of independent errors: the sums of two groups cancel, and tell little.
     """
+    least = float(errors.std(ddof=1)) / math.sqrt(len(errors))
     sums = np.bincount(np.unique(related, return_inverse=True)[1], errors - errors.mean())
     clusters = len(sums)
     if clusters < 2:
-        return float(errors.std(ddof=1)) / math.sqrt(len(errors))
-    return math.sqrt(clusters / (clusters - 1) * float(sums @ sums)) / len(errors)
+        return least
+    return max(least, math.sqrt(clusters / (clusters - 1) * float(sums @ sums)) / len(errors))
 
 
 def numerical_tolerance(uncertainty: float) -> float:

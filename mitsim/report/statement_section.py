@@ -12,7 +12,7 @@ from typing import Any
 from characterisation.plots.statements import GROUPS
 from characterisation.statements.losses import Loss, lost_features
 from characterisation.statements.statement import AT_THE_LIMIT, FAR_FROM_NOMINAL
-from mitsim.report.first_rows import bias_words
+from mitsim.report.first_rows import bias_words, exact
 from mitsim.report.unknowns_words import unknowns_in_words
 from mitsim.running.numbers import NONE, SPACE, interval_text, listed, percent, quantity
 from mitsim.study.dependence_words import dependences_in_words, remedies_in_words
@@ -90,7 +90,7 @@ def _row(name: str, one: StatedMeasurement) -> dict[str, str]:
         "corrected": interval_words(one.interval_corrected, one.unit),
         "without": percent(one.without_value),
         "share": percent(one.share_of_tolerance),
-        "tolerance": quantity(one.tolerance, one.unit),
+        "tolerance": NONE if one.tolerance is None else exact(one.tolerance, one.unit),
         "verdict": one.verdict,
         "repeatability": quantity(one.repeatability, one.unit),
         "after_four": quantity(one.after_repeats.get("4"), one.unit),

@@ -142,6 +142,13 @@ def test_the_uncertainty_of_the_bias_knows_that_captures_of_a_day_are_alike():
         assert np.mean(stated) == pytest.approx(spread, rel=0.15)  # 0.13; as if independent it were 0.075
 
 
+def test_two_groups_of_alike_errors_do_not_make_the_bias_certain():
+    """Their sums are as large and opposite: of five trials on three days, u of the bias was a hundredth of it."""
+    errors = [0.10, -0.08, 0.03, 0.04, 0.06]
+    stated = statement("m", "mm", errors, days=[0, 1, 2, 3, 0], related=[0, 0, 1, 1, 0])
+    assert stated.bias_uncertainty >= np.std(errors, ddof=1) / np.sqrt(5)
+
+
 def test_a_leader_is_as_often_the_best_as_is_said():
     # views of known risks, a map that is wrong by a factor, worlds in common, tails of different weight
     rng = np.random.default_rng(11)
