@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import beta, t
+from scipy.stats import beta, binom, t
 
 Floats = NDArray[np.float64]
 
@@ -62,6 +62,36 @@ def coverage_interval(errors: Floats, coverage: float = COVERAGE) -> tuple[float
         return float(errors.mean()) - half, float(errors.mean()) + half
     low, high = np.quantile(errors, [tail, 1 - tail], method="weibull")
     return float(low), float(high)
+
+
+def expanded_uncertainty(errors: Floats) -> float:
+    """Return the end of the 95 % coverage interval of the error that is larger in absolute value."""
+    low, high = coverage_interval(errors)
+    return max(abs(low), abs(high))
+
+
+def expanded_interval(errors: Floats, related: NDArray[np.int64] | None = None) -> tuple[float, float]:
+    """Return the 95 % interval of the expanded uncertainty of many trials, from the errors (n,) of few.
+
+    Both ends are order statistics, right for any distribution of independent errors. At most 5 % of many absolute
+    errors exceed their expanded uncertainty, and 2.5 % lie beyond the end of their interval that is larger. So the
+    number of n that do is at most, or is, binomial. For the high end this takes 146 trials, and repeated captures make
+    it too low. It is therefore at least the estimate times exp(t s), with s the relative standard error by
+    :func:`standard_errors`, and ``related`` as there. From fewer trials it is that alone, and too low if they lack the
+    rare large errors.
+    """
+    count, half, tail = len(errors), expanded_uncertainty(errors), (1 - COVERAGE) / 2
+    if not half > 0:
+        return 0.0, 0.0
+    exceeding = int(binom.isf(tail, count, 1 - COVERAGE)) + 1
+    low = float(np.sort(np.abs(errors))[-min(exceeding, count)])
+    moved = float(standard_errors(errors, lambda part: np.array([expanded_uncertainty(part)]), related)[0])
+    high = half * math.exp(min(float(t.ppf(0.975, BLOCKS - 1)) * moved / half, 700.0))
+    beyond = int(binom.ppf(tail, count, tail))  # so many or fewer: at least 2.5 %
+    if beyond > 0:
+        ordered = np.sort(errors)
+        high = max(high, abs(float(ordered[beyond - 1])), abs(float(ordered[-beyond])))
+    return min(low, half), high
 
 
 def standard_errors(

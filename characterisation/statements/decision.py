@@ -42,7 +42,15 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.stats import gamma, norm, t
 
-from characterisation.statements.coverage import BLOCKS, COVERAGE, coverage_interval, share, standard_errors
+from characterisation.statements.coverage import (
+    BLOCKS,
+    COVERAGE,
+    coverage_interval,
+    expanded_interval,
+    expanded_uncertainty,
+    share,
+    standard_errors,
+)
 from characterisation.statements.one_sided import OneSidedErrors, stated_errors, without_bias
 from characterisation.tasks.decision_table import Decision
 from characterisation.tasks.task_file import Task
@@ -51,13 +59,6 @@ Floats = NDArray[np.float64]
 
 #: errors (n,) of trials, or those of a value that folds
 Errors = Floats | OneSidedErrors
-
-#: description of each rule in a decision
-WORDS = {
-    "iso_14253_1": "ISO 14253-1, guard band of the expanded uncertainty (95 %)",
-    "jcgm_106": "JCGM 106, guard band for a stated consumer's risk",
-    "simple_acceptance": "simple acceptance, JCGM 106, 8.2",
-}
 
 #: default for the largest share of the tolerance for the guard band: the 4 : 1 of ANSI/NCSL Z540.3
 GUARD_SHARE = 0.25
@@ -183,24 +184,33 @@ def mostly_lost(trials: int) -> bool:
     return 0.5**trials <= 0.05
 
 
-def decide(errors: Errors, tolerance: Tolerance, lost: int | None = None) -> Decided:
-    """Decide from the errors (n,) of trials with a value whether a measurement fits its tolerance.
+def decide(
+    errors: Errors, tolerance: Tolerance, lost: int | None = None, related: NDArray[np.int64] | None = None
+) -> Decided:
+    """Decide from the errors of trials with a value whether a measurement fits its tolerance.
 
-    ``lost`` is the number of trials without a value; by default enough to call a measurement without any undecidable.
+    Parameters
+    ----------
+    errors
+        (n,) of trials with a value.
+    tolerance
+        Tolerance and rule.
+    lost
+        Number of trials without a value; by default enough to call a measurement without any undecidable.
+    related
+        (n,) whole numbers: trials with the same number have draws in common. By default all are independent.
     """
     rule = tolerance.rule
     if len(errors) < 2:
         nan = math.nan
         few = len(errors) > 0 or (lost is not None and not mostly_lost(lost))
         unsure: Verdict = "not decided" if few else "undecidable"
-        return Decided(
-            WORDS[rule.rule], None, nan, (nan, nan), unsure, False, nan, nan, (nan, nan), nan, nan, None, None
-        )
+        return Decided(rule.in_words, None, nan, (nan, nan), unsure, False, nan, nan, (nan, nan), nan, nan, None, None)
     bias = float(stated_errors(errors).mean())
     taken: Errors = without_bias(errors, bias) if rule.subtract_bias else errors
     limits = acceptance(taken, tolerance)
     asked = demand(taken, tolerance)
-    low, high = _demand_interval(taken, tolerance, asked)
+    low, high = _demand_interval(taken, tolerance, asked, related)
     corrected = demand(without_bias(errors, bias), tolerance) if not rule.subtract_bias else asked
     verdict: Verdict = "not decided"
     if high <= 1:
@@ -214,7 +224,7 @@ def decide(errors: Errors, tolerance: Tolerance, lost: int | None = None) -> Dec
     worst = max(through, key=lambda one: one.value)
     risks = None if rule.rule != "jcgm_106" else global_risks(taken, tolerance, limits)
     return Decided(
-        WORDS[rule.rule],
+        rule.in_words,
         limits,
         asked,
         (low, high),
@@ -243,7 +253,7 @@ def acceptance(errors: Errors, tolerance: Tolerance) -> tuple[float, float] | No
     """Return the readings, from and to, that the rule of the tolerance accepts; None if there are none."""
     lower, upper, rule = tolerance.lower, tolerance.upper, tolerance.rule
     if rule.rule == "simple_acceptance":
-        return (lower, upper) if expanded(errors) < tolerance.size else None
+        return (lower, upper) if expanded_uncertainty(stated_errors(errors)) < tolerance.size else None
     if rule.rule == "jcgm_106":
         guard = _least_guard(errors, tolerance)
         below = above = guard
@@ -251,28 +261,21 @@ def acceptance(errors: Errors, tolerance: Tolerance) -> tuple[float, float] | No
         low, high = coverage_interval(stated_errors(errors))
         below, above = max(high, 0.0), max(-low, 0.0)
     else:
-        below = above = expanded(errors)
+        below = above = expanded_uncertainty(stated_errors(errors))
     most = max(upper - above, 90.0) if _limited_below(errors, tolerance) else upper - above
     room = most - lower - below if math.isfinite(lower) else most
     return (lower + below, most) if room > 0 else None
-
-
-def expanded(errors: Errors) -> float:
-    """Return the expanded uncertainty.
-
-    It is the end of the 95 % coverage interval of the error that is larger in absolute value.
-    """
-    low, high = coverage_interval(stated_errors(errors))
-    return max(abs(low), abs(high))
 
 
 def demand(errors: Errors, tolerance: Tolerance) -> float:
     """Return the demand of the rule, at most 1 where the measurement fits; see :class:`Decided`."""
     rule = tolerance.rule
     if rule.rule == "iso_14253_1":
-        return expanded(errors) / tolerance.size / (rule.guard_share or GUARD_SHARE)
+        return expanded_uncertainty(stated_errors(errors)) / tolerance.size / (rule.guard_share or GUARD_SHARE)
     if rule.rule == "simple_acceptance":
-        return expanded(errors) / tolerance.size * (rule.uncertainty_ratio or UNCERTAINTY_RATIO)
+        return (
+            expanded_uncertainty(stated_errors(errors)) / tolerance.size * (rule.uncertainty_ratio or UNCERTAINTY_RATIO)
+        )
     assert rule.producer_risk is not None
     return global_risks(errors, tolerance, acceptance(errors, tolerance))[1] / rule.producer_risk
 
@@ -377,17 +380,22 @@ def _within(readings: Floats, limits: tuple[float, float] | None) -> Floats:
     return np.asarray((readings >= limits[0]) & (readings <= limits[1]), float)
 
 
-def _demand_interval(errors: Errors, tolerance: Tolerance, asked: float) -> tuple[float, float]:
-    """Return the 95 % interval of the demand, symmetric in its logarithm, as few trials give only its order."""
+def _demand_interval(
+    errors: Errors, tolerance: Tolerance, asked: float, related: NDArray[np.int64] | None
+) -> tuple[float, float]:
+    """Return the 95 % interval of the demand; that of a risk is symmetric in its logarithm."""
     if not asked > 0:
         return 0.0, 0.0
-    if isinstance(errors, OneSidedErrors):
+    stated = stated_errors(errors)
+    if tolerance.rule.rule != "jcgm_106":  # the demand is proportional to the expanded uncertainty
+        ratio, (low, high) = asked / expanded_uncertainty(stated), expanded_interval(stated, related)
+        return ratio * low, ratio * high
 
-        def without_block(chosen: Floats) -> Floats:
-            return np.array([demand(errors.part(chosen.astype(int)), tolerance)])
+    def without_block(chosen: Floats) -> Floats:
+        kept = chosen.astype(int)
+        part = errors.part(kept) if isinstance(errors, OneSidedErrors) else errors[kept]
+        return np.array([demand(part, tolerance)])
 
-        moved = float(standard_errors(np.arange(len(errors), dtype=float), without_block)[0])
-    else:
-        moved = float(standard_errors(errors, lambda part: np.array([demand(part, tolerance)]))[0])
+    moved = float(standard_errors(np.arange(len(errors), dtype=float), without_block, related)[0])
     factor = math.exp(min(float(t.ppf(0.975, BLOCKS - 1)) * moved / asked, 700.0))
     return asked / factor, asked * factor

@@ -24,11 +24,15 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import t
 
 from characterisation.files.errors import InputError
 from characterisation.statements.budget import BudgetLine
-from characterisation.statements.coverage import BLOCKS, coverage_interval, standard_errors
+from characterisation.statements.coverage import (
+    coverage_interval,
+    expanded_interval,
+    expanded_uncertainty,
+    standard_errors,
+)
 from characterisation.statements.decision import Decided, Tolerance, Verdict, decide
 from characterisation.statements.losses import Loss
 from characterisation.statements.one_sided import OneSidedErrors
@@ -85,7 +89,8 @@ class Statement:
     tolerance
         Size of the tolerance; None without one.
     share_of_tolerance
-        End of the 95 % interval that is larger in absolute value, over the size of the tolerance.
+        End of the 95 % interval that is larger in absolute value, over the size of the tolerance; of the corrected
+        interval if the rule subtracts the bias.
     share_interval
         95 % interval of this share.
     decided
@@ -265,7 +270,7 @@ def statement(
     decided = None
     if tolerance is not None:
         used = errors.part(errors.known) if isinstance(errors, OneSidedErrors) else known
-        decided = decide(used, tolerance, len(every) - count)
+        decided = decide(used, tolerance, len(every) - count, common)
     nan = math.nan
     bias = spread = bias_uncertainty = delta = low = high = nan
     moved, share, shares = np.full(4, nan), None, None
@@ -277,11 +282,10 @@ def statement(
             known, lambda part: np.array([part.mean(), part.std(ddof=1), *coverage_interval(part)]), common
         )
         if tolerance is not None:
-            half = max(abs(low), abs(high))
-            share = half / tolerance.size
-            # few trials determine only the order of magnitude of a scale, so the interval is one of its logarithm
-            factor = math.exp(float(t.ppf(0.975, BLOCKS - 1)) * max(moved[2:]) / half) if half > 0 else 1.0
-            shares = (share / factor, share * factor)
+            taken = known - bias if tolerance.rule.subtract_bias else known
+            share = expanded_uncertainty(taken) / tolerance.size
+            least, most = expanded_interval(taken, common)
+            shares = (least / tolerance.size, most / tolerance.size)
     return Statement(
         measurement=measurement,
         unit=unit,
@@ -319,13 +323,15 @@ def _within(errors: Floats, day: NDArray[np.int64]) -> float:
 def _error_of_mean(errors: Floats, related: NDArray[np.int64]) -> float:
     """Return the standard error of the mean of errors (n,), of which those with the same number are not independent.
 
-    It follows from the sums of related errors (Liang and Zeger 1986), which need no model of their dependence.
+    It follows from the sums of related errors (Liang and Zeger 1986), which need no model of their dependence, and is
+    at least that of independent errors: the sums of two groups cancel, and tell little.
     """
+    least = float(errors.std(ddof=1)) / math.sqrt(len(errors))
     sums = np.bincount(np.unique(related, return_inverse=True)[1], errors - errors.mean())
     clusters = len(sums)
     if clusters < 2:
-        return float(errors.std(ddof=1)) / math.sqrt(len(errors))
-    return math.sqrt(clusters / (clusters - 1) * float(sums @ sums)) / len(errors)
+        return least
+    return max(least, math.sqrt(clusters / (clusters - 1) * float(sums @ sums)) / len(errors))
 
 
 def numerical_tolerance(uncertainty: float) -> float:

@@ -96,6 +96,8 @@ def _why(one: Judged) -> str:
 
 
 def _percent(share: float) -> str:
+    if 0.995 < share < 1:
+        return "more than 99 %"
     return f"{100 * share:.0f} %" if share >= 0.005 else "less than 1 %"
 
 

@@ -30,6 +30,16 @@ _OWN = {
 Risk = Annotated[float, Field(gt=0, lt=0.5)]
 Positive = Annotated[float, Field(gt=0)]
 
+#: description of each rule in a decision
+WORDS = {
+    "iso_14253_1": "ISO 14253-1, guard band of the expanded uncertainty (95 %)",
+    "jcgm_106": "JCGM 106, guard band for a stated consumer's risk",
+    "simple_acceptance": "simple acceptance, JCGM 106, 8.2",
+}
+
+#: end of the description of a rule for readings from which the bias is subtracted
+BIAS_SUBTRACTED = ", readings minus the bias"
+
 
 class Decision(Document):
     """How a measurement is compared with its tolerance.
@@ -74,3 +84,8 @@ class Decision(Document):
             if self.process_std is not None and self.process_capability is not None:
                 raise ValueError("give either process_std or process_capability, not both")
         return self
+
+    @property
+    def in_words(self) -> str:
+        """Return a description of the rule, which says at its end if the bias is subtracted from the readings."""
+        return WORDS[self.rule] + (BIAS_SUBTRACTED if self.subtract_bias else "")

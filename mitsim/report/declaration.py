@@ -151,10 +151,10 @@ def _notes(document: StatementDocument | None) -> list[str]:
     if document is None:
         return []
     notes = [
-        "Error = measured − true; bias = mean error over the virtual measurements, not subtracted; u = standard "
-        "uncertainty, standard deviation about the bias; U = half the 95 % interval of the error; k = U / u; N = "
-        "number of virtual measurements. The interval leaves 2.5 % on either side. If y is read, the true value lies "
-        "between y − (upper end) and y − (lower end)."
+        "Error = measured − true; bias = mean error over the virtual measurements, part of the error; u = standard "
+        "uncertainty, standard deviation about the bias; U = larger end of the 95 % interval, from the bias; "
+        "k = U / u; N = number of virtual measurements. The interval leaves 2.5 % on either side. If y is read, the "
+        "true value lies between y − (upper end) and y − (lower end)."
     ]
     by_part = {
         AT_THE_LIMIT: "for a part at the limit of its tolerance",

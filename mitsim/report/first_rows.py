@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 from markupsafe import Markup, escape
 
+from characterisation.tasks.decision_table import BIAS_SUBTRACTED
 from mitsim.report.placement_figure import VERDICTS
-from mitsim.running.numbers import MINUS, NONE, count, listed, percent, quantity, rounded, two_digits, unit_symbol
+from mitsim.running.numbers import MINUS, NONE, accepted_text, beside, count, listed, percent, quantity, unit_symbol
 
 #: beginning of the names of rules whose demand is the share of the tolerance over the largest share that fits
 _BY_SHARE = ("ISO 14253-1", "simple acceptance")
@@ -106,7 +107,10 @@ class RowValues:
     def texts(self) -> ResultRow:
         """Return the row of the table, as texts."""
         limit = self.share_limit
-        size = _size(self.tolerance)
+        accepted = NONE
+        if self.rule and self.stated:
+            accepted = accepted_words(self.accepted, self.unit, _size(self.tolerance))
+            accepted += ", bias subtracted" * (self.accepted is not None and self.rule.endswith(BIAS_SUBTRACTED))
         return ResultRow(
             name=self.name,
             about=self.about,
@@ -118,7 +122,7 @@ class RowValues:
             share=NONE if self.share is None else _share(self.share),
             share_interval="" if limit is None else _interval(self.demand_interval, limit),
             share_limit="" if limit is None else percent(limit),
-            accepted=accepted_words(self.accepted, self.unit, size) if self.rule and self.stated else NONE,
+            accepted=accepted,
             false_accept=percent(self.false_accept),
             without_value=percent(self.without_value),
             limited=self.limited,
@@ -159,22 +163,20 @@ def tolerance_words(tolerance: float | tuple[float, float] | None, nominal: floa
     if isinstance(tolerance, tuple):
         lower, upper = tolerance
         return f"{upper:+g} {lower:+g}".replace("-", MINUS) + _suffix(unit)
-    sign = "up to " if nominal - tolerance <= 0 else "±"
-    return f"{sign}{tolerance:g}{_suffix(unit)}"
+    text = f"up to {nominal + tolerance:g}" if nominal - tolerance <= 0 else f"±{tolerance:g}"
+    return text + _suffix(unit)
 
 
-def accepted_words(accepted: tuple[float | None, float] | None, unit: str, tolerance: float | None) -> str:
+def accepted_words(readings: tuple[float | None, float] | None, unit: str, tolerance: float | None) -> str:
     """Format the readings that are accepted: ``19.82 to 20.18 mm``, ``up to 0.13 mm``, ``none``; a dash without
     tolerance.
     """
     if tolerance is None:
         return NONE
-    if accepted is None:
+    if readings is None:
         return "none"
-    digits = max(0, 2 - math.floor(math.log10(tolerance)))
-    low, high = accepted
-    text = f"up to {high:.{digits}f}" if low is None else f"{low:.{digits}f} to {high:.{digits}f}"
-    return text.replace("-", MINUS) + _suffix(unit)
+    low, high = readings
+    return accepted_text(-math.inf if low is None else low, high, tolerance) + _suffix(unit)
 
 
 def _size(tolerance: float | tuple[float, float] | None) -> float | None:
@@ -204,8 +206,5 @@ def bias_words(bias: float | None, uncertainty: float | None, unit: str) -> str:
     """
     if bias is None:
         return NONE
-    if not uncertainty or not math.isfinite(uncertainty):
-        return ("+" if bias > 0 else MINUS if bias < 0 else "") + quantity(abs(bias), unit)
-    places = len(two_digits(uncertainty).partition(".")[2])
-    sign = "+" if round(bias, places) > 0 else ""
-    return f"{sign}{rounded(bias, places)}{_suffix(unit)}"
+    text = beside(bias, uncertainty)
+    return ("+" if bias > 0 and text.strip("0.") else "") + text + _suffix(unit)

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from characterisation.statements.verdict_words import OFTEN
+from mitsim.running.numbers import two_digits
 from mitsim.study.run_folder import ConfirmedEntry, ViewSetEntry
 
 
@@ -68,4 +69,4 @@ def _missed(name: str, one: ConfirmedEntry | None, error: float, limit: float, r
         return f"{name} is out of reach"
     if one is None or not math.isfinite(error):
         return f"{name} has no value"
-    return f"{name} exceeds its limit: error {error:.2g} {one.unit}, {limit:.2g} {one.unit} allowed"
+    return f"{name} exceeds its limit: error {two_digits(error)} {one.unit}, {limit:g} {one.unit} allowed"

@@ -12,8 +12,9 @@ from typing import Any
 from characterisation.plots.statements import GROUPS
 from characterisation.statements.losses import Loss, lost_features
 from characterisation.statements.statement import AT_THE_LIMIT, FAR_FROM_NOMINAL
+from mitsim.report.first_rows import bias_words, exact
 from mitsim.report.unknowns_words import unknowns_in_words
-from mitsim.running.numbers import NONE, SPACE, listed, percent, quantity, rounded
+from mitsim.running.numbers import NONE, SPACE, interval_text, listed, percent, quantity
 from mitsim.study.dependence_words import dependences_in_words, remedies_in_words
 from mitsim.study.statement_file import BudgetEntry, ExposureEntry, StatedMeasurement, StatementDocument
 
@@ -82,7 +83,7 @@ def _row(name: str, one: StatedMeasurement) -> dict[str, str]:
     known = one.bias is not None and one.standard_uncertainty is not None
     return {
         "name": name,
-        "bias": quantity(one.bias, one.unit),
+        "bias": bias_words(one.bias, one.bias_uncertainty, one.unit),
         "bias_uncertainty": quantity(one.bias_uncertainty, one.unit),
         "uncertainty": quantity(one.standard_uncertainty, one.unit),
         "uncorrected": quantity(math.hypot(one.bias or 0, one.standard_uncertainty or 0) if known else None, one.unit),
@@ -90,7 +91,7 @@ def _row(name: str, one: StatedMeasurement) -> dict[str, str]:
         "corrected": interval_words(one.interval_corrected, one.unit),
         "without": percent(one.without_value),
         "share": percent(one.share_of_tolerance),
-        "tolerance": quantity(one.tolerance, one.unit),
+        "tolerance": NONE if one.tolerance is None else exact(one.tolerance, one.unit),
         "verdict": one.verdict,
         "repeatability": quantity(one.repeatability, one.unit),
         "after_four": quantity(one.after_repeats.get("4"), one.unit),
@@ -135,9 +136,6 @@ def _share_interval(line: BudgetEntry) -> str:
 
 
 def interval_words(ends: tuple[float | None, float | None], unit: str) -> str:
-    """Write both ends of an interval with as many decimal places as two digits of the larger need."""
+    """Write both ends of an interval with their unit; a dash without one."""
     low, high = ends
-    if low is None or high is None:
-        return NONE
-    digits = max(0, 1 - math.floor(math.log10(max(abs(low), abs(high), 1e-12))))
-    return f"{rounded(low, digits)} to {rounded(high, digits)}{'°' if unit == 'deg' else ' mm'}"
+    return NONE if low is None or high is None else f"{interval_text(low, high)}{'°' if unit == 'deg' else ' mm'}"

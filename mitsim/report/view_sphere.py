@@ -20,6 +20,7 @@ from typing import Any
 
 from characterisation.tasks.covariance import LEAST_CHANCE
 from mitsim.report import findings
+from mitsim.report.first_rows import bias_words
 from mitsim.report.pose_texts import expected_texts, pose_of_view, pose_texts
 from mitsim.report.templates import joined_script, script_content
 from mitsim.report.view_data import as_json, solids, view_data
@@ -105,5 +106,6 @@ def _confirmed_words(entry: ViewSetEntry, name: str) -> str:
     if one.bias is None or one.standard_uncertainty is None:
         return "; measured together it has no value"
     found = quantity(one.standard_uncertainty, one.unit)
-    lost = f", no value in {100 * one.without_value:.0f} %" if one.without_value > 0 else ""
-    return f"; measured together {one.trials} times: {found}, bias {quantity(one.bias, one.unit)}{lost}"
+    lost = f", no value in {percent(one.without_value)}" if one.without_value > 0 else ""
+    bias = bias_words(one.bias, one.standard_uncertainty, one.unit)
+    return f"; measured together {one.trials} times: {found}, bias {bias}{lost}"

@@ -26,6 +26,31 @@ def rounded(value: float, places: int = 0) -> str:
     return signed(f"{round(value, places) + 0.0:.{places}f}") if math.isfinite(value) else NONE
 
 
+def beside(value: float, uncertainty: float | None) -> str:
+    """Round an estimate to the decimal places of its standard uncertainty (GUM 7.2.6), or to two digits without one."""
+    if not uncertainty or not math.isfinite(uncertainty):
+        return two_digits(value)
+    return rounded(value, len(two_digits(uncertainty).partition(".")[2]))
+
+
+def interval_text(low: float, high: float) -> str:
+    """Write the ends of an interval with the decimal places that two digits of half its width need."""
+    half = (high - low) / 2 or max(abs(low), abs(high), 1e-12)
+    places = max(0, 1 - math.floor(math.log10(half)))
+    return f"{rounded(low, places)} to {rounded(high, places)}"
+
+
+def accepted_text(low: float, high: float, tolerance: float) -> str:
+    """Write accepted readings to a hundredth of the tolerance or finer, and none beyond: ``19.82 to 20.18``.
+
+    ``low`` is -inf for ``up to 0.13``.
+    """
+    places = max(0, 2 - math.floor(math.log10(tolerance)), 1 - math.floor(math.log10(min(tolerance, high - low))))
+    unit, near = 10.0**places, 1e-6  # a number that is written with these places stays
+    most = rounded(math.floor(high * unit + near) / unit, places)
+    return f"up to {most}" if math.isinf(low) else f"{rounded(math.ceil(low * unit - near) / unit, places)} to {most}"
+
+
 def signed(text: str) -> str:
     """Replace hyphens by minus signs."""
     return text.replace("-", MINUS)

@@ -15,7 +15,7 @@ from characterisation.files.checked_files import read_json_object
 from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
 from characterisation.statements.verdict_words import Judged
-from mitsim.running.numbers import or_nan
+from mitsim.running.numbers import or_nan, two_digits
 from mitsim.study.statement_file import PartialDocument, StatementDocument, read_statement
 
 #: name of the file in the folder
@@ -178,7 +178,8 @@ class ChoiceDocument(PartialDocument):
                 continue
             why = "it can make more measurements"
             if len(one.impossible) <= len(best.impossible):
-                ratios = f"{or_nan(best.ratio):.2g} times its limit, that of {one.name} at {or_nan(one.ratio):.2g}"
+                mine, other = (two_digits(or_nan(each.ratio)) for each in (best, one))
+                ratios = f"{mine} times its limit, that of {one.name} at {other}"
                 why = f"its worst measurement is at {ratios} times"
             fits = f"{one.name} fits {one.fits} of {self.toleranced} tolerances, {best.name} {best.fits}"
             out.append(f"{fits}. {best.name} leads, since {why}")

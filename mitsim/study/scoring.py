@@ -25,6 +25,7 @@ from characterisation.scores.view_score import write_scores
 from characterisation.scores.view_sets import ViewSet
 from characterisation.tasks.measurement_model import InputQuantity
 from mitsim.maps.campaign.run import write_netcdf
+from mitsim.running.numbers import two_digits
 from mitsim.running.progress import say
 from mitsim.running.time_limit import TimeLimit
 from mitsim.scene.ray_casting.triangles import triangles
@@ -131,7 +132,7 @@ def _expected(study: Study, limits: dict[str, float], chosen: ViewSet) -> str:
     """Like ``pillar1_radius u 0.36 of 0.5 mm``."""
     rows = zip(limits.items(), chosen.uncertainty.tolist(), chosen.feasible, strict=True)
     units = {name: study.task.measurements[name].unit for name in limits}
-    parts = [f"{name} u {u:.2g} of {limit:g} {units[name]}" for (name, limit), u, able in rows if able]
+    parts = [f"{name} u {two_digits(u)} of {limit:g} {units[name]}" for (name, limit), u, able in rows if able]
     return ", ".join(parts) or "nothing"
 
 

@@ -82,9 +82,9 @@ class StatedMeasurement(PartialDocument):
 
     @property
     def expanded_uncertainty(self) -> float | None:
-        """Return U, half the width of the 95 % interval of the error; None without one."""
-        low, high = self.interval
-        return None if low is None or high is None else (high - low) / 2
+        """Return U, the larger end of the 95 % interval after correction: bias - U to bias + U has 95 % or more."""
+        low, high = self.interval_corrected
+        return None if low is None or high is None else max(-low, high)
 
     @property
     def coverage_factor(self) -> float | None:

@@ -218,6 +218,8 @@ def _labelled(cloud: PointCloud, scene: Scene, world_from_sensor: Transform, mar
 def corrected(result: Result, statement: ViewStatement) -> Result:
     """Subtract the bias of a measurement; its uncertainty becomes that of the statement.
 
+    A value that folds stays at least 0: its bias is that of a part at the limit of the tolerance.
+
     Raises
     ------
     InputError
@@ -232,9 +234,10 @@ def corrected(result: Result, statement: ViewStatement) -> Result:
     if correction.unit != result.unit or correction.bias is None:
         found = "no bias" if correction.bias is None else f"bias {correction.bias:g} {correction.unit}"
         raise InputError(statement.path, f"measurements.{result.name}", found, f"a bias in {result.unit}")
+    value = result.value - correction.bias
     return replace(
         result,
-        value=result.value - correction.bias,
+        value=value if result.deviations is None else max(value, 0.0),
         bias=correction.bias,
         uncertainty=correction.uncertainty,
         origin="statement",

@@ -112,8 +112,8 @@ def test_a_sheet_has_what_iso_ts_15530_4_and_jcgm_101_ask_for(run_folder, tmp_pa
     assert "not by a metal part with calibrated values" in facts["Verified by"]
     assert "200 virtual measurements" in facts["Method"] and "seed 7" in facts["Made with"]
     row = declaration.rows[0]
-    # U = (0.47 + 0.52) / 2 and k = U / 0.25
-    assert row.expanded == "0.49\N{NO-BREAK SPACE}mm" and row.factor == "1.98" and row.trials == "200"
+    # U = 0.47 + 0.03 and k = U / 0.25
+    assert row.expanded == "0.50\N{NO-BREAK SPACE}mm" and row.factor == "2.00" and row.trials == "200"
     assert row.interval == "−0.52 to 0.47 mm" and row.bias == "−0.03\N{NO-BREAK SPACE}mm"
     assert re.fullmatch(r"\d{4}-\d\d-\d\d", declaration.date) and declaration.number in facts["Made with"]
 

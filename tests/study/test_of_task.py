@@ -31,6 +31,15 @@ def test_the_bias_is_taken_off_and_the_uncertainty_is_the_statements(statement):
     assert one.uncertainty == pytest.approx(0.05)
 
 
+def test_a_corrected_zone_is_not_negative(statement):
+    table = json.loads(statement.read_text())
+    table["measurements"]["gap"]["bias"] = 0.3
+    statement.write_text(json.dumps(table))
+    one = corrected(Result("gap", "mm", 0.1, deviations=np.zeros((1, 3))), read_view_statement(statement))
+    assert one.value == 0 and one.bias == 0.3
+    assert corrected(Result("gap", "mm", 0.1), read_view_statement(statement)).value == pytest.approx(-0.2)
+
+
 def test_a_statement_of_another_sensor_or_view_is_refused(statement):
     loaded = read_view_statement(statement)
     with pytest.raises(InputError, match="ensenso-n35, the sensor of the cloud"):

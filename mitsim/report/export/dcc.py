@@ -1,7 +1,8 @@
 """Write the statement of a run as a digital calibration certificate: DCC 3.2.1 of PTB, numbers after D-SI 2.1.0.
 
 Signal chain: results of a run, who issues them -> administrative data, then for each measurement its nominal value,
-error with u and 95 % interval, expected reading with U and k, number of virtual measurements, verdict -> one document.
+error of the stated part with u and 95 % interval, its expected reading with U and k, number of virtual measurements,
+verdict -> one document.
 
 The elements are those of PTB's schema (https://ptb.de/dcc/v3.2.1/dcc.xsd), which is LGPL-3.0 and no part of mitsim. The
 document calls itself simulated and not traceable: it is the statement of a virtual experiment in the form that programs
@@ -17,6 +18,7 @@ from xml.etree.ElementTree import Element, ElementTree, SubElement, indent, regi
 
 from characterisation.files.atomic_io import atomic_write
 from characterisation.files.errors import InputError
+from characterisation.statements.statement import ANY_PART
 from mitsim.report.declaration import Declaration
 from mitsim.report.export.results import ExpectedResult, RunResults
 from mitsim.running.version import __version__
@@ -169,22 +171,25 @@ def _result(to: Element, one: ExpectedResult) -> None:
     table = _add(_add(result, "data"), "list")
     unit = _UNITS[one.unit]
     _real(_quantity(table, "nominal value", "basic_nominalValue"), one.nominal, unit)
-    if one.bias is not None and one.uncertainty is not None and one.low is not None and one.high is not None:
+    low, high = one.error_low, one.error_high
+    if one.bias is not None and one.uncertainty is not None and low is not None and high is not None:
         error = _real(_quantity(table, "error, measured less true", "basic_measurementError"), one.bias, unit)
         interval = _si(error, "coverageInterval")
         _si(interval, "standardUnc", _number(one.uncertainty))
-        _si(interval, "intervalMin", _number(one.low - one.nominal))
-        _si(interval, "intervalMax", _number(one.high - one.nominal))
+        _si(interval, "intervalMin", _number(low))
+        _si(interval, "intervalMax", _number(high))
         _si(interval, "coverageProbability", "0.95")
-        reading = _real(
-            _quantity(table, "expected reading of a nominal part", "basic_measuredValue"), one.nominal + one.bias, unit
-        )
-        half = (one.high - one.low) / 2
-        if half >= one.uncertainty > 0:  # D-SI has no coverage factor below 1
-            expanded = _si(reading, "expandedUnc")
-            _si(expanded, "uncertainty", _number(half))
-            _si(expanded, "coverageFactor", f"{half / one.uncertainty:.4f}")
-            _si(expanded, "coverageProbability", "0.95")
+        largest = max(one.bias - low, high - one.bias)
+        if one.expected is not None:
+            part = "nominal part" if one.errors_of == ANY_PART else one.errors_of
+            reading = _real(
+                _quantity(table, f"expected reading of a {part}", "basic_measuredValue"), one.expected, unit
+            )
+            if largest >= one.uncertainty > 0:  # D-SI has no coverage factor below 1
+                expanded = _si(reading, "expandedUnc")
+                _si(expanded, "uncertainty", _number(largest))
+                _si(expanded, "coverageFactor", f"{largest / one.uncertainty:.4f}")
+                _si(expanded, "coverageProbability", "0.95")
     for name, value in zip(("lower deviation", "upper deviation"), _limits(one), strict=True):
         if value is not None:
             _real(_quantity(table, f"tolerance, {name}"), value, unit)

@@ -3,10 +3,10 @@
 Signal chain: results -> features (definition, nominal, item) -> characteristics (definition, nominal, item) -> plan (a
 step for each view, with its pose and its measurements) -> results (a measurement of every characteristic).
 
-A virtual measurement is of a perfect part. Its value is therefore the expectation, nominal plus bias, with its
+A virtual measurement is of a known part. Its value is therefore the expectation, value of this part plus bias, with its
 ``combinedUncertainty`` (k = 1) and its ``meanError``, the magnitude of the bias; QIF requires both together. The sign
-of the bias, the interval and the verdict are attributes. No part was inspected: statuses are ``NOT_ANALYZED``, and that
-of the inspection ``NOT_CALCULATED``. Lengths are mm, angles degrees, all in the part frame.
+of the bias, the interval, the part and the verdict are attributes. No part was inspected: statuses are
+``NOT_ANALYZED``, and that of the inspection ``NOT_CALCULATED``. Lengths are mm, angles degrees, all in the part frame.
 """
 
 from __future__ import annotations
@@ -212,7 +212,7 @@ def _plan(ids: Ids, found: RunResults) -> dict[str, Any]:
 
 def _results(ids: Ids, found: RunResults) -> Element:
     number = ids.new("results")
-    virtual = {"virtual": "expectation for a perfect part; no part was inspected", "study": found.study}
+    virtual = {"virtual": "expectations; no part was inspected", "study": found.study}
     content = {
         "Attributes": attributes(virtual),
         "MeasuredCharacteristics": {
@@ -236,7 +236,7 @@ def _measurement(ids: Ids, found: RunResults, one: ExpectedResult) -> Element:
     }
     known: dict[str, str | float | int] = {name: value for name, value in numbers.items() if value is not None}
     content = {
-        "Attributes": attributes(known | {"verdict": one.verdict}),
+        "Attributes": attributes(known | {"verdict": one.verdict, "errors_of": one.errors_of}),
         "Status": {"CharacteristicStatusEnum": "NOT_ANALYZED"},
         "CharacteristicItemId": ids.of("characteristic", one.measurement),
         "MeasurementDeviceIds": references([ids.of("device")]),

@@ -14,7 +14,9 @@ from typing import Any
 
 from characterisation.files.atomic_io import write_json, write_text
 from characterisation.files.errors import InputError
-from characterisation.tasks.task_file import Task
+from characterisation.statements.statement import ANY_PART, AT_THE_LIMIT
+from characterisation.tasks.deviations import fold_of
+from characterisation.tasks.task_file import Measurement, Task
 from characterisation.tasks.task_reading import read_task
 from mitsim.report.export.run_scene import view_pose
 from mitsim.running.version import __version__
@@ -28,9 +30,12 @@ from mitsim.study.statement_file import StatedMeasurement
 class ExpectedResult:
     """Expected result of one measurement, in its ``unit`` (mm or deg); missing numbers are None.
 
-    ``expected`` is the mean value for a perfect part, nominal + ``bias``. ``low`` to ``high`` contain 95 % of the
-    values. ``uncertainty`` is the standard deviation about the mean (k = 1). ``verdict`` compares them with the
-    tolerance: it states whether the sensor is good enough, and nothing about a real part.
+    Errors are those of the part that ``errors_of`` names: ``any part``, or of a value that cannot fall below 0 a part
+    at the limit of its tolerance, or far from nominal. ``error_low`` to ``error_high`` contain 95 % of them.
+    ``expected`` is the mean reading of this part, its value + ``bias``; ``low`` to ``high`` contain 95 % of its
+    readings. The value of any part is the nominal one; a part far from nominal has none, and no reading.
+    ``uncertainty`` is the standard deviation about the mean (k = 1). ``verdict`` compares them with the tolerance: it
+    states whether the sensor is good enough, and nothing about a real part.
     """
 
     measurement: str
@@ -49,6 +54,9 @@ class ExpectedResult:
     trials: int
     without_value: float
     verdict: str
+    error_low: float | None
+    error_high: float | None
+    errors_of: str
 
 
 @dataclass(frozen=True)
@@ -93,7 +101,8 @@ def read_results(folder: str | Path, task_file: str | Path | None = None) -> Run
             "give the run's own: --task FILE",
         )
     view = run.statement.view
-    results = tuple(_result(name, task, run.statement.measurements[name], view) for name in task.measurements)
+    stated = run.statement.measurements
+    results = tuple(expected_result(name, asked, stated[name], view) for name, asked in task.measurements.items())
     numbers = run.about.view_sets[0].views if run.about.view_sets else [view]
     plan = tuple((number, view_pose(run, number), tuple(task.measurements)) for number in numbers)
     return RunResults(results, task, run.about.sensor, run.about.study, run.statement.measured_by, plan)
@@ -134,9 +143,22 @@ def write_results_json(found: RunResults, path: str | Path) -> None:
     )
 
 
-def _result(name: str, task: Task, stated: StatedMeasurement, view: int) -> ExpectedResult:
-    asked = task.measurements[name]
-    low, high = (None if end is None else asked.nominal + end for end in stated.interval)
+def expected_result(name: str, asked: Measurement, stated: StatedMeasurement, view: int) -> ExpectedResult:
+    """Return the expected result of a measurement.
+
+    Parameters
+    ----------
+    name, asked
+        The measurement, from the task.
+    stated
+        Its statement.
+    view
+        Number of the stated view.
+    """
+    value = _part_value(asked, stated.errors_of)
+    expected, low, high = (
+        None if end is None or value is None else value + end for end in (stated.bias, *stated.interval)
+    )
     return ExpectedResult(
         name,
         asked.kind,
@@ -145,7 +167,7 @@ def _result(name: str, task: Task, stated: StatedMeasurement, view: int) -> Expe
         asked.nominal,
         asked.tolerance,
         view,
-        None if stated.bias is None else asked.nominal + stated.bias,
+        expected,
         stated.bias,
         stated.bias_uncertainty,
         stated.standard_uncertainty,
@@ -154,4 +176,13 @@ def _result(name: str, task: Task, stated: StatedMeasurement, view: int) -> Expe
         stated.trials,
         stated.without_value,
         stated.verdict,
+        *stated.interval,
+        stated.errors_of,
     )
+
+
+def _part_value(asked: Measurement, errors_of: str) -> float | None:
+    """Return the value of the part whose errors are stated; None for a part far from nominal."""
+    if errors_of == AT_THE_LIMIT:
+        return asked.limits[0 if fold_of(asked) else 1]
+    return asked.nominal if errors_of == ANY_PART else None

@@ -27,6 +27,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from mitsim.running.executor import Executor
+from mitsim.running.numbers import two_digits
 from mitsim.running.progress import say
 from mitsim.running.time_limit import TimeLimit
 from mitsim.study.choose.candidates import CandidateSensor
@@ -156,7 +157,7 @@ def _say(found: list[SensorResult], done: str, limit: TimeLimit) -> None:
     worst = max(limited or possible, key=rows.__getitem__)
     measurement = first.candidate.study.task.measurements[names[worst]]
     unit = "times the limit" if first.has_tolerance[worst] else measurement.unit
-    demand_in_words = f"{rows[worst]:.2g} {unit} ({names[worst]})"
+    demand_in_words = f"{two_digits(rows[worst])} {unit} ({names[worst]})"
     if len(possible) < len(rows):
         demand_in_words += f", {len(possible)} of {len(rows)} measurements possible"
     say(f"choose: {done}; {first.candidate.name} leads {by}, at worst {demand_in_words}; {left:.0f} s left")

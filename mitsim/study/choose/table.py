@@ -13,9 +13,10 @@ from dataclasses import replace
 import numpy as np
 
 from characterisation.files.atomic_io import json_values
-from characterisation.statements.decision import WORDS, Verdict, decide, mostly_lost, needed, tolerance_of
+from characterisation.statements.decision import Verdict, decide, mostly_lost, needed, tolerance_of
 from characterisation.statements.statement import Statement
 from characterisation.statements.verdict_words import result_in_words
+from mitsim.running.numbers import or_nan, two_digits
 from mitsim.running.text_table import aligned
 from mitsim.running.version import __version__
 from mitsim.sensor.exposure import PlannedExposure
@@ -65,7 +66,7 @@ def document(
             tolerance=one.tolerance,
             features=list(one.features),
             kind=one.kind,
-            rule="" if one.tolerance is None else WORDS[task.decision_of(name).rule],
+            rule="" if one.tolerance is None else task.decision_of(name).in_words,
         )
         for name, one in task.measurements.items()
     }
@@ -116,7 +117,7 @@ def words(one: SensorEntry, named_measurements: dict[str, ComparedMeasurement]) 
     if toleranced:
         result = result_in_words(verdicts) if one.status == "stated" else _expected_in_words(one, named_measurements)
     elif one.ratio is not None and one.ratio > 1:
-        result = f"{one.ratio:.2g} times the least uncertainty of all sensors at worst"
+        result = f"{two_digits(one.ratio)} times the least uncertainty of all sensors at worst"
     else:
         result = "the least uncertainty of all sensors in every " + "possible " * bool(one.impossible) + "measurement"
     result = "by screening alone: " * (one.status == "screened") + result
@@ -132,8 +133,8 @@ def _expected_in_words(one: SensorEntry, named_measurements: dict[str, ComparedM
         return text
     name = max(known, key=lambda each: known[each].demand or 0.0)
     unit, needed, u = named_measurements[name].unit, known[name].needed, known[name].uncertainty
-    limit = "" if needed is None else f", {needed:.2g} {unit} needed"
-    return f"{text}; the hardest is {name}: standard uncertainty {u:.2g} {unit}{limit}"
+    limit = "" if needed is None else f", {two_digits(needed)} {unit} needed"
+    return f"{text}; the hardest is {name}: standard uncertainty {two_digits(or_nan(u))} {unit}{limit}"
 
 
 def _reasons(one: SensorEntry, but: Collection[str] = ()) -> str:
@@ -157,7 +158,7 @@ def as_text(choice: ChoiceDocument) -> str:
             (
                 one.name + ("" if one.status == "stated" else " *"),
                 _fits(one, toleranced),
-                "-" if one.ratio is None else f"{one.ratio:.2g}",
+                "-" if one.ratio is None else two_digits(one.ratio),
                 "-" if one.capture is None else f"{1e3 * one.capture.seconds:.0f} ms",
                 *(_cell(one.measurements[name], choice.measurements[name]) for name in names),
             )
@@ -195,7 +196,7 @@ def _fits(one: SensorEntry, toleranced: int) -> str:
 def _cell(cell: CellEntry, measurement: ComparedMeasurement) -> str:
     if cell.uncertainty is None:
         return f"no value in {cell.trials}" if cell.trials else "none by screening"
-    return f"{cell.uncertainty:.2g} {measurement.unit} ({cell.view}) {_SIGNS[cell.verdict]}".rstrip()
+    return f"{two_digits(cell.uncertainty)} {measurement.unit} ({cell.view}) {_SIGNS[cell.verdict]}".rstrip()
 
 
 def _sensor(one: SensorResult) -> SensorEntry:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 
 from characterisation.statements.budget import INTERACTION, NOISE
 from characterisation.statements.statement import Statement
+from characterisation.tasks.decision_table import BIAS_SUBTRACTED
 
 #: beginning of the names of rules that limit the larger end of the 95 % interval of the error
 _BY_INTERVAL = ("ISO 14253-1", "simple acceptance")
@@ -70,7 +71,8 @@ def can_fit(stated: Statement, uncertainty: float, unbiased: bool) -> bool:
         return unbiased  # no values: only a change of light, surface, view or sensor can give some
     if uncertainty > decided.needed:
         return False
-    if unbiased or not decided.rule.startswith(_BY_INTERVAL) or not stated.standard_uncertainty > 0:
+    without_bias = unbiased or decided.rule.endswith(BIAS_SUBTRACTED)
+    if without_bias or not decided.rule.startswith(_BY_INTERVAL) or not stated.standard_uncertainty > 0:
         return True
     ratio = uncertainty / stated.standard_uncertainty
     ends = [stated.bias + ratio * end for end in stated.interval_corrected]

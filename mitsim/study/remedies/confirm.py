@@ -165,8 +165,8 @@ def _deserves_more(one: Statement, first: bool) -> bool:
     """
     if one.decided is None or one.verdict != "not decided":
         return one.verdict == "fits" and first
-    demand, low = one.decided.demand, one.decided.demand_interval[0]
-    return demand <= 1 or (first and demand * low <= 1)
+    demand, high = one.decided.demand, one.decided.demand_interval[1]
+    return demand <= 1 or (first and demand**2 <= high / demand)
 
 
 def remedies_document(found: Remedies) -> dict[str, Any]:

@@ -24,13 +24,14 @@ from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.decision import tolerance_of
 from characterisation.statements.losses import losses
 from characterisation.statements.statement import Statement, statement
+from mitsim.running.numbers import beside, percent, two_digits
 from mitsim.running.progress import say, track
 from mitsim.running.text_table import aligned
 from mitsim.study import SetTable
 from mitsim.study.exposures.planned import with_exposure
 from mitsim.study.session import Session
 from mitsim.study.view_sets.joined import JoinedMeasurements
-from mitsim.study.virtual.stated import digits
+from mitsim.study.virtual.stated import digits, plain
 from mitsim.study.virtual.trials import TrialFolder
 from mitsim.study.virtual.world import SET_DAYS, Trial
 
@@ -134,7 +135,8 @@ def _missed(tried: TriedSet, limits: dict[str, float]) -> str:
     """Return text such as ``radius missed, 1.3 times its limit``."""
     stated = {one.measurement: one for one in tried.stated}
     ratios = {name: _excess(one, limits[name]) for name, one in stated.items() if name in limits}
-    words = [f"{name} missed, {ratio:.2g} times its limit" for name, ratio in ratios.items() if 1 < ratio < math.inf]
+    missed = {name: two_digits(ratio) for name, ratio in ratios.items() if 1 < ratio < math.inf}
+    words = [f"{name} missed, {ratio} times its limit" for name, ratio in missed.items()]
     return "; ".join(words + [f"{name} without a value" for name, ratio in ratios.items() if ratio == math.inf])
 
 
@@ -240,7 +242,8 @@ def set_table(table: SetTable, tried: TriedSet) -> str:
     for one in tried.stated:
         limit = table.limits.get(one.measurement)
         kept = "-" if limit is None else "yes" if one.root_mean_square <= limit else "no"
-        wanted = ("-", "-") if limit is None else (f"{limit:g}", f"{expected[one.measurement]:.2g}")
-        numbers = digits(one.bias), digits(one.standard_uncertainty), f"{100 * one.without_value:.0f} %"
+        wanted = ("-", "-") if limit is None else (f"{limit:g}", digits(expected[one.measurement]))
+        u = one.standard_uncertainty
+        numbers = plain(beside(one.bias, u)), digits(u), plain(percent(one.without_value))
         rows.append((one.measurement, one.unit, *wanted, *numbers, kept))
     return "\n".join(aligned(rows))

@@ -21,6 +21,8 @@ from characterisation.statements.one_sided import stated_errors
 from characterisation.statements.size_dependence import DrawnNumber, size_dependence
 from characterisation.statements.statement import Statement, statement
 from characterisation.statements.verdict_words import Judged
+from characterisation.tasks.decision_table import BIAS_SUBTRACTED
+from mitsim.running.numbers import MINUS, NONE, SPACE, accepted_text, beside, interval_text, percent, two_digits
 from mitsim.running.text_table import aligned
 from mitsim.running.time_limit import TimeLimit
 from mitsim.sensor.exposure import PlannedExposure
@@ -242,11 +244,11 @@ def statement_table(stated: Sequence[Statement]) -> str:
             (
                 one.measurement,
                 one.unit,
-                digits(one.bias),
+                plain(beside(one.bias, one.standard_uncertainty)),
                 digits(one.standard_uncertainty),
                 _interval(one.interval),
                 _interval(one.interval_corrected),
-                f"{100 * one.without_value:.0f} %",
+                plain(percent(one.without_value)),
                 _largest(one),
                 _accepted(one),
                 one.verdict,
@@ -282,9 +284,8 @@ def _accepted(one: Statement) -> str:
         return "-"
     if one.decided.accepted is None:
         return "none"
-    low, high = one.decided.accepted
-    digits = max(0, 2 - math.floor(math.log10(one.tolerance or 1.0)))
-    return f"up to {high:.{digits}f}" if math.isinf(low) else f"{low:.{digits}f} to {high:.{digits}f}"
+    text = plain(accepted_text(*one.decided.accepted, one.tolerance or 1.0))
+    return text + ", bias subtracted" * one.decided.rule.endswith(BIAS_SUBTRACTED)
 
 
 def _largest(one: Statement) -> str:
@@ -295,10 +296,15 @@ def _largest(one: Statement) -> str:
     return "too few trials" if largest is None else f"{largest.group} ({100 * largest.share:.0f} %)"
 
 
+def plain(text: str) -> str:
+    """Return a number of a page for a terminal: with hyphens for a minus and for no number, and plain spaces."""
+    return text.replace(MINUS, "-").replace(NONE, "-").replace(SPACE, " ")
+
+
 def digits(value: float) -> str:
     """Return a number with two digits, or a dash for NaN."""
-    return "-" if not math.isfinite(value) else f"{value:.2g}"
+    return plain(two_digits(value))
 
 
 def _interval(ends: tuple[float, float]) -> str:
-    return "-" if not math.isfinite(ends[0]) else f"{ends[0]:.2g} to {ends[1]:.2g}"
+    return "-" if not math.isfinite(ends[0]) else plain(interval_text(*ends))

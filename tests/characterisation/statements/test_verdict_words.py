@@ -49,3 +49,6 @@ def test_without_tolerances_the_losses_are_told():
     assert result_in_words([replace(a, without_value=0.0), few]).endswith(
         "b has no value in less than 1 % of the virtual measurements"
     )
+    assert result_in_words([replace(a, without_value=0.997)]).endswith(
+        "a has no value in more than 99 % of the virtual measurements"
+    )

@@ -13,13 +13,22 @@ import xarray as xr
 from characterisation.files.atomic_io import write_netcdf
 from characterisation.files.errors import InputError
 from characterisation.tasks.definitions import DEFINITIONS
+from characterisation.tasks.task_file import Measurement
 from characterisation.tasks.task_reading import read_task
 from mitsim.report.export.qif import NAMESPACE, write_qif
-from mitsim.report.export.results import ExpectedResult, RunResults, read_results, write_results_csv, write_results_json
+from mitsim.report.export.results import (
+    ExpectedResult,
+    RunResults,
+    expected_result,
+    read_results,
+    write_results_csv,
+    write_results_json,
+)
 from mitsim.study import open_study
 from mitsim.study.run_folder import read_run
 from mitsim.study.scoring import write_inputs
 from mitsim.study.session import Session
+from mitsim.study.statement_file import StatedMeasurement
 from tests.report.conftest import FEATURES as SEEN
 from tests.report.conftest import MEASUREMENTS
 from tests.report.export.known_cloud import POSE
@@ -104,6 +113,9 @@ def every_kind(tmp_path_factory):
             200,
             0.0,
             "fits",
+            -1.0,
+            1.0,
+            "any part",
         )
         for name, m in task.measurements.items()
     ]
@@ -115,6 +127,8 @@ def every_kind(tmp_path_factory):
         uncertainty=None,
         low=None,
         high=None,
+        error_low=None,
+        error_high=None,
         without_value=1.0,
     )
     plan = ((12, POSE, tuple(task.measurements)[:5]), (40, POSE.inverse(), tuple(task.measurements)[5:]))
@@ -310,6 +324,47 @@ def test_a_study_keeps_its_task_in_the_folder_that_is_exported(tmp_path, monkeyp
         export("results", "run", "-o", name)
         assert Path(name).stat().st_size > 300
     export("run", "run", "-o", "out.glb")
+
+
+@pytest.mark.parametrize(
+    ("kind", "nominal", "tolerance", "errors_of", "value"),
+    [
+        ("radius", 20.0, 0.5, "any part", 20.0),
+        ("coaxiality", 0.0, 0.3, "part at the limit of the tolerance", 0.3),
+        ("point_distance", 0.1, 0.3, "part at the limit of the tolerance", 0.4),
+        ("plane_angle", 90.0, 0.2, "part at the limit of the tolerance", 89.8),
+        ("coaxiality", 0.0, None, "part far from nominal", None),
+    ],
+)
+def test_readings_are_those_of_the_part_whose_errors_are_stated(kind, nominal, tolerance, errors_of, value):
+    """A reading of a zone is never negative, and one of a right angle never above 90 deg."""
+    asked = Measurement(
+        kind=kind, features=("a", "b"), nominal=nominal, unit=DEFINITIONS[kind].unit, tolerance=tolerance
+    )
+    stated = StatedMeasurement(
+        unit=asked.unit,
+        trials=200,
+        without_value=0.0,
+        bias=-0.01,
+        bias_uncertainty=0.001,
+        standard_uncertainty=0.05,
+        interval=(-0.11, 0.09),
+        interval_corrected=(-0.1, 0.1),
+        numerical_tolerance=0.005,
+        settled=True,
+        repeatability=None,
+        budget=[],
+        tolerance=tolerance,
+        share_of_tolerance=None,
+        verdict="fits",
+        errors_of=errors_of,
+    )
+    one = expected_result("m", asked, stated, 3)
+    assert (one.error_low, one.error_high, one.errors_of) == (-0.11, 0.09, errors_of)
+    if value is None:
+        assert one.expected is one.low is one.high is None
+    else:
+        assert (one.expected, one.low, one.high) == (value - 0.01, value - 0.11, value + 0.09)
 
 
 def test_results_are_read_from_a_run(tmp_path):

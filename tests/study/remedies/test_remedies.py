@@ -49,6 +49,13 @@ def test_a_change_leaves_the_variance_of_the_groups_that_it_does_not_touch() -> 
     assert least_uncertainty(replace(one, budget=()), Effect({"form": 0.0})) == 0
 
 
+def test_a_bias_that_the_rule_subtracts_excludes_no_change() -> None:
+    errors = 1 + 0.1 * NORMAL
+    one = statement("m", "mm", errors, plus_minus(70.0, 0.5, Decision(subtract_bias=True)))
+    assert can_fit(one, 0.05, unbiased=False) and not can_fit(one, 0.08, unbiased=False)
+    assert not can_fit(statement("m", "mm", errors, plus_minus(70.0, 0.5)), 0.05, unbiased=False)
+
+
 def test_an_uncertain_line_of_the_budget_counts_with_its_high_end() -> None:
     one = stated("radius", 0.5)
     u2 = one.standard_uncertainty**2

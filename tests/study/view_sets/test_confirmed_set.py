@@ -74,7 +74,7 @@ def test_where_the_map_can_keep_no_stricter_limit_the_search_comes_back_to_those
     assert measured[:2] == [4, 8] and tried[-1].excess(LIMITS) > 1  # sixteen would do; eight come nearest
     assert len(tried[-1].chosen.views) == 8 and tried[-1].searched["apart"] < 0.1
     told = capsys.readouterr().err
-    assert "set 1, views 0, 1, 2, 3: apart missed, 2 times its limit; radius missed, 2 times its limit" in told
+    assert "set 1, views 0, 1, 2, 3: apart missed, 2.0 times its limit; radius missed, 2.0 times its limit" in told
     assert "no further set is tried: by the map, no set of other views is more accurate" in told
 
 
