@@ -9,6 +9,7 @@ import typer
 
 from characterisation.files.errors import InputError
 from mitsim.cli.options import Clouds, DecodedAs, Frame, Json, Seed, Simulated, Topic, Unit, Variant, check_unit, start
+from mitsim.running.progress import say
 
 if TYPE_CHECKING:
     from characterisation.point_cloud import PointCloud
@@ -68,7 +69,6 @@ def acceptance(
         result_values,
         summary,
     )
-    from mitsim.running.progress import say
 
     check_unit(unit)
     artefacts = read_artefacts(plane or [], sphere or [], spacing or [])

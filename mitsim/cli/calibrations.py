@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -9,6 +10,7 @@ import typer
 
 from characterisation.files.errors import InputError, nearest
 from mitsim.cli.options import Seed, check_file, definitions
+from mitsim.running.progress import say
 
 
 def rig(
@@ -66,11 +68,9 @@ def rig(
     if _is_recorded(sensor):
         _recorded(Path(sensor), output, board)
         return
-    from dataclasses import replace
 
     import numpy as np
 
-    from mitsim.running.progress import say
     from mitsim.sensor.drift import Drift
     from mitsim.sensor.preset import load_sensor
     from mitsim.sensor.rig_covariance import write_rig_covariance
@@ -139,7 +139,6 @@ def verify(
     from mitsim.decoding.checks.checked_cloud import checked_cloud
     from mitsim.decoding.cloud import decoder_settings
     from mitsim.decoding.plate import Plate
-    from mitsim.running.progress import say
     from mitsim.study.calibration import verification
     from mitsim.study.calibration.board import parse_board
     from mitsim.study.virtual.study_unknowns import calibration_covariance
@@ -187,7 +186,6 @@ def _is_recorded(given: str) -> bool:
 
 def _recorded(path: Path, output: Path, board: str | None) -> None:
     """Calibrate from recorded corners; print the result, and write it with its covariance."""
-    from mitsim.running.progress import say
     from mitsim.study.calibration.board import parse_board
     from mitsim.study.calibration.corner_files import read_corners
     from mitsim.study.calibration.halves import calibrate_checked

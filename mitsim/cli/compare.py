@@ -10,6 +10,7 @@ import typer
 
 from characterisation.files.errors import InputError
 from mitsim.cli.options import ObjectWindow, Out, Seed, Variant, check_folder, start
+from mitsim.running.progress import say
 
 
 def compare(
@@ -51,7 +52,6 @@ def compare(
     start(variant)
     from characterisation.region_of_interest import Roi
     from mitsim.report.capture_page import write_capture_page
-    from mitsim.running.progress import say
     from mitsim.twin.compare.captures_run import validate_captures
 
     if projector not in (None, "on", "off"):
@@ -76,7 +76,6 @@ def _imported(recording: Path, folder: Path, frame: int | None, calibration: Pat
     """Import a recording into a capture folder."""
     from mitsim.capture.folder import write_capture
     from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
-    from mitsim.running.progress import say
 
     options = ReadOptions(frame=frame, calibration=None if calibration is None else str(calibration))
     imported = read_recording(recording, options)

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from mitsim.cli.options import OutCloud, check_cloud_file, print_reasons
+from mitsim.running.progress import say
 
 
 def decode(
@@ -50,7 +51,6 @@ def decode(
     from mitsim.capture.workspace import written_frame
     from mitsim.decoding.checks.checked_cloud import checked_cloud
     from mitsim.decoding.cloud import decoder_settings, settings_in_words, with_options
-    from mitsim.running.progress import say
 
     read = read_capture(capture)
     check_cloud_file(output)

@@ -10,6 +10,7 @@ import typer
 
 from characterisation.files.errors import InputError
 from mitsim.cli.options import Out, check_folder
+from mitsim.running.progress import say, track
 
 _KINDS = "ensenso:SERIAL, depthai or depthai:ID"
 
@@ -29,7 +30,6 @@ def capture(
     """
     from mitsim.capture.devices.maker_captures import open_device
     from mitsim.capture.folder import write_capture
-    from mitsim.running.progress import say, track
 
     table = device_table(device, settings)
     check_folder(output)

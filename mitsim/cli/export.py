@@ -7,8 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from characterisation.files.atomic_io import write_text
 from characterisation.files.errors import InputError
-from mitsim.cli.options import Group, MapFile, Variant, ViewOfPoses, check_file, check_folder, start
+from mitsim.cli.options import MapFile, Variant, ViewOfPoses, check_file, check_folder, start
+from mitsim.running.numbers import how_many
+from mitsim.running.progress import say
 
 if TYPE_CHECKING:
     from characterisation.point_cloud import PointCloud
@@ -18,19 +21,11 @@ CLOUD_SUFFIXES = (".ply", ".pcd", ".e57", ".mcap")
 RUN_SUFFIXES = (".glb", ".usda", ".usdc", ".usdz", ".rrd", ".mcap", ".e57")
 RESULT_SUFFIXES = (".qif", ".xml", ".csv", ".json")
 
-app = typer.Typer(
-    cls=Group,
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    help="Write clouds, runs, results and maps in the formats of other programs.",
-)
-
 Views = Annotated[
     str, typer.Option(help="best (views that are best for a measurement, or have a cloud), all, or numbers: 3,12.")
 ]
 
 
-@app.command()
 def cloud(
     cloud: Annotated[Path, typer.Argument(help="PLY file that mitsim wrote.")],
     output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(CLOUD_SUFFIXES)}.")],
@@ -52,7 +47,6 @@ def cloud(
     from mitsim.report.export.cloud_writers import write_cloud_pcd, write_cloud_ply
     from mitsim.report.export.e57 import write_e57
     from mitsim.report.export.ros_bag import Stamped, write_mcap
-    from mitsim.running.progress import say
     from mitsim.study.task_measurement import read_pose
 
     suffix = _suffix(output, CLOUD_SUFFIXES)
@@ -78,7 +72,6 @@ def cloud(
     say(f"cloud: {output}: {_counted(read)}")
 
 
-@app.command()
 def run(
     folder: Annotated[Path, typer.Argument(help="Folder of mitsim run, or of mitsim study choose (best sensor).")],
     output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(RUN_SUFFIXES)}.")],
@@ -98,8 +91,6 @@ def run(
     from mitsim.report.export.ros_bag import Stamped, write_mcap
     from mitsim.report.export.run_scene import read_run_scene
     from mitsim.report.export.usd import write_usd
-    from mitsim.running.numbers import how_many
-    from mitsim.running.progress import say
 
     suffix = _suffix(output, RUN_SUFFIXES)
     folder = _run_in(folder)
@@ -127,7 +118,6 @@ def run(
     say(f"run: {output}: {', '.join(written)}")
 
 
-@app.command()
 def results(
     folder: Annotated[Path, typer.Argument(help="Folder of mitsim run, or of mitsim study choose (best sensor).")],
     output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(RESULT_SUFFIXES)}.")],
@@ -150,8 +140,6 @@ def results(
     from mitsim.report.export.dcc import Issuer, write_dcc
     from mitsim.report.export.qif import write_qif
     from mitsim.report.export.results import read_results, write_results_csv, write_results_json
-    from mitsim.running.numbers import how_many
-    from mitsim.running.progress import say
 
     suffix = _suffix(output, RESULT_SUFFIXES)
     folder = _run_in(folder)
@@ -167,7 +155,6 @@ def results(
     say(f"results: {output}: {how_many(len(found.results), 'measurement')}, planned from view {views}")
 
 
-@app.command()
 def targets(
     folder: Annotated[Path, typer.Argument(help="Folder of mitsim run, study score or study choose (best sensor).")],
     output: Annotated[Path, typer.Option("--output", "-o", help="File to write.")],
@@ -184,10 +171,7 @@ def targets(
 
     Example: mitsim export targets runs/two_pillars --robot kuka -o views.dat
     """
-    from characterisation.files.atomic_io import write_text
     from mitsim.report.export.robot_targets import ROBOT_FORMATS, read_targets
-    from mitsim.running.numbers import how_many
-    from mitsim.running.progress import say
 
     if robot not in ROBOT_FORMATS:
         raise InputError("--robot", "", repr(robot), ", ".join(ROBOT_FORMATS))
@@ -202,7 +186,6 @@ def targets(
     say(f"targets: {output}: {how_many(len(found), 'pose')} of the {tool} in the part frame{hint}")
 
 
-@app.command("map")
 def map_(
     map_file: MapFile,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
@@ -221,7 +204,6 @@ def map_(
     from characterisation.maps.performance_map import PerformanceMap
     from characterisation.maps.shipped import map_path
     from mitsim.report.export.map_export import write_map_kernel
-    from mitsim.running.progress import say
     from mitsim.sensor.preset import load_sensor, presets
 
     loaded = PerformanceMap.load(map_path(map_file))
@@ -236,7 +218,6 @@ def map_(
     say(f"kernel: {output / 'sensor_map.py'}, {output / 'map.npz'}: {len(loaded.samples)} surfaces of {name}")
 
 
-@app.command()
 def bop(
     folder: Annotated[Path, typer.Argument(help="Folder of mitsim render --many.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write; it must not exist.")],
@@ -259,7 +240,6 @@ def bop(
         raise InputError("--split", "", repr(split), "train, val or test")
     start(variant)
     from mitsim.report.export.bop import find_sources, write_bop
-    from mitsim.running.progress import say
 
     count = write_bop(find_sources(folder), output, split, objects or ())
     say(f"data set: {output}: {count} images")
@@ -267,7 +247,6 @@ def bop(
 
 def _run_in(folder: Path) -> Path:
     """Return the folder to read: of a comparison of sensors, that of the best one."""
-    from mitsim.running.progress import say
     from mitsim.study.choice_document import winner_folder
 
     found = winner_folder(folder)

@@ -10,7 +10,10 @@ from typing import Annotated
 
 import typer
 
+from characterisation.files.atomic_io import write_json
+from characterisation.files.errors import InputError
 from mitsim.cli.options import Defines, ObjectWindow, Seed, Variant, Yes, asking, check_file, definitions, start
+from mitsim.running.progress import say
 
 
 def finish(
@@ -55,11 +58,9 @@ def finish(
     Example: mitsim fit finish captures/coupon_* --scene scenes/coupon/coupon.xml -o fit.json --figure fit.png
     """
     start(variant)
-    from characterisation.files.atomic_io import write_json
     from characterisation.region_of_interest import Roi
     from mitsim.report.finish_figure import fit_figure, fit_table, remarks
     from mitsim.report.style import write_png
-    from mitsim.running.progress import say
     from mitsim.twin.finish.run import fit_captures
 
     for file in (output, figure):
@@ -116,10 +117,8 @@ def sensor_(
     Example: mitsim fit sensor captures/sheet_* --off captures/no_projector --sensor ensenso-n10 -o my-camera.toml
     """
     start(variant)
-    from characterisation.files.errors import InputError
     from characterisation.region_of_interest import Roi
     from mitsim.cli.fit_journey import map_and_run, read_journey
-    from mitsim.running.progress import say
     from mitsim.twin.sensor.run import fit_sensor
     from mitsim.twin.sensor.write import fit_table, write_sensor
 

@@ -13,6 +13,7 @@ import typer
 from characterisation.files.errors import InputError
 from mitsim.cli.folder_lock import remove_partial_beside
 from mitsim.cli.options import Topic, definitions
+from mitsim.running.progress import say
 
 if TYPE_CHECKING:
     from mitsim.capture.capture import Capture
@@ -139,7 +140,6 @@ def import_(
     from mitsim.capture.recordings.recognise import NAMES
     from mitsim.capture.recordings.recording_files import plain_name
     from mitsim.decoding.checks.sanity import with_warnings
-    from mitsim.running.progress import say
 
     named = {one.name: given[one.name] for one in fields(ReadOptions)}
     options = ReadOptions(**named | {"topic": tuple(topic) if topic else None, "images": _patterns(images)})

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import typer
 
 from mitsim.cli.options import Json
@@ -15,7 +17,6 @@ def doctor(json: Json = False) -> None:
     Example: mitsim doctor
     """
     import json as json_module
-    from dataclasses import asdict
 
     from mitsim.cli.doctor import examine
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
+from characterisation.files.atomic_io import write_json
 from characterisation.files.errors import InputError
 from mitsim.cli.devices import mount
 from mitsim.cli.options import (
@@ -35,6 +37,7 @@ from mitsim.cli.options import (
     requested_workers,
     start,
 )
+from mitsim.running.progress import say, track
 
 #: what workers are allowed with, and why
 _ONE_AT_A_TIME = ("not with a [device]", "a device takes one capture at a time")
@@ -79,7 +82,6 @@ def make(
     from mitsim.maps.use import simulate_campaign
     from mitsim.report.figures import write_map_figures
     from mitsim.report.findings import spread_in_words
-    from mitsim.running.progress import say
     from mitsim.sensor.preset import load_sensor
 
     if captures is not None and scheduler is not None:
@@ -134,7 +136,6 @@ def compare(
     from characterisation.maps.shipped import map_path, shipped_maps
     from mitsim.report.map_comparison import check_distance, comparison_figure, strip_figure
     from mitsim.report.style import write_png
-    from mitsim.running.progress import say
 
     loaded = [PerformanceMap.load(map_path(name)) for name in (maps or shipped_maps())]
     if distance is not None:
@@ -175,7 +176,6 @@ def predict(
     from mitsim.maps import use as maps
     from mitsim.maps.prediction import Predictor
     from mitsim.maps.prediction.faces_in_sight import faces_in_sight, in_words
-    from mitsim.running.progress import say
     from mitsim.study import read_map
 
     chosen = load_sensor(sensor)
@@ -218,7 +218,6 @@ def validate(
     Example: mitsim map validate runs/n10/map.nc scenes/coupon/campaign.toml -o runs/n10_held_out
     """
     start(variant)
-    from contextlib import AbstractContextManager, nullcontext
 
     from characterisation.files.documents import read_toml
     from characterisation.maps.performance_map import PerformanceMap
@@ -240,7 +239,6 @@ def validate(
     from mitsim.report.style import write_png
     from mitsim.report.validation_figures import agreement_figure, validation_table
     from mitsim.running.executor import results_of
-    from mitsim.running.progress import say, track
     from mitsim.sensor.preset import load_sensor
 
     path = map_path(map_file)
@@ -288,11 +286,9 @@ def sheet(
     Example: mitsim map sheet ensenso-n10 kinect-v2 -o runs/sheets
     """
     start(variant)
-    from characterisation.files.atomic_io import write_json
     from mitsim.maps.data_sheet import gallery, measure_sensor
     from mitsim.report.sheet_figures import gallery_figure, noise_figure, residual_figure, sheet_leaves_out, sheet_table
     from mitsim.report.style import write_png
-    from mitsim.running.progress import say
     from mitsim.sensor.preset import load_sensor, presets
 
     chosen = [load_sensor(name) for name in (sensors or presets())]

@@ -27,6 +27,7 @@ from mitsim.cli.options import (
     definitions,
     start,
 )
+from mitsim.running.progress import say
 
 if TYPE_CHECKING:
     from characterisation.point_cloud import PointCloud
@@ -137,7 +138,6 @@ def clouds(
     from mitsim.cli.measure_request import read_request
     from mitsim.decoding.input_clouds import cloud_paths, read_cloud
     from mitsim.decoding.measured_document import beside_document, measured_document, result_tables, summary
-    from mitsim.running.progress import say
 
     check_unit(unit)
     request = read_request(

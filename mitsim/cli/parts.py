@@ -23,6 +23,7 @@ from mitsim.cli.options import (
     pose_of,
     start,
 )
+from mitsim.running.progress import say
 
 if TYPE_CHECKING:
     from mitsim.scene.authoring.check import Authored
@@ -72,7 +73,6 @@ def check(
     import json as json_module
 
     from mitsim.report.scene_table import as_data, as_text
-    from mitsim.running.progress import say
     from mitsim.sensor.preset import load_sensor
     from mitsim.sensor.working_volume import usual_place
 
@@ -194,7 +194,6 @@ def part(
 
     Example: mitsim part bracket.step -o scenes/bracket --process milled --Ra 1.6 --sensor ensenso-n10 --edit
     """
-    from mitsim.running.progress import say
     from mitsim.scene.authoring.fineness import fineness_for
     from mitsim.scene.authoring.part_folder import Finishing, described, write_part
     from mitsim.scene.authoring.read_step import Fineness
@@ -234,7 +233,6 @@ def _edit(scene: Path, sensor: str | None, port: int) -> None:
     start(None)
     from mitsim.report.author_page import author_page, findings_data
     from mitsim.report.author_server import AuthorServer
-    from mitsim.running.progress import say
     from mitsim.sensor.preset import load_sensor
 
     chosen, task = load_sensor(sensor or "ensenso-n10"), scene.parent / "task.toml"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import asdict
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -27,6 +29,7 @@ from mitsim.cli.options import (
     requested_workers,
     start,
 )
+from mitsim.running.progress import say
 
 if TYPE_CHECKING:
     from mitsim.running.executor import Executor
@@ -96,15 +99,12 @@ def render(
         _render_many(many, scene, sensor, settings, output, requested_workers(scheduler, processes))
         return
     assert position is not None
-    from dataclasses import asdict
-    from math import isfinite
 
     from mitsim.capture.folder import check_free, read_capture, write_capture
     from mitsim.capture.simulated.render_residual import LIMIT, render_residual
     from mitsim.capture.simulated.rendering import Rendering
     from mitsim.capture.simulated.truth import encode_exr, true_images
     from mitsim.decoding import captures as interface
-    from mitsim.running.progress import say
     from mitsim.scene.surface.scatter import Deviation
     from mitsim.scene.visible_surfaces import sees_nothing
 
@@ -150,7 +150,6 @@ def _render_many(
 ) -> None:
     """Simulate the missing captures of a plan, and report their number."""
     from mitsim.capture.simulated.simulate import SimulatedSensor
-    from mitsim.running.progress import say
     from mitsim.sensor.preset import load_sensor
     from mitsim.study.many_captures import in_turn, missing_jobs, read_jobs, render_many, take_job
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from characterisation.files.atomic_io import write_json
 from characterisation.files.errors import InputError
 from mitsim.cli.options import (
     Out,
@@ -22,6 +25,8 @@ from mitsim.cli.options import (
     requested_workers,
     start,
 )
+from mitsim.running.progress import say
+from mitsim.running.time_limit import TimeLimit, ending_in_order, stopped_by_user
 
 if TYPE_CHECKING:
     from characterisation.statements.statement import Statement
@@ -71,12 +76,9 @@ def run(
 
     Example: mitsim run scenes/two_pillars/study.toml -o runs/two_pillars
     """
-    from mitsim.running.time_limit import TimeLimit, ending_in_order, stopped_by_user
-
     limit = TimeLimit(None if minutes is None else 60 * minutes)
     start(variant)
     from mitsim.report.page import write_report
-    from mitsim.running.progress import say
     from mitsim.study import open_study, report_lays, with_plan
     from mitsim.study.remedies.entries import remedies_in_words
     from mitsim.study.run import run_within
@@ -125,17 +127,11 @@ def choose(
 
     Example: mitsim study choose scenes/two_pillars/tolerances.toml --sensors all -o runs/choice
     """
-    from mitsim.running.time_limit import TimeLimit, ending_in_order, stopped_by_user
-
     limit = TimeLimit(60 * minutes)
     start(variant)
-    import json
-    from dataclasses import replace
 
-    from characterisation.files.atomic_io import write_json
     from characterisation.statements.verdict_words import fits_all
     from mitsim.report.choice_page import write_choice_page
-    from mitsim.running.progress import say
     from mitsim.study import report_lays, with_plan
     from mitsim.study.choice_document import CHOICE, judged, read_choice
     from mitsim.study.choose import choose_sensor, read_candidates
@@ -203,11 +199,8 @@ def state(
 
     Example: mitsim study state scenes/two_pillars/study.toml --view 12 -o runs/view_12
     """
-    from mitsim.running.time_limit import TimeLimit, ending_in_order, stopped_by_user
-
     limit = TimeLimit(None if minutes is None else 60 * minutes)
     start(variant)
-    from characterisation.files.atomic_io import write_json
     from mitsim.study import open_study, with_plan
     from mitsim.study.session import Session
     from mitsim.study.statement_document import statement_document
@@ -253,10 +246,7 @@ def exposures(
     Example: mitsim study exposures scenes/two_pillars/study.toml --view 40 -o runs/exposures
     """
     start(variant)
-    import json
 
-    from characterisation.files.atomic_io import write_json
-    from mitsim.running.progress import say
     from mitsim.study import ExposureTable, open_study
     from mitsim.study.exposures.exposure_plan import PlanRules
     from mitsim.study.exposures.planned import (
@@ -298,7 +288,6 @@ def _tell_statement(
     """
     from characterisation.statements.verdict_words import fits_all, result_in_words
     from mitsim.report.set_words import with_sets
-    from mitsim.running.progress import say
     from mitsim.study.statement_file import read_statement
     from mitsim.study.virtual.stated import judged, statement_table
 
@@ -341,7 +330,6 @@ def score(
     """
     start(variant)
     from mitsim.report.best_views import best_views
-    from mitsim.running.progress import say
     from mitsim.study import open_study, report_lays
     from mitsim.study.scoring import score_study
     from mitsim.study.session import Session
@@ -373,7 +361,6 @@ def report(
     from mitsim.report.choice_page import write_choice_page
     from mitsim.report.page import write_report
     from mitsim.report.sheet import write_sheet
-    from mitsim.running.progress import say
     from mitsim.study.choice_document import CHOICE
 
     if pdf:

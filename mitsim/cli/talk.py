@@ -7,7 +7,10 @@ from typing import Annotated
 
 import typer
 
+from characterisation.files.errors import InputError
 from mitsim.cli.options import Out, Processes, Scheduler, Variant, check_folder, requested_workers, start
+from mitsim.running.progress import say
+from mitsim.running.time_limit import TimeLimit, ending_in_order, stopped_by_user
 
 
 def talk(
@@ -36,14 +39,10 @@ def talk(
 
     Example: mitsim study talk scenes/talk/talk.toml -o runs/talk --processes 2
     """
-    from characterisation.files.errors import InputError
-    from mitsim.running.time_limit import TimeLimit, ending_in_order, stopped_by_user
-
     limit = TimeLimit(None if minutes is None else 60 * minutes)
     if kept and fresh:
         raise InputError("--fresh", "", "--kept", "only one of the two")
     start(variant)
-    from mitsim.running.progress import say
     from mitsim.talk.make import make, results_known
     from mitsim.talk.measured import measured_errors
     from mitsim.talk.page import write_talk
