@@ -70,12 +70,7 @@ def make(
     """
     start(variant)
     from characterisation.files.documents import read_toml
-    from mitsim.maps.campaign.acquire import (
-        found_shots,
-        found_source,
-        in_turn,
-        out_of_range,
-    )
+    from mitsim.maps.campaign.acquire import found_shots, found_source, in_turn, out_of_range
     from mitsim.maps.campaign.live import live_source, place_by_place, plan_live
     from mitsim.maps.campaign.plan import CampaignFile, plan_campaign
     from mitsim.maps.campaign.run import measure_captures, run_campaign

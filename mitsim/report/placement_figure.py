@@ -75,10 +75,7 @@ def face_verdicts(measurements: Mapping[str, tuple[Sequence[str], str]]) -> dict
 
 
 def placement_figure(
-    geometry: SceneGeometry,
-    poses: Sequence[tuple[str, ArrayLike]],
-    verdicts: Mapping[str, str],
-    stacked: bool = False,
+    geometry: SceneGeometry, poses: Sequence[tuple[str, ArrayLike]], verdicts: Mapping[str, str], stacked: bool = False
 ) -> Figure:
     """Draw a part with a sensor at each pose and its verdicts, as a figure of its own.
 

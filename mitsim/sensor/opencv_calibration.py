@@ -26,13 +26,7 @@ from mitsim.sensor.calibration_doubts import baseline_note, facing_note, lens_no
 from mitsim.sensor.calibration_eyes import size_of
 from mitsim.sensor.calibration_names import USUAL_NAMES, Names
 from mitsim.sensor.calibration_numbers import by_rows, checked_matrix, numbers_of, rotation_matrix
-from mitsim.sensor.calibration_qualifiers import (
-    lens_model,
-    of_images,
-    read_out_of,
-    rectified_pair,
-    unit_mm,
-)
+from mitsim.sensor.calibration_qualifiers import lens_model, of_images, read_out_of, rectified_pair, unit_mm
 from mitsim.sensor.calibration_tree import CalibrationTree, Found, read_tree
 
 

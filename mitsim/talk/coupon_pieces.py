@@ -145,10 +145,7 @@ def tilts(folder: str, place: CouponPlace, angles: tuple[float, ...]) -> xr.Data
     looks the same at every tilt, and ``metal_along_ray`` is of the coupon.
     """
     prepared = prepared_sensor(sensor_in(folder, place.sensor))
-    plans = {
-        "metal": campaign_of(folder, place),
-        "white": campaign_of(folder, replace(place, roughness=None)),
-    }
+    plans = {"metal": campaign_of(folder, place), "white": campaign_of(folder, replace(place, roughness=None))}
     rows: list[dict[str, float]] = []
     for angle in angles:
         clouds = {name: _taken(prepared, plan, tilted(angle)) for name, plan in plans.items()}
