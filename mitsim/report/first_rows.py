@@ -106,7 +106,7 @@ class RowValues:
     def texts(self) -> ResultRow:
         """Return the row of the table, as texts."""
         limit = self.share_limit
-        size = _size(self.tolerance)
+        size = (self.tolerance[1] - self.tolerance[0]) / 2 if isinstance(self.tolerance, tuple) else self.tolerance
         return ResultRow(
             name=self.name,
             about=self.about,
@@ -175,10 +175,6 @@ def accepted_words(accepted: tuple[float | None, float] | None, unit: str, toler
     low, high = accepted
     text = f"up to {high:.{digits}f}" if low is None else f"{low:.{digits}f} to {high:.{digits}f}"
     return text.replace("-", MINUS) + _suffix(unit)
-
-
-def _size(tolerance: float | tuple[float, float] | None) -> float | None:
-    return (tolerance[1] - tolerance[0]) / 2 if isinstance(tolerance, tuple) else tolerance
 
 
 def _share(share: float) -> str:

@@ -124,7 +124,7 @@ def draw_placement(
     """
     matrices = [np.asarray(pose, float) for _, pose in poses]
     with drawing():
-        middle = _middle(geometry)
+        middle = (geometry.corners.min(axis=(0, 1)) + geometry.corners.max(axis=(0, 1))) / 2
         turn = _viewpoint(matrices[0], middle)
         flat, depth = _projected(geometry.corners - middle, turn)
         whole, near = (figure.add_axes(place) for place in (_STACKED if stacked else _BESIDE))
@@ -141,11 +141,6 @@ def draw_placement(
         for axes in (whole, near):
             _make_room_for_texts(axes)
         _legend(figure, verdicts, geometry.camera, 2 if stacked else None)
-
-
-def _middle(geometry: SceneGeometry) -> Floats:
-    points = geometry.corners.reshape(-1, 3)
-    return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
 
 
 def _viewpoint(part_from_sensor: Floats, middle: Floats) -> Floats:

@@ -157,7 +157,7 @@ def compare_captures(
             "REAL", "specimen", found, f"{LEAST_PATCHES} or more", "use a larger --window, or a nearer view"
         )
     _check_place(real_patches, simulated_patches, where)
-    reasons, inapplicable = _reasons_not_comparable(real, simulated, projector_on), _inapplicable(real, geometry)
+    reasons, inapplicable = _reasons_not_comparable(simulated, projector_on), _inapplicable(real, geometry)
     rows = [_histogram_row(real_patches, simulated_patches, reasons, seed)]
     for number, quantity in enumerate(QUANTITIES):
         if quantity.name in inapplicable:
@@ -206,7 +206,7 @@ def _check_place(real_patches: SpecimenPatches, simulated_patches: SpecimenPatch
         )
 
 
-def _reasons_not_comparable(real: Capture, simulated: Capture, projector_on: bool) -> dict[str, str]:
+def _reasons_not_comparable(simulated: Capture, projector_on: bool) -> dict[str, str]:
     """Return the reasons why quantities cannot be compared, by name."""
     taken: dict[str, str] = simulated.settings.get("rebuilt", {}).get("taken", {})
     if projector_on == (simulated.settings.get("projector_on") is not False):
