@@ -23,12 +23,11 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike, NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.plots.labels import label_columns
 from characterisation.plots.part_pictures import EDGE_SHADE, innermost_pixel, viewer_frame
 from characterisation.plots.style import INK, MUTED, PAPER, drawing
 from mitsim.study.scene_geometry import SceneGeometry
-
-Floats = NDArray[np.float64]
 
 #: colour of faces by verdict (Okabe and Ito, safe for colour-blind readers), worst last; faces without measurements are
 #: grey

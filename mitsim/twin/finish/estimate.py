@@ -26,9 +26,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares, nnls
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from mitsim.twin.finish.finish import LOG_ALPHA_RANGE, MetalFinish
-from mitsim.twin.finish.observation import CouponView, Floats
+from mitsim.twin.finish.observation import CouponView
 from mitsim.twin.finish.problem import FIRST_GRAIN, Problem, Residual
 
 #: number of alphas in the scan

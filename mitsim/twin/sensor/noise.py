@@ -36,8 +36,6 @@ from mitsim.twin.sensor.photon_transfer import (
 )
 from mitsim.twin.sensor.response import first_knee, quiet_pixels
 
-Floats = NDArray[np.float64]
-
 #: largest number of pixels used in a group
 _PIXELS = 200_000
 
