@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from characterisation.files.errors import InputError, nearest
-from mitsim.cli.options import Seed, check_file, definitions
+from mitsim.cli import options
 from mitsim.running.progress import say
 
 
@@ -49,7 +49,7 @@ def rig(
             help="Also simulate this many calibrations, and count those inside the stated 95 % intervals.",
         ),
     ] = 0,
-    seed: Seed = 1,
+    seed: options.Seed = 1,
 ) -> None:
     """Calibrate virtually, or from recorded corners, and write the covariance that statements of uncertainty draw.
 
@@ -81,14 +81,14 @@ def rig(
 
     known = list(Drift().numbers())
     terms = {}
-    for name, value in definitions(drift, "--drift", "NAME=VALUE").items():
+    for name, value in options.definitions(drift, "--drift", "NAME=VALUE").items():
         if name not in known:
             raise InputError("--drift", "", repr(name), ", ".join(known), nearest(name, known))
         try:
             terms[name] = float(value)
         except ValueError:
             raise InputError("--drift", name, repr(value), "a number, 0 or more") from None
-    check_file(output)
+    options.check_file(output)
     chosen = load_sensor(sensor)
     since = replace(sensor_drift(chosen), **terms)
     say(f"calibrating {chosen.name}: noise of corners, adjustment, accuracy")
@@ -196,8 +196,8 @@ def _recorded(path: Path, output: Path, board: str | None) -> None:
     if output.suffix.lower() in (".yml", ".yaml"):
         raise InputError("--output", "", str(output), "a .toml file; the calibration is written beside it as .yml")
     known = parse_board(board)
-    check_file(output)
-    check_file(output.with_suffix(".yml"))
+    options.check_file(output)
+    options.check_file(output.with_suffix(".yml"))
     corners = read_corners(path, known)
     for line in corners.left_out:
         say(f"left out: {line}")

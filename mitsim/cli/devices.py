@@ -9,14 +9,14 @@ from typing import Annotated, Any
 import typer
 
 from characterisation.files.errors import InputError
-from mitsim.cli.options import Out, check_folder
+from mitsim.cli import options
 from mitsim.running.progress import say, track
 
 _KINDS = "ensenso:SERIAL, depthai or depthai:ID"
 
 
 def capture(
-    output: Out,
+    output: options.Out,
     device: Annotated[str, typer.Option(help=f"Camera: {_KINDS}.")],
     settings: Annotated[
         Path | None,
@@ -32,7 +32,7 @@ def capture(
     from mitsim.capture.folder import write_capture
 
     table = device_table(device, settings)
-    check_folder(output)
+    options.check_folder(output)
     taken_before = (int(path.name) for path in output.glob("[0-9][0-9][0-9][0-9]*") if path.name.isdigit())
     first = max(taken_before, default=-1) + 1
     with open_device(table) as camera:

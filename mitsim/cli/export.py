@@ -9,7 +9,7 @@ import typer
 
 from characterisation.files.atomic_io import write_text
 from characterisation.files.errors import InputError
-from mitsim.cli.options import MapFile, Variant, ViewOfPoses, check_file, check_folder, start
+from mitsim.cli import options
 from mitsim.running.numbers import how_many
 from mitsim.running.progress import say
 
@@ -32,7 +32,7 @@ def cloud(
     pose: Annotated[
         Path | None, typer.Option(help="Pose of the sensor: pose.json, statement.json, or poses.json with --view.")
     ] = None,
-    view: ViewOfPoses = None,
+    view: options.ViewOfPoses = None,
     frame: Annotated[
         str, typer.Option("--in", help="Frame of the points in PLY and PCD: sensor, or part (needs --pose).")
     ] = "sensor",
@@ -57,7 +57,7 @@ def cloud(
     if frame == "part" and known is None:
         raise InputError("--in", "", "part, without --pose", "a JSON file with the sensor's pose", "give --pose FILE")
     read = read_cloud(cloud)
-    check_file(output)
+    options.check_file(output)
     if suffix == ".e57":
         write_e57([(cloud.stem, cloud_points(read), known)], output)
     elif suffix == ".mcap":
@@ -98,7 +98,7 @@ def run(
     scans = [(view, kind, cloud_points(one)) for view in scene.views for kind, one in view.clouds.items()]
     if suffix in (".mcap", ".e57") and not scans:
         raise InputError("--views", "", f"{views}: none of these views has a cloud", "views with clouds", "see clouds/")
-    check_file(output)
+    options.check_file(output)
     if suffix == ".glb":
         write_glb(scene, output)
     elif suffix == ".rrd":
@@ -144,7 +144,7 @@ def results(
     suffix = _suffix(output, RESULT_SUFFIXES)
     folder = _run_in(folder)
     found = read_results(folder, task)
-    check_file(output)
+    options.check_file(output)
     if suffix == ".xml":
         issuer = Issuer(laboratory, country, responsible, customer, serial)
         write_dcc(found, read_declaration(folder, None), issuer, output)
@@ -180,14 +180,14 @@ def targets(
         allowed = f"a name that ends in {target_format.suffix}: {target_format.what}"
         raise InputError("--output", "", output.name, allowed)
     found, tool = read_targets(_run_in(folder), views)
-    check_file(output)
+    options.check_file(output)
     write_text(output, target_format.write(found, tool))
     hint = "" if tool == "flange" else "; make the tool frame the sensor frame, or give [views.flange_from_sensor]"
     say(f"targets: {output}: {how_many(len(found), 'pose')} of the {tool} in the part frame{hint}")
 
 
 def map_(
-    map_file: MapFile,
+    map_file: options.MapFile,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
     sensor: Annotated[
         str,
@@ -213,7 +213,7 @@ def map_(
     chosen = load_sensor(sensor or name)
     if chosen.name != name:
         raise InputError("--sensor", "", chosen.name, f"{name}, the sensor of the map")
-    check_folder(output.absolute().parent, locked=False)
+    options.check_folder(output.absolute().parent, locked=False)
     write_map_kernel(loaded, output, chosen.measuring_rig.baseline_direction)
     say(f"kernel: {output / 'sensor_map.py'}, {output / 'map.npz'}: {len(loaded.samples)} surfaces of {name}")
 
@@ -230,7 +230,7 @@ def bop(
             "are one object.",
         ),
     ] = None,
-    variant: Variant = None,
+    variant: options.Variant = None,
 ) -> None:
     """Write many captures as a BOP data set: images, depth, reasons of missing pixels, masks, poses.
 
@@ -238,7 +238,7 @@ def bop(
     """
     if split not in ("train", "val", "test"):
         raise InputError("--split", "", repr(split), "train, val or test")
-    start(variant)
+    options.start(variant)
     from mitsim.report.export.bop import find_sources, write_bop
 
     count = write_bop(find_sources(folder), output, split, objects or ())

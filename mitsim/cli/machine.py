@@ -6,10 +6,10 @@ from dataclasses import asdict
 
 import typer
 
-from mitsim.cli.options import Json
+from mitsim.cli import options
 
 
-def doctor(json: Json = False) -> None:
+def doctor(json: options.Json = False) -> None:
     """Check this machine: list what is present, what is missing, and how to fix it.
 
     Exit code 3 if something that mitsim needs is missing.
