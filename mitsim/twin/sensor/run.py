@@ -74,6 +74,7 @@ def fit_sensor(
     dark: Sequence[Path] = (),
     roi: Roi | None = None,
     seed: int = 1,
+    draws: int = 3,
 ) -> SensorFit:
     """Fit a sensor file to captures of a flat object.
 
@@ -89,6 +90,8 @@ def fit_sensor(
         Region of the first camera's image that shows the specimen, in all of them; all that is flat if left out.
     seed
         Selects the noise of the simulations.
+    draws
+        Number of simulations to average.
 
     Raises
     ------
@@ -112,7 +115,7 @@ def fit_sensor(
     base = replace(base, imager=imager.imager)
     room = fit_room(off_captures, base, places) if off_captures and on_captures else None
     estimates += room.estimates if room is not None else []
-    dots = _dots(on_captures, base, places, imager, room, DotDraws(seed=seed))
+    dots = _dots(on_captures, base, places, imager, room, DotDraws(draws, seed))
     shared, undetermined = _combined_estimates(dots, base, imager, room)
     estimates += shared
     if isinstance(base.pattern, LightCode):
