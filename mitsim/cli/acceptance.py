@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from characterisation.files.errors import InputError
-from mitsim.cli.options import Clouds, DecodedAs, Frame, Json, Seed, Simulated, Topic, Unit, Variant, check_unit, start
+from mitsim.cli import options
+from mitsim.running.progress import say
 
 if TYPE_CHECKING:
     from characterisation.point_cloud import PointCloud
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def acceptance(
-    clouds: Clouds,
+    clouds: options.Clouds,
     plane: Annotated[
         list[str] | None,
         typer.Option(
@@ -40,14 +41,14 @@ def acceptance(
     baseline: Annotated[
         float | None, typer.Option(min=1.0, max=10000.0, help="Baseline of a stereo camera [mm]: adds sub-pixel RMS.")
     ] = None,
-    simulated: Simulated = None,
-    topic: Topic = None,
-    frame: Frame = None,
-    unit: Unit = None,
-    as_json: Json = False,
-    sensor: DecodedAs = None,
-    seed: Seed = 1,
-    variant: Variant = None,
+    simulated: options.Simulated = None,
+    topic: options.Topic = None,
+    frame: options.Frame = None,
+    unit: options.Unit = None,
+    as_json: options.Json = False,
+    sensor: options.DecodedAs = None,
+    seed: options.Seed = 1,
+    variant: options.Variant = None,
 ) -> None:
     """Compute acceptance figures of VDI/VDE 2634-2 and of makers' data sheets from clouds of planes and spheres.
 
@@ -68,9 +69,8 @@ def acceptance(
         result_values,
         summary,
     )
-    from mitsim.running.progress import say
 
-    check_unit(unit)
+    options.check_unit(unit)
     artefacts = read_artefacts(plane or [], sphere or [], spacing or [])
     if not (artefacts.planes or artefacts.spheres):
         command = "mitsim measure acceptance"
@@ -83,7 +83,7 @@ def acceptance(
     over = repeatability(results) if several else []
     beside: tuple[list[Result], list[Result]] | None = None
     if simulated is not None:
-        start(variant)
+        options.start(variant)
 
         def figures(cloud: PointCloud, name: str, window: Roi | None) -> list[Result]:
             if name in artefacts.planes:

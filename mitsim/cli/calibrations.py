@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from characterisation.files.errors import InputError, nearest
-from mitsim.cli.options import Seed, check_file, definitions
+from mitsim.cli import options
+from mitsim.running.progress import say
 
 
 def rig(
@@ -47,7 +49,7 @@ def rig(
             help="Also simulate this many calibrations, and count those inside the stated 95 % intervals.",
         ),
     ] = 0,
-    seed: Seed = 1,
+    seed: options.Seed = 1,
 ) -> None:
     """Calibrate virtually, or from recorded corners, and write the covariance that statements of uncertainty draw.
 
@@ -66,11 +68,9 @@ def rig(
     if _is_recorded(sensor):
         _recorded(Path(sensor), output, board)
         return
-    from dataclasses import replace
 
     import numpy as np
 
-    from mitsim.running.progress import say
     from mitsim.sensor.drift import Drift
     from mitsim.sensor.preset import load_sensor
     from mitsim.sensor.rig_covariance import write_rig_covariance
@@ -81,14 +81,14 @@ def rig(
 
     known = list(Drift().numbers())
     terms = {}
-    for name, value in definitions(drift, "--drift", "NAME=VALUE").items():
+    for name, value in options.definitions(drift, "--drift", "NAME=VALUE").items():
         if name not in known:
             raise InputError("--drift", "", repr(name), ", ".join(known), nearest(name, known))
         try:
             terms[name] = float(value)
         except ValueError:
             raise InputError("--drift", name, repr(value), "a number, 0 or more") from None
-    check_file(output)
+    options.check_file(output)
     chosen = load_sensor(sensor)
     since = replace(sensor_drift(chosen), **terms)
     say(f"calibrating {chosen.name}: noise of corners, adjustment, accuracy")
@@ -139,7 +139,6 @@ def verify(
     from mitsim.decoding.checks.checked_cloud import checked_cloud
     from mitsim.decoding.cloud import decoder_settings
     from mitsim.decoding.plate import Plate
-    from mitsim.running.progress import say
     from mitsim.study.calibration import verification
     from mitsim.study.calibration.board import parse_board
     from mitsim.study.virtual.study_unknowns import calibration_covariance
@@ -187,7 +186,6 @@ def _is_recorded(given: str) -> bool:
 
 def _recorded(path: Path, output: Path, board: str | None) -> None:
     """Calibrate from recorded corners; print the result, and write it with its covariance."""
-    from mitsim.running.progress import say
     from mitsim.study.calibration.board import parse_board
     from mitsim.study.calibration.corner_files import read_corners
     from mitsim.study.calibration.halves import calibrate_checked
@@ -198,8 +196,8 @@ def _recorded(path: Path, output: Path, board: str | None) -> None:
     if output.suffix.lower() in (".yml", ".yaml"):
         raise InputError("--output", "", str(output), "a .toml file; the calibration is written beside it as .yml")
     known = parse_board(board)
-    check_file(output)
-    check_file(output.with_suffix(".yml"))
+    options.check_file(output)
+    options.check_file(output.with_suffix(".yml"))
     corners = read_corners(path, known)
     for line in corners.left_out:
         say(f"left out: {line}")

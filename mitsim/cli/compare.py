@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 
 from characterisation.files.errors import InputError
-from mitsim.cli.options import ObjectWindow, Out, Seed, Variant, check_folder, start
+from mitsim.cli import options
+from mitsim.running.progress import say
 
 
 def compare(
@@ -19,7 +20,7 @@ def compare(
             help="Real capture of a flat object: a capture folder, or a recording that mitsim import accepts."
         ),
     ],
-    output: Out,
+    output: options.Out,
     simulated: Annotated[
         Path | None,
         typer.Argument(help="Simulated capture of the same object; default: simulated from REAL and --sensor."),
@@ -27,7 +28,7 @@ def compare(
     sensor: Annotated[
         str | None, typer.Option(help="Sensor to simulate, a preset or TOML file; default: the one that REAL names.")
     ] = None,
-    window: ObjectWindow = None,
+    window: options.ObjectWindow = None,
     projector: Annotated[
         str | None,
         typer.Option(
@@ -38,8 +39,8 @@ def compare(
         int | None, typer.Option(min=0, help="For a recording: number of the view or image set, from 0.")
     ] = None,
     calibration: Annotated[Path | None, typer.Option(help="For a recording: calibration file of its cameras.")] = None,
-    seed: Seed = 1,
-    variant: Variant = None,
+    seed: options.Seed = 1,
+    variant: options.Variant = None,
 ) -> None:
     """Compare a simulated capture with a real one, quantity by quantity; exit code 1 if some differ.
 
@@ -48,15 +49,14 @@ def compare(
 
     Example: mitsim compare captures/sheet --sensor ensenso-n35 -o runs/sheet_against_simulated
     """
-    start(variant)
+    options.start(variant)
     from characterisation.region_of_interest import Roi
     from mitsim.report.capture_page import write_capture_page
-    from mitsim.running.progress import say
     from mitsim.twin.compare.captures_run import validate_captures
 
     if projector not in (None, "on", "off"):
         raise InputError("--projector", "", repr(projector), "on or off")
-    check_folder(output)
+    options.check_folder(output)
     if not real.is_dir() or not (real / "capture.json").exists():
         real = _imported(real, output / "recorded", frame, calibration)
     elif frame is not None or calibration is not None:
@@ -76,10 +76,9 @@ def _imported(recording: Path, folder: Path, frame: int | None, calibration: Pat
     """Import a recording into a capture folder."""
     from mitsim.capture.folder import write_capture
     from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
-    from mitsim.running.progress import say
 
-    options = ReadOptions(frame=frame, calibration=None if calibration is None else str(calibration))
-    imported = read_recording(recording, options)
+    reading = ReadOptions(frame=frame, calibration=None if calibration is None else str(calibration))
+    imported = read_recording(recording, reading)
     write_capture(imported.capture, folder, overwrite=True, vendor=imported.originals)
     say(f"{recording}: {imported.kind}, imported to {folder}")
     return folder

@@ -8,12 +8,13 @@ from typing import Annotated
 
 import typer
 
-from mitsim.cli.options import OutCloud, check_cloud_file, print_reasons
+from mitsim.cli import options
+from mitsim.running.progress import say
 
 
 def decode(
     capture: Annotated[Path, typer.Argument(help="Capture folder.")],
-    output: OutCloud,
+    output: options.OutCloud,
     sensor: Annotated[
         str | None,
         typer.Option(
@@ -50,10 +51,9 @@ def decode(
     from mitsim.capture.workspace import written_frame
     from mitsim.decoding.checks.checked_cloud import checked_cloud
     from mitsim.decoding.cloud import decoder_settings, settings_in_words, with_options
-    from mitsim.running.progress import say
 
     read = read_capture(capture)
-    check_cloud_file(output)
+    options.check_cloud_file(output)
     written = written_frame(read, points_in, capture)
     settings, imager = decoder_settings(read, sensor, depth_range)
     settings = with_options(settings, block, contrast)
@@ -64,7 +64,7 @@ def decode(
     for note in decoded.notes:
         say(note)
     write_cloud(decoded.cloud, output, written)
-    print_reasons(decoded.cloud)
+    options.print_reasons(decoded.cloud)
     if not decoded.cloud.valid.any():
         say(f"no pixel has a point, for the reasons above; {output} is empty")
         raise typer.Exit(1)

@@ -9,13 +9,14 @@ from typing import Annotated, Any
 import typer
 
 from characterisation.files.errors import InputError
-from mitsim.cli.options import Out, check_folder
+from mitsim.cli import options
+from mitsim.running.progress import say, track
 
 _KINDS = "ensenso:SERIAL, depthai or depthai:ID"
 
 
 def capture(
-    output: Out,
+    output: options.Out,
     device: Annotated[str, typer.Option(help=f"Camera: {_KINDS}.")],
     settings: Annotated[
         Path | None,
@@ -29,11 +30,11 @@ def capture(
     """
     from mitsim.capture.devices.maker_captures import open_device
     from mitsim.capture.folder import write_capture
-    from mitsim.running.progress import say, track
 
     table = device_table(device, settings)
-    check_folder(output)
-    first = _next_number(output)
+    options.check_folder(output)
+    taken_before = (int(path.name) for path in output.glob("[0-9][0-9][0-9][0-9]*") if path.name.isdigit())
+    first = max(taken_before, default=-1) + 1
     with open_device(table) as camera:
         for number in track(range(first, first + repeats), "capture", repeats):
             taken = camera.take()
@@ -79,8 +80,3 @@ def mount(sample: str, distance: float) -> None:
         raise InputError("campaign", "samples", found, allowed, "run the command in a terminal")
     asked = f"{sample} at {distance:g} mm: is the coupon mounted, the stage in place, and its path free?"
     typer.confirm(asked, abort=True, err=True)
-
-
-def _next_number(folder: Path) -> int:
-    """Return the number after that of the last existing capture."""
-    return max((int(path.name) for path in folder.glob("[0-9][0-9][0-9][0-9]*") if path.name.isdigit()), default=-1) + 1

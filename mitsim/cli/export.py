@@ -7,8 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from characterisation.files.atomic_io import write_text
 from characterisation.files.errors import InputError
-from mitsim.cli.options import Group, MapFile, Variant, ViewOfPoses, check_file, check_folder, start
+from mitsim.cli import options
+from mitsim.running.numbers import how_many
+from mitsim.running.progress import say
 
 if TYPE_CHECKING:
     from characterisation.point_cloud import PointCloud
@@ -18,26 +21,18 @@ CLOUD_SUFFIXES = (".ply", ".pcd", ".e57", ".mcap")
 RUN_SUFFIXES = (".glb", ".usda", ".usdc", ".usdz", ".rrd", ".mcap", ".e57")
 RESULT_SUFFIXES = (".qif", ".xml", ".csv", ".json")
 
-app = typer.Typer(
-    cls=Group,
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    help="Write clouds, runs, results and maps in the formats of other programs.",
-)
-
 Views = Annotated[
     str, typer.Option(help="best (views that are best for a measurement, or have a cloud), all, or numbers: 3,12.")
 ]
 
 
-@app.command()
 def cloud(
     cloud: Annotated[Path, typer.Argument(help="PLY file that mitsim wrote.")],
     output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(CLOUD_SUFFIXES)}.")],
     pose: Annotated[
         Path | None, typer.Option(help="Pose of the sensor: pose.json, statement.json, or poses.json with --view.")
     ] = None,
-    view: ViewOfPoses = None,
+    view: options.ViewOfPoses = None,
     frame: Annotated[
         str, typer.Option("--in", help="Frame of the points in PLY and PCD: sensor, or part (needs --pose).")
     ] = "sensor",
@@ -52,7 +47,6 @@ def cloud(
     from mitsim.report.export.cloud_writers import write_cloud_pcd, write_cloud_ply
     from mitsim.report.export.e57 import write_e57
     from mitsim.report.export.ros_bag import Stamped, write_mcap
-    from mitsim.running.progress import say
     from mitsim.study.task_measurement import read_pose
 
     suffix = _suffix(output, CLOUD_SUFFIXES)
@@ -63,7 +57,7 @@ def cloud(
     if frame == "part" and known is None:
         raise InputError("--in", "", "part, without --pose", "a JSON file with the sensor's pose", "give --pose FILE")
     read = read_cloud(cloud)
-    check_file(output)
+    options.check_file(output)
     if suffix == ".e57":
         write_e57([(cloud.stem, cloud_points(read), known)], output)
     elif suffix == ".mcap":
@@ -78,7 +72,6 @@ def cloud(
     say(f"cloud: {output}: {_counted(read)}")
 
 
-@app.command()
 def run(
     folder: Annotated[Path, typer.Argument(help="Folder of mitsim run, or of mitsim study choose (best sensor).")],
     output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(RUN_SUFFIXES)}.")],
@@ -98,8 +91,6 @@ def run(
     from mitsim.report.export.ros_bag import Stamped, write_mcap
     from mitsim.report.export.run_scene import read_run_scene
     from mitsim.report.export.usd import write_usd
-    from mitsim.running.numbers import how_many
-    from mitsim.running.progress import say
 
     suffix = _suffix(output, RUN_SUFFIXES)
     folder = _run_in(folder)
@@ -107,7 +98,7 @@ def run(
     scans = [(view, kind, cloud_points(one)) for view in scene.views for kind, one in view.clouds.items()]
     if suffix in (".mcap", ".e57") and not scans:
         raise InputError("--views", "", f"{views}: none of these views has a cloud", "views with clouds", "see clouds/")
-    check_file(output)
+    options.check_file(output)
     if suffix == ".glb":
         write_glb(scene, output)
     elif suffix == ".rrd":
@@ -127,7 +118,6 @@ def run(
     say(f"run: {output}: {', '.join(written)}")
 
 
-@app.command()
 def results(
     folder: Annotated[Path, typer.Argument(help="Folder of mitsim run, or of mitsim study choose (best sensor).")],
     output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(RESULT_SUFFIXES)}.")],
@@ -150,13 +140,11 @@ def results(
     from mitsim.report.export.dcc import Issuer, write_dcc
     from mitsim.report.export.qif import write_qif
     from mitsim.report.export.results import read_results, write_results_csv, write_results_json
-    from mitsim.running.numbers import how_many
-    from mitsim.running.progress import say
 
     suffix = _suffix(output, RESULT_SUFFIXES)
     folder = _run_in(folder)
     found = read_results(folder, task)
-    check_file(output)
+    options.check_file(output)
     if suffix == ".xml":
         issuer = Issuer(laboratory, country, responsible, customer, serial)
         write_dcc(found, read_declaration(folder, None), issuer, output)
@@ -167,7 +155,6 @@ def results(
     say(f"results: {output}: {how_many(len(found.results), 'measurement')}, planned from view {views}")
 
 
-@app.command()
 def targets(
     folder: Annotated[Path, typer.Argument(help="Folder of mitsim run, study score or study choose (best sensor).")],
     output: Annotated[Path, typer.Option("--output", "-o", help="File to write.")],
@@ -184,10 +171,7 @@ def targets(
 
     Example: mitsim export targets runs/two_pillars --robot kuka -o views.dat
     """
-    from characterisation.files.atomic_io import write_text
     from mitsim.report.export.robot_targets import ROBOT_FORMATS, read_targets
-    from mitsim.running.numbers import how_many
-    from mitsim.running.progress import say
 
     if robot not in ROBOT_FORMATS:
         raise InputError("--robot", "", repr(robot), ", ".join(ROBOT_FORMATS))
@@ -196,15 +180,14 @@ def targets(
         allowed = f"a name that ends in {target_format.suffix}: {target_format.what}"
         raise InputError("--output", "", output.name, allowed)
     found, tool = read_targets(_run_in(folder), views)
-    check_file(output)
+    options.check_file(output)
     write_text(output, target_format.write(found, tool))
     hint = "" if tool == "flange" else "; make the tool frame the sensor frame, or give [views.flange_from_sensor]"
     say(f"targets: {output}: {how_many(len(found), 'pose')} of the {tool} in the part frame{hint}")
 
 
-@app.command("map")
 def map_(
-    map_file: MapFile,
+    map_file: options.MapFile,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
     sensor: Annotated[
         str,
@@ -221,7 +204,6 @@ def map_(
     from characterisation.maps.performance_map import PerformanceMap
     from characterisation.maps.shipped import map_path
     from mitsim.report.export.map_export import write_map_kernel
-    from mitsim.running.progress import say
     from mitsim.sensor.preset import load_sensor, presets
 
     loaded = PerformanceMap.load(map_path(map_file))
@@ -231,12 +213,11 @@ def map_(
     chosen = load_sensor(sensor or name)
     if chosen.name != name:
         raise InputError("--sensor", "", chosen.name, f"{name}, the sensor of the map")
-    check_folder(output.absolute().parent, locked=False)
+    options.check_folder(output.absolute().parent, locked=False)
     write_map_kernel(loaded, output, chosen.measuring_rig.baseline_direction)
     say(f"kernel: {output / 'sensor_map.py'}, {output / 'map.npz'}: {len(loaded.samples)} surfaces of {name}")
 
 
-@app.command()
 def bop(
     folder: Annotated[Path, typer.Argument(help="Folder of mitsim render --many.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write; it must not exist.")],
@@ -249,7 +230,7 @@ def bop(
             "are one object.",
         ),
     ] = None,
-    variant: Variant = None,
+    variant: options.Variant = None,
 ) -> None:
     """Write many captures as a BOP data set: images, depth, reasons of missing pixels, masks, poses.
 
@@ -257,9 +238,8 @@ def bop(
     """
     if split not in ("train", "val", "test"):
         raise InputError("--split", "", repr(split), "train, val or test")
-    start(variant)
+    options.start(variant)
     from mitsim.report.export.bop import find_sources, write_bop
-    from mitsim.running.progress import say
 
     count = write_bop(find_sources(folder), output, split, objects or ())
     say(f"data set: {output}: {count} images")
@@ -267,7 +247,6 @@ def bop(
 
 def _run_in(folder: Path) -> Path:
     """Return the folder to read: of a comparison of sensors, that of the best one."""
-    from mitsim.running.progress import say
     from mitsim.study.choice_document import winner_folder
 
     found = winner_folder(folder)

@@ -10,7 +10,10 @@ from typing import Annotated
 
 import typer
 
-from mitsim.cli.options import Defines, ObjectWindow, Seed, Variant, Yes, asking, check_file, definitions, start
+from characterisation.files.atomic_io import write_json
+from characterisation.files.errors import InputError
+from mitsim.cli import options
+from mitsim.running.progress import say
 
 
 def finish(
@@ -45,8 +48,8 @@ def finish(
             "the plane with most points.",
         ),
     ] = None,
-    define: Defines = None,
-    variant: Variant = None,
+    define: options.Defines = None,
+    variant: options.Variant = None,
 ) -> None:
     """Estimate the width alpha of a coupon's specular lobe, its equivalent Ra, and the projector's power.
 
@@ -54,18 +57,16 @@ def finish(
 
     Example: mitsim fit finish captures/coupon_* --scene scenes/coupon/coupon.xml -o fit.json --figure fit.png
     """
-    start(variant)
-    from characterisation.files.atomic_io import write_json
+    options.start(variant)
     from characterisation.region_of_interest import Roi
     from mitsim.report.finish_figure import fit_figure, fit_table, remarks
     from mitsim.report.style import write_png
-    from mitsim.running.progress import say
     from mitsim.twin.finish.run import fit_captures
 
     for file in (output, figure):
         if file is not None:
-            check_file(file)
-    found = fit_captures(captures, sensor, scene, definitions(define), block, Roi(*window) if window else None)
+            options.check_file(file)
+    found = fit_captures(captures, sensor, scene, options.definitions(define), block, Roi(*window) if window else None)
     print(fit_table(found), end="")
     if found.posterior is not None:
         print(f"\n# for a study whose part has this finish and the Ra of this scene\n{found.posterior.toml()}", end="")
@@ -90,7 +91,7 @@ def sensor_(
     output: Annotated[Path, typer.Option("--output", "-o", help="Sensor TOML file to write.")] = Path("my-camera.toml"),
     off: Annotated[list[Path] | None, typer.Option(help="Capture with the projector off; once for each.")] = None,
     dark: Annotated[list[Path] | None, typer.Option(help="Capture with all light off; once for each.")] = None,
-    window: ObjectWindow = None,
+    window: options.ObjectWindow = None,
     study: Annotated[
         Path | None,
         typer.Option(
@@ -103,9 +104,9 @@ def sensor_(
     minutes: Annotated[
         float | None, typer.Option(min=0.1, help="With --study: time limit for comparing views [min].")
     ] = None,
-    yes: Yes = False,
-    seed: Seed = 1,
-    variant: Variant = None,
+    yes: options.Yes = False,
+    seed: options.Seed = 1,
+    variant: options.Variant = None,
 ) -> None:
     """Fit a sensor file to captures of a flat object by your own camera in your own room.
 
@@ -115,11 +116,9 @@ def sensor_(
 
     Example: mitsim fit sensor captures/sheet_* --off captures/no_projector --sensor ensenso-n10 -o my-camera.toml
     """
-    start(variant)
-    from characterisation.files.errors import InputError
+    options.start(variant)
     from characterisation.region_of_interest import Roi
     from mitsim.cli.fit_journey import map_and_run, read_journey
-    from mitsim.running.progress import say
     from mitsim.twin.sensor.run import fit_sensor
     from mitsim.twin.sensor.write import fit_table, write_sensor
 
@@ -127,10 +126,10 @@ def sensor_(
         raise InputError("--sensor", "", "none", "the preset of this type of sensor, or a sensor TOML file")
     if output.suffix != ".toml":
         raise InputError("--output", "", str(output), "a .toml file")
-    check_file(output)
+    options.check_file(output)
     if study is None and (campaign is not None or minutes is not None):
         raise InputError("--campaign" if campaign is not None else "--minutes", "", "no --study", "--study study.toml")
-    journey = None if study is None else read_journey(study, campaign, output, minutes, asking(yes))
+    journey = None if study is None else read_journey(study, campaign, output, minutes, options.asking(yes))
     if journey is not None:
         say("step 1 of 3: the fit; its first message of every capture states the time of a round")
     roi = Roi(*window) if window else None

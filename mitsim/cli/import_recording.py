@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from characterisation.files.errors import InputError
+from mitsim.cli import options
 from mitsim.cli.folder_lock import remove_partial_beside
-from mitsim.cli.options import Topic, definitions
+from mitsim.running.progress import say
 
 if TYPE_CHECKING:
     from mitsim.capture.capture import Capture
@@ -70,7 +71,7 @@ def import_(
     frame: Annotated[
         str | None, typer.Option(help="Image set, pair or frame to import: its number, from 0, or its name.")
     ] = None,
-    topic: Topic = None,
+    topic: options.Topic = None,
     images: Annotated[
         list[str] | None,
         typer.Option(help="For a folder of images: files of one camera, NAME=PATTERN (left='cam0_*.png'). Repeatable."),
@@ -139,11 +140,10 @@ def import_(
     from mitsim.capture.recordings.recognise import NAMES
     from mitsim.capture.recordings.recording_files import plain_name
     from mitsim.decoding.checks.sanity import with_warnings
-    from mitsim.running.progress import say
 
     named = {one.name: given[one.name] for one in fields(ReadOptions)}
-    options = ReadOptions(**named | {"topic": tuple(topic) if topic else None, "images": _patterns(images)})
-    imported = read_recording(path, options, kind)
+    reading = ReadOptions(**named | {"topic": tuple(topic) if topic else None, "images": _patterns(images)})
+    imported = read_recording(path, reading, kind)
     capture = with_warnings(imported.capture)
     if coupon is not None:
         if pose is not None:
@@ -183,7 +183,7 @@ def _posed(capture: Capture, window: tuple[int, int, int, int], where: str) -> C
 def _patterns(images: list[str] | None) -> dict[str, str] | None:
     """Return the patterns of --images by camera."""
     allowed = "NAME=PATTERN, as left='cam0_*.png'"
-    patterns = definitions(images, "--images", allowed)
+    patterns = options.definitions(images, "--images", allowed)
     if empty := [name for name, pattern in patterns.items() if not pattern]:
         raise InputError("--images", "", repr(f"{empty[0]}="), allowed)
     return patterns or None

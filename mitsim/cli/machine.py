@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import typer
 
-from mitsim.cli.options import Json
+from mitsim.cli import options
 
 
-def doctor(json: Json = False) -> None:
+def doctor(json: options.Json = False) -> None:
     """Check this machine: list what is present, what is missing, and how to fix it.
 
     Exit code 3 if something that mitsim needs is missing.
@@ -15,7 +17,6 @@ def doctor(json: Json = False) -> None:
     Example: mitsim doctor
     """
     import json as json_module
-    from dataclasses import asdict
 
     from mitsim.cli.doctor import examine
 

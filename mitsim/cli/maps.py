@@ -2,39 +2,17 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
+from characterisation.files.atomic_io import write_json
 from characterisation.files.errors import InputError
+from mitsim.cli import options
 from mitsim.cli.devices import mount
-from mitsim.cli.options import (
-    Defines,
-    MapFile,
-    Out,
-    OutCloud,
-    Position,
-    Processes,
-    Roll,
-    Scene,
-    Scheduler,
-    Seed,
-    SensorOption,
-    Target,
-    Variant,
-    Yes,
-    asking,
-    check_cloud_file,
-    check_file,
-    check_folder,
-    check_no_workers,
-    definitions,
-    pose_of,
-    print_reasons,
-    requested_workers,
-    start,
-)
+from mitsim.running.progress import say, track
 
 #: what workers are allowed with, and why
 _ONE_AT_A_TIME = ("not with a [device]", "a device takes one capture at a time")
@@ -42,18 +20,18 @@ _ONE_AT_A_TIME = ("not with a [device]", "a device takes one capture at a time")
 
 def make(
     campaign: Annotated[Path, typer.Argument(help="Campaign TOML file.")],
-    output: Out,
-    sensor: SensorOption = "ensenso-n10",
+    output: options.Out,
+    sensor: options.SensorOption = "ensenso-n10",
     captures: Annotated[
         Path | None, typer.Option(help="Use the captures of coupons in this folder; do not take new ones.")
     ] = None,
-    scheduler: Scheduler = None,
-    processes: Processes = 1,
+    scheduler: options.Scheduler = None,
+    processes: options.Processes = 1,
     compact: Annotated[
         Path | None,
         typer.Option(help="Also write the map to this file, rounded and compressed: about 0.1 MB per sample."),
     ] = None,
-    variant: Variant = None,
+    variant: options.Variant = None,
 ) -> None:
     """Capture coupons at many orientations, as a campaign file says, and make the performance map of a sensor.
 
@@ -65,21 +43,15 @@ def make(
 
     Example: mitsim map make scenes/coupon/campaign.toml -o runs/n10
     """
-    start(variant)
+    options.start(variant)
     from characterisation.files.documents import read_toml
-    from mitsim.maps.campaign.acquire import (
-        found_shots,
-        found_source,
-        in_turn,
-        out_of_range,
-    )
+    from mitsim.maps.campaign.acquire import found_shots, found_source, in_turn, out_of_range
     from mitsim.maps.campaign.live import live_source, place_by_place, plan_live
     from mitsim.maps.campaign.plan import CampaignFile, plan_campaign
     from mitsim.maps.campaign.run import measure_captures, run_campaign
     from mitsim.maps.use import simulate_campaign
     from mitsim.report.figures import write_map_figures
     from mitsim.report.findings import spread_in_words
-    from mitsim.running.progress import say
     from mitsim.sensor.preset import load_sensor
 
     if captures is not None and scheduler is not None:
@@ -87,11 +59,11 @@ def make(
     file, chosen = read_toml(campaign, CampaignFile), load_sensor(sensor)
     live = None if file.device is None else plan_live(campaign, file, chosen)
     if live is not None:
-        check_no_workers(scheduler, processes, *_ONE_AT_A_TIME)
+        options.check_no_workers(scheduler, processes, *_ONE_AT_A_TIME)
     plan = plan_campaign(campaign, file, chosen) if live is None else live.campaign
-    check_folder(output)
+    options.check_folder(output)
     if compact is not None:
-        check_file(compact)
+        options.check_file(compact)
     found = None if captures is None else found_shots(captures, plan)
     for line in out_of_range(plan, found):
         say(line)
@@ -102,7 +74,7 @@ def make(
         with live_source(live, mount) as take:
             performance_map = run_campaign(plan, place_by_place(in_turn(take, plan)), output)
     else:
-        performance_map = simulate_campaign(plan, output, requested_workers(scheduler, processes))
+        performance_map = simulate_campaign(plan, output, options.requested_workers(scheduler, processes))
     if compact is not None:
         performance_map.save(compact, compact=True)
     write_map_figures(performance_map, output)
@@ -116,7 +88,7 @@ def compare(
         list[str],
         typer.Argument(help="map.nc files, or sensors whose map comes with mitsim; default: all such sensors."),
     ] = [],  # noqa: B006
-    output: Out = Path("compare"),
+    output: options.Out = Path("compare"),
     distance: Annotated[
         float | None,
         typer.Option(
@@ -134,12 +106,11 @@ def compare(
     from characterisation.maps.shipped import map_path, shipped_maps
     from mitsim.report.map_comparison import check_distance, comparison_figure, strip_figure
     from mitsim.report.style import write_png
-    from mitsim.running.progress import say
 
     loaded = [PerformanceMap.load(map_path(name)) for name in (maps or shipped_maps())]
     if distance is not None:
         check_distance(loaded, distance)
-    check_folder(output)
+    options.check_folder(output)
     write_png(comparison_figure(loaded, "fraction", distance), output / "compare_fraction.png", dpi=62)
     write_png(comparison_figure(loaded, "noise", distance), output / "compare_noise.png", dpi=62)
     write_png(strip_figure(loaded), output / "compare_strip.png", dpi=80)
@@ -147,56 +118,57 @@ def compare(
 
 
 def predict(
-    scene: Scene,
-    output: OutCloud,
+    scene: options.Scene,
+    output: options.OutCloud,
     map_file: Annotated[
         Path, typer.Option("--map", metavar="MAP", help="A map.nc file, or a sensor whose map comes with mitsim.")
     ],
-    position: Position,
-    target: Target = (0.0, 0.0, 0.0),
-    roll: Roll = 0.0,
-    sensor: SensorOption = "ensenso-n10",
+    position: options.Position,
+    target: options.Target = (0.0, 0.0, 0.0),
+    roll: options.Roll = 0.0,
+    sensor: options.SensorOption = "ensenso-n10",
     noise: Annotated[
         Literal["independent", "correlated"],
         typer.Option(help="Errors of neighbouring points: independent, or correlated as measured in the map."),
     ] = "independent",
-    seed: Seed = 1,
-    define: Defines = None,
-    yes: Yes = False,
-    variant: Variant = None,
+    seed: options.Seed = 1,
+    define: options.Defines = None,
+    yes: options.Yes = False,
+    variant: options.Variant = None,
 ) -> None:
     """Predict the point cloud of a view from a performance map, without rendering.
 
     Example: mitsim map predict scenes/two_pillars/two_pillars.xml --map ensenso-n10 --position 0 -400 300 -o cloud.ply
     """
-    start(variant)
+    options.start(variant)
     from mitsim.decoding.captures import load_scene, load_sensor, write_cloud
     from mitsim.decoding.cloud import sensor_geometry
     from mitsim.maps import use as maps
     from mitsim.maps.prediction import Predictor
     from mitsim.maps.prediction.faces_in_sight import faces_in_sight, in_words
-    from mitsim.running.progress import say
     from mitsim.study import read_map
 
     chosen = load_sensor(sensor)
     performance_map = read_map(map_file, chosen)
-    loaded = load_scene(scene, chosen, definitions(define))
-    pose = pose_of(position, target, roll, chosen)
+    loaded = load_scene(scene, chosen, options.definitions(define))
+    pose = options.pose_of(position, target, roll, chosen)
     correlated = noise == "correlated"
-    cloud = maps.predict(loaded, chosen, performance_map, pose, seed=seed, correlated=correlated, ask=asking(yes))
-    check_cloud_file(output)
+    cloud = maps.predict(
+        loaded, chosen, performance_map, pose, seed=seed, correlated=correlated, ask=options.asking(yes)
+    )
+    options.check_cloud_file(output)
     write_cloud(cloud, output)
-    print_reasons(cloud)
+    options.print_reasons(cloud)
     predictor = Predictor.of_sensor(chosen, sensor_geometry(chosen))
     if lit := in_words(faces_in_sight(predictor, loaded, pose)):
         say(f"{lit}; their F can be far lower: mitsim study score predicts it")
 
 
 def validate(
-    map_file: MapFile,
+    map_file: options.MapFile,
     campaign: Annotated[Path, typer.Argument(help="Campaign TOML file with the coupons to capture.")],
-    output: Out,
-    sensor: SensorOption = "ensenso-n10",
+    output: options.Out,
+    sensor: options.SensorOption = "ensenso-n10",
     poses: Annotated[int, typer.Option(min=1, max=10000, help="Poses of each sample at each distance.")] = 24,
     repeats: Annotated[
         int,
@@ -204,10 +176,10 @@ def validate(
             min=1, max=1000, help="Captures of each pose; up to four times as many where few points are recovered."
         ),
     ] = 1,
-    seed: Seed = 1,
-    scheduler: Scheduler = None,
-    processes: Processes = 1,
-    variant: Variant = None,
+    seed: options.Seed = 1,
+    scheduler: options.Scheduler = None,
+    processes: options.Processes = 1,
+    variant: options.Variant = None,
 ) -> None:
     """Compare a map with captures at new poses; exit code 1 if the map predicts them wrongly.
 
@@ -217,8 +189,7 @@ def validate(
 
     Example: mitsim map validate runs/n10/map.nc scenes/coupon/campaign.toml -o runs/n10_held_out
     """
-    start(variant)
-    from contextlib import AbstractContextManager, nullcontext
+    options.start(variant)
 
     from characterisation.files.documents import read_toml
     from characterisation.maps.performance_map import PerformanceMap
@@ -240,19 +211,18 @@ def validate(
     from mitsim.report.style import write_png
     from mitsim.report.validation_figures import agreement_figure, validation_table
     from mitsim.running.executor import results_of
-    from mitsim.running.progress import say, track
     from mitsim.sensor.preset import load_sensor
 
     path = map_path(map_file)
     performance_map = PerformanceMap.load(path)
     file, chosen = read_toml(campaign, CampaignFile), load_sensor(sensor)
     if file.device is not None:
-        check_no_workers(scheduler, processes, *_ONE_AT_A_TIME)
+        options.check_no_workers(scheduler, processes, *_ONE_AT_A_TIME)
     live = None if file.device is None else held_out_live(campaign, file, chosen, performance_map)
     plan = held_out_campaign(campaign, chosen, performance_map) if live is None else live.campaign
     shots = held_out_shots(plan, poses, seed)
-    check_folder(output)
-    workers = requested_workers(scheduler, processes)
+    options.check_folder(output)
+    workers = options.requested_workers(scheduler, processes)
     if workers is not None:
         pairs = results_of(held_out_orders(plan, shots, path, repeats), hold_out_order, workers, "hold out")
     else:
@@ -277,27 +247,25 @@ def validate(
 
 def sheet(
     sensors: Annotated[list[str], typer.Argument(help="Presets or sensor TOML files; default: all presets.")] = [],  # noqa: B006
-    output: Out = Path("datasheet"),
-    seed: Seed = 1,
-    scheduler: Scheduler = None,
-    processes: Processes = 1,
-    variant: Variant = None,
+    output: options.Out = Path("datasheet"),
+    seed: options.Seed = 1,
+    scheduler: options.Scheduler = None,
+    processes: options.Processes = 1,
+    variant: options.Variant = None,
 ) -> None:
     """Make data sheets: noise floor, noise over distance, and recovery on metal, from simulated plates and balls.
 
     Example: mitsim map sheet ensenso-n10 kinect-v2 -o runs/sheets
     """
-    start(variant)
-    from characterisation.files.atomic_io import write_json
+    options.start(variant)
     from mitsim.maps.data_sheet import gallery, measure_sensor
     from mitsim.report.sheet_figures import gallery_figure, noise_figure, residual_figure, sheet_leaves_out, sheet_table
     from mitsim.report.style import write_png
-    from mitsim.running.progress import say
     from mitsim.sensor.preset import load_sensor, presets
 
     chosen = [load_sensor(name) for name in (sensors or presets())]
-    check_folder(output)
-    workers = requested_workers(scheduler, processes)
+    options.check_folder(output)
+    workers = options.requested_workers(scheduler, processes)
     sheets = []
     for sensor in chosen:
         sheets.append(measure_sensor(sensor, seed, workers))

@@ -9,24 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from characterisation.files.errors import InputError
-from mitsim.cli.options import (
-    Clouds,
-    DecodedAs,
-    Defines,
-    Frame,
-    Json,
-    PoseFile,
-    Seed,
-    Simulated,
-    Topic,
-    Unit,
-    Variant,
-    ViewOfPoses,
-    check_file,
-    check_unit,
-    definitions,
-    start,
-)
+from mitsim.cli import options
+from mitsim.running.progress import say
 
 if TYPE_CHECKING:
     from characterisation.point_cloud import PointCloud
@@ -38,7 +22,7 @@ _WINDOW = "NAME=COLUMN,ROW,WIDTH,HEIGHT"
 
 
 def clouds(
-    inputs: Clouds,
+    inputs: options.Clouds,
     plane: Annotated[
         list[str] | None,
         typer.Option(
@@ -73,8 +57,8 @@ def clouds(
     bright_dots: Annotated[bool, typer.Option("--bright-dots", help="The dots are brighter than the plate.")] = False,
     task: Annotated[Path | None, typer.Option(help="Task TOML file: measure what it defines; needs --scene.")] = None,
     scene: Annotated[Path | None, typer.Option(help="Scene of the part; it assigns pixels to features.")] = None,
-    pose: PoseFile = None,
-    view: ViewOfPoses = None,
+    pose: options.PoseFile = None,
+    view: options.ViewOfPoses = None,
     correct: Annotated[
         Path | None,
         typer.Option(
@@ -113,15 +97,15 @@ def clouds(
             "the sensor in another frame.",
         ),
     ] = "sensor",
-    simulated: Simulated = None,
-    topic: Topic = None,
-    frame: Frame = None,
-    unit: Unit = None,
-    as_json: Json = False,
-    sensor: DecodedAs = None,
-    seed: Seed = 1,
-    define: Defines = None,
-    variant: Variant = None,
+    simulated: options.Simulated = None,
+    topic: options.Topic = None,
+    frame: options.Frame = None,
+    unit: options.Unit = None,
+    as_json: options.Json = False,
+    sensor: options.DecodedAs = None,
+    seed: options.Seed = 1,
+    define: options.Defines = None,
+    variant: options.Variant = None,
 ) -> None:
     """Measure planes, spheres, cylinders, dots or a task in point clouds, or the difference from another cloud.
 
@@ -137,9 +121,8 @@ def clouds(
     from mitsim.cli.measure_request import read_request
     from mitsim.decoding.input_clouds import cloud_paths, read_cloud
     from mitsim.decoding.measured_document import beside_document, measured_document, result_tables, summary
-    from mitsim.running.progress import say
 
-    check_unit(unit)
+    options.check_unit(unit)
     request = read_request(
         {"plane": plane or [], "sphere": sphere or [], "cylinder": cylinder or []},
         {"angle": angle or [], "distance": distance or []},
@@ -160,12 +143,12 @@ def clouds(
         allowed = "--plane, --sphere, --cylinder, --dots, --task, --against or --picture"
         raise InputError("mitsim measure", "", "nothing to measure", allowed, "see mitsim measure --help")
     if picture is not None:
-        check_file(picture)
+        options.check_file(picture)
     of_task = None
     if simulated is not None or (task is not None and scene is not None):
-        start(variant)
+        options.start(variant)
     if task is not None and scene is not None:
-        of_task = _task(task, scene, pose, view, correct, definitions(define))
+        of_task = _task(task, scene, pose, view, correct, options.definitions(define))
     reference = None if against is None else read_cloud(against, sensor, reference=True, unit=unit)
     paths = cloud_paths(inputs)
     beside: tuple[list[Result], list[Result]] | None = None

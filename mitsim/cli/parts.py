@@ -9,20 +9,8 @@ import typer
 
 from characterisation.files.atomic_io import write_text
 from characterisation.files.errors import InputError
-from mitsim.cli.options import (
-    Defines,
-    Json,
-    Roll,
-    Scene,
-    SensorOption,
-    Target,
-    Variant,
-    ViewOfPoses,
-    check_file,
-    definitions,
-    pose_of,
-    start,
-)
+from mitsim.cli import options
+from mitsim.running.progress import say
 
 if TYPE_CHECKING:
     from mitsim.scene.authoring.check import Authored
@@ -32,13 +20,13 @@ if TYPE_CHECKING:
 
 
 def check(
-    scene: Scene,
+    scene: options.Scene,
     position: Annotated[
         tuple[float, float, float] | None,
         typer.Option(help="Position of the sensor in the frame of the scene [mm]; default: 45 deg above the part."),
     ] = None,
-    target: Target = (0.0, 0.0, 0.0),
-    roll: Roll = 0.0,
+    target: options.Target = (0.0, 0.0, 0.0),
+    roll: options.Roll = 0.0,
     pose: Annotated[
         Path | None,
         typer.Option(
@@ -46,21 +34,21 @@ def check(
             "with --view."
         ),
     ] = None,
-    view: ViewOfPoses = None,
-    sensor: SensorOption = "ensenso-n10",
+    view: options.ViewOfPoses = None,
+    sensor: options.SensorOption = "ensenso-n10",
     task: Annotated[Path | None, typer.Option(help="Task TOML file; check that the scene has its features.")] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="PNG picture to write.")] = None,
     bounces: Annotated[
         Path | None,
         typer.Option(help="PNG picture to write: the share of interreflected light, and the face that it comes from."),
     ] = None,
-    json: Json = False,
+    json: options.Json = False,
     html: Annotated[
         Path | None,
         typer.Option(help="HTML page to write: edit names, finishes and measurements, then download the files."),
     ] = None,
-    define: Defines = None,
-    variant: Variant = None,
+    define: options.Defines = None,
+    variant: options.Variant = None,
 ) -> None:
     """List the contents of a scene, warn of likely mistakes, and draw it from the sensor and from above.
 
@@ -68,23 +56,22 @@ def check(
 
     Example: mitsim check scenes/two_pillars/two_pillars.xml --task scenes/two_pillars/task.toml -o preview.png
     """
-    start(variant)
+    options.start(variant)
     import json as json_module
 
     from mitsim.report.scene_table import as_data, as_text
-    from mitsim.running.progress import say
     from mitsim.sensor.preset import load_sensor
     from mitsim.sensor.working_volume import usual_place
 
     chosen = load_sensor(sensor)
-    stand = None if position is None else pose_of(position, target, roll, chosen)
+    stand = None if position is None else options.pose_of(position, target, roll, chosen)
     if pose is not None:
         from mitsim.study.task_measurement import read_pose
 
         if position is not None:
             raise InputError("--pose", "", "--position too", "one of them")
         stand = read_pose(pose, view)
-    checked, visible, placed = _inspected(scene, chosen, definitions(define), task, stand, roll)
+    checked, visible, placed = _inspected(scene, chosen, options.definitions(define), task, stand, roll)
     facts, found, centre = checked.facts, checked.found, checked.scene.centre
     if stand is None:
         ends = [" ".join(f"{round(float(v), 1) + 0.0:g}" for v in end) for end in (usual_place(chosen, centre), centre)]
@@ -93,7 +80,7 @@ def check(
         from mitsim.report.scene_preview import preview_figure
         from mitsim.report.style import write_png
 
-        check_file(output)
+        options.check_file(output)
         first = list(checked.task.features) if checked.task else []
         measured = checked.task.measured_shapes() if checked.task else ()
         write_png(preview_figure(checked.scene, facts, chosen, placed, visible, first, measured), output)
@@ -102,14 +89,14 @@ def check(
         from mitsim.report.bounce_figure import bounce_figure, bounced_light
         from mitsim.report.style import write_png
 
-        check_file(bounces)
+        options.check_file(bounces)
         light = bounced_light(checked.scene, chosen, placed, visible)
         write_png(bounce_figure(light, checked.scene.names, f"{scene.stem} before {chosen.name}"), bounces)
         say(f"picture: {bounces}")
     if html:
         from mitsim.report.author_page import author_page
 
-        check_file(html)
+        options.check_file(html)
         text = author_page(checked)
         write_text(html, text)
         say(f"page: {html}")
@@ -194,7 +181,6 @@ def part(
 
     Example: mitsim part bracket.step -o scenes/bracket --process milled --Ra 1.6 --sensor ensenso-n10 --edit
     """
-    from mitsim.running.progress import say
     from mitsim.scene.authoring.fineness import fineness_for
     from mitsim.scene.authoring.part_folder import Finishing, described, write_part
     from mitsim.scene.authoring.read_step import Fineness
@@ -231,10 +217,9 @@ def part(
 
 def _edit(scene: Path, sensor: str | None, port: int) -> None:
     """Serve the editor page of a scene until the user ends it."""
-    start(None)
+    options.start(None)
     from mitsim.report.author_page import author_page, findings_data
     from mitsim.report.author_server import AuthorServer
-    from mitsim.running.progress import say
     from mitsim.sensor.preset import load_sensor
 
     chosen, task = load_sensor(sensor or "ensenso-n10"), scene.parent / "task.toml"

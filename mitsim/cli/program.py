@@ -124,9 +124,17 @@ for name, group in {
         maps.sheet,
     ),
     "fit": command_group("Fit a finish or a sensor file to captures.", fit.finish, fit.sensor_, default=True),
+    "export": command_group(
+        "Write clouds, runs, results and maps in the formats of other programs.",
+        export.cloud,
+        export.run,
+        export.results,
+        export.targets,
+        export.map_,
+        export.bop,
+    ),
 }.items():
     app.add_typer(group, name=name)
-app.add_typer(export.app, name="export")
 
 
 #: errors of the system for a path that does not exist or may not be read or written

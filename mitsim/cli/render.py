@@ -3,30 +3,17 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import asdict
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from characterisation.files.errors import InputError
+from mitsim.cli import options
 from mitsim.cli.folder_lock import remove_partial_beside
-from mitsim.cli.options import (
-    Defines,
-    Out,
-    Processes,
-    Roll,
-    Scene,
-    Seed,
-    SensorOption,
-    Target,
-    Variant,
-    check_folder,
-    check_no_workers,
-    definitions,
-    pose_of,
-    requested_workers,
-    start,
-)
+from mitsim.running.progress import say
 
 if TYPE_CHECKING:
     from mitsim.running.executor import Executor
@@ -34,16 +21,16 @@ if TYPE_CHECKING:
 
 
 def render(
-    scene: Scene,
-    output: Out,
+    scene: options.Scene,
+    output: options.Out,
     position: Annotated[
         tuple[float, float, float] | None,
         typer.Option(help="Position of the sensor in the frame of the scene [mm]; or use --many."),
     ] = None,
-    target: Target = (0.0, 0.0, 0.0),
-    roll: Roll = 0.0,
-    sensor: SensorOption = "ensenso-n10",
-    seed: Seed = 1,
+    target: options.Target = (0.0, 0.0, 0.0),
+    roll: options.Roll = 0.0,
+    sensor: options.SensorOption = "ensenso-n10",
+    seed: options.Seed = 1,
     samples: Annotated[int, typer.Option(min=1, max=65536, help="Light paths per pixel.")] = 16,
     depth: Annotated[
         int, typer.Option(min=1, max=16, help="Largest number of surfaces on a light path; 1: direct light only.")
@@ -73,9 +60,9 @@ def render(
             help="With --many: address of a Dask scheduler whose workers simulate the captures, tcp://HOST:8786."
         ),
     ] = None,
-    processes: Processes = 1,
-    define: Defines = None,
-    variant: Variant = None,
+    processes: options.Processes = 1,
+    define: options.Defines = None,
+    variant: options.Variant = None,
 ) -> None:
     """Simulate one capture of a scene, or many of them.
 
@@ -85,32 +72,29 @@ def render(
         found = "both --position and --many" if many else "neither --position nor --many"
         raise InputError("--position", "", found, "one of them: a position, or a plan")
     if many is None:
-        check_no_workers(scheduler, processes, "only with --many", "a single capture runs in this process")
-    start(variant)
+        options.check_no_workers(scheduler, processes, "only with --many", "a single capture runs in this process")
+    options.start(variant)
     from mitsim.sensor.noise_sources import Noise
     from mitsim.study.many_captures import CaptureJob, CaptureSettings, digest_of, origin_of
 
-    defined = definitions(define)
+    defined = options.definitions(define)
     settings = CaptureSettings(defined, deviation, seed, samples, depth, Noise.parse(noise), truth)
     if many is not None:
-        _render_many(many, scene, sensor, settings, output, requested_workers(scheduler, processes))
+        _render_many(many, scene, sensor, settings, output, options.requested_workers(scheduler, processes))
         return
     assert position is not None
-    from dataclasses import asdict
-    from math import isfinite
 
     from mitsim.capture.folder import check_free, read_capture, write_capture
     from mitsim.capture.simulated.render_residual import LIMIT, render_residual
     from mitsim.capture.simulated.rendering import Rendering
     from mitsim.capture.simulated.truth import encode_exr, true_images
     from mitsim.decoding import captures as interface
-    from mitsim.running.progress import say
     from mitsim.scene.surface.scatter import Deviation
     from mitsim.scene.visible_surfaces import sees_nothing
 
     chosen, moved = interface.load_sensor(sensor), Deviation.parse(deviation)
     loaded = interface.load_scene(scene, chosen, defined, deviation=moved)
-    pose = pose_of(position, target, roll, chosen)
+    pose = options.pose_of(position, target, roll, chosen)
     origin = origin_of(scene, chosen, defined)
     digest = CaptureJob(chosen, str(scene), "", 0, pose, settings, origin).digest()
     remove_partial_beside(output)
@@ -150,13 +134,12 @@ def _render_many(
 ) -> None:
     """Simulate the missing captures of a plan, and report their number."""
     from mitsim.capture.simulated.simulate import SimulatedSensor
-    from mitsim.running.progress import say
     from mitsim.sensor.preset import load_sensor
     from mitsim.study.many_captures import in_turn, missing_jobs, read_jobs, render_many, take_job
 
     chosen = load_sensor(sensor)
     jobs = read_jobs(plan, scene, chosen, common)
-    check_folder(output)
+    options.check_folder(output)
     missing = missing_jobs(jobs, output)
     if len(missing) < len(jobs):
         say(f"{len(jobs) - len(missing)} of {len(jobs)} captures exist already")

@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from characterisation.files.atomic_io import write_json
 from characterisation.files.errors import InputError
-from mitsim.cli.options import (
-    Out,
-    Overwrite,
-    Processes,
-    Scheduler,
-    Variant,
-    Yes,
-    asking,
-    check_folder,
-    keep_finished,
-    requested_workers,
-    start,
-)
+from mitsim.cli import options
+from mitsim.running.progress import say
+from mitsim.running.time_limit import TimeLimit, ending_in_order, stopped_by_user
 
 if TYPE_CHECKING:
     from characterisation.statements.statement import Statement
@@ -45,7 +38,7 @@ ViewNumber = Annotated[int, typer.Option(min=0, help="Number of the view in scor
 
 def run(
     study: StudyFile,
-    output: Out,
+    output: options.Out,
     minutes: Annotated[
         float | None,
         typer.Option(
@@ -56,11 +49,11 @@ def run(
     ] = None,
     plan: PlanExposures = False,
     require_fit: RequireFit = False,
-    scheduler: Scheduler = None,
-    processes: Processes = 1,
-    overwrite: Overwrite = False,
-    yes: Yes = False,
-    variant: Variant = None,
+    scheduler: options.Scheduler = None,
+    processes: options.Processes = 1,
+    overwrite: options.Overwrite = False,
+    yes: options.Yes = False,
+    variant: options.Variant = None,
 ) -> None:
     """Run a study: screen all views, compare the best by virtual measurements, state the uncertainty, write a report.
 
@@ -71,22 +64,19 @@ def run(
 
     Example: mitsim run scenes/two_pillars/study.toml -o runs/two_pillars
     """
-    from mitsim.running.time_limit import TimeLimit, ending_in_order, stopped_by_user
-
     limit = TimeLimit(None if minutes is None else 60 * minutes)
-    start(variant)
+    options.start(variant)
     from mitsim.report.page import write_report
-    from mitsim.running.progress import say
     from mitsim.study import open_study, report_lays, with_plan
     from mitsim.study.remedies.entries import remedies_in_words
     from mitsim.study.run import run_within
     from mitsim.study.run_folder import read_run
 
-    check_folder(output)
-    chosen = with_plan(open_study(study, ask=asking(yes)), plan)
-    keep_finished(output, overwrite, "run.json")
+    options.check_folder(output)
+    chosen = with_plan(open_study(study, ask=options.asking(yes)), plan)
+    options.keep_finished(output, overwrite, "run.json")
     report_lays(chosen)
-    workers = requested_workers(scheduler, processes)
+    workers = options.requested_workers(scheduler, processes)
     with ending_in_order():
         stated = run_within(chosen, output, limit, workers, lambda: write_report(output))
         stopped = stopped_by_user()
@@ -102,7 +92,7 @@ def run(
 
 def choose(
     study: StudyFile,
-    output: Out,
+    output: options.Out,
     sensors: Annotated[
         str,
         typer.Option(
@@ -112,12 +102,12 @@ def choose(
     minutes: Annotated[float, typer.Option(min=0.1, help="Total time, shared among the sensors [min].")] = 10.0,
     plan: PlanExposures = False,
     require_fit: RequireFit = False,
-    scheduler: Scheduler = None,
-    processes: Processes = 1,
+    scheduler: options.Scheduler = None,
+    processes: options.Processes = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print choice.json in place of the table.")] = False,
-    overwrite: Overwrite = False,
-    yes: Yes = False,
-    variant: Variant = None,
+    overwrite: options.Overwrite = False,
+    yes: options.Yes = False,
+    variant: options.Variant = None,
 ) -> None:
     """Choose a sensor for a study: screen all sensors, and compare the promising ones by virtual measurements.
 
@@ -125,17 +115,11 @@ def choose(
 
     Example: mitsim study choose scenes/two_pillars/tolerances.toml --sensors all -o runs/choice
     """
-    from mitsim.running.time_limit import TimeLimit, ending_in_order, stopped_by_user
-
     limit = TimeLimit(60 * minutes)
-    start(variant)
-    import json
-    from dataclasses import replace
+    options.start(variant)
 
-    from characterisation.files.atomic_io import write_json
     from characterisation.statements.verdict_words import fits_all
     from mitsim.report.choice_page import write_choice_page
-    from mitsim.running.progress import say
     from mitsim.study import report_lays, with_plan
     from mitsim.study.choice_document import CHOICE, judged, read_choice
     from mitsim.study.choose import choose_sensor, read_candidates
@@ -143,12 +127,14 @@ def choose(
     from mitsim.study.choose.table import as_text, document
     from mitsim.study.scene_geometry import write_scene_geometry
 
-    check_folder(output)
-    candidates, excluded = read_candidates(study, [sensors], asking(yes, " (and likewise for every other sensor)"))
+    options.check_folder(output)
+    candidates, excluded = read_candidates(
+        study, [sensors], options.asking(yes, " (and likewise for every other sensor)")
+    )
     candidates = [replace(one, study=with_plan(one.study, plan)) for one in candidates]
     done = read_choice(output)
     if done is not None and done.finished:
-        keep_finished(output, overwrite, CHOICE)
+        options.keep_finished(output, overwrite, CHOICE)
         (output / CHOICE).unlink()
     report_lays(candidates[0].study)
     for one in excluded:
@@ -162,7 +148,9 @@ def choose(
         write_json(output / CHOICE, known.model_dump(mode="json"))
 
     with ending_in_order():
-        found = choose_sensor(candidates, output, limit, report_results, requested_workers(scheduler, processes))
+        found = choose_sensor(
+            candidates, output, limit, report_results, options.requested_workers(scheduler, processes)
+        )
         stopped = stopped_by_user()
     best = found[0].candidate.study
     write_scene_geometry(output, best.scene, best.sensor)
@@ -180,7 +168,7 @@ def choose(
 
 def state(
     study: StudyFile,
-    output: Out,
+    output: options.Out,
     view: ViewNumber,
     minutes: Annotated[
         float | None,
@@ -192,10 +180,10 @@ def state(
     ] = None,
     plan: PlanExposures = False,
     require_fit: RequireFit = False,
-    scheduler: Scheduler = None,
-    processes: Processes = 1,
-    yes: Yes = False,
-    variant: Variant = None,
+    scheduler: options.Scheduler = None,
+    processes: options.Processes = 1,
+    yes: options.Yes = False,
+    variant: options.Variant = None,
 ) -> None:
     """State the uncertainty of every measurement from one view of a study, with a budget of its sources.
 
@@ -203,19 +191,16 @@ def state(
 
     Example: mitsim study state scenes/two_pillars/study.toml --view 12 -o runs/view_12
     """
-    from mitsim.running.time_limit import TimeLimit, ending_in_order, stopped_by_user
-
     limit = TimeLimit(None if minutes is None else 60 * minutes)
-    start(variant)
-    from characterisation.files.atomic_io import write_json
+    options.start(variant)
     from mitsim.study import open_study, with_plan
     from mitsim.study.session import Session
     from mitsim.study.statement_document import statement_document
 
-    check_folder(output)
-    chosen = with_plan(open_study(study, ask=asking(yes)), plan)
+    options.check_folder(output)
+    chosen = with_plan(open_study(study, ask=options.asking(yes)), plan)
     seen_from = chosen.view(view, "--view")
-    session = Session(chosen, output, requested_workers(scheduler, processes))
+    session = Session(chosen, output, options.requested_workers(scheduler, processes))
     session.claim(f"budget of view {view}")
     with ending_in_order():
         stated = session.state(seen_from, None, limit)
@@ -228,7 +213,7 @@ def state(
 
 def exposures(
     study: StudyFile,
-    output: Out,
+    output: options.Out,
     view: ViewNumber,
     most: Annotated[
         int | None, typer.Option(min=1, max=7, help="Largest number of exposures to merge; default: from the study.")
@@ -242,7 +227,7 @@ def exposures(
         ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print exposures.json in place of the table.")] = False,
-    variant: Variant = None,
+    variant: options.Variant = None,
 ) -> None:
     """Find the fewest exposures of one view with which every feature nearly reaches its least possible uncertainty.
 
@@ -252,11 +237,8 @@ def exposures(
 
     Example: mitsim study exposures scenes/two_pillars/study.toml --view 40 -o runs/exposures
     """
-    start(variant)
-    import json
+    options.start(variant)
 
-    from characterisation.files.atomic_io import write_json
-    from mitsim.running.progress import say
     from mitsim.study import ExposureTable, open_study
     from mitsim.study.exposures.exposure_plan import PlanRules
     from mitsim.study.exposures.planned import (
@@ -269,7 +251,7 @@ def exposures(
     )
     from mitsim.study.session import Session
 
-    check_folder(output)
+    options.check_folder(output)
     chosen = open_study(study, mapped=False)  # the view is rendered
     shown = chosen.view(view, "--view")
     table = chosen.file.exposure or ExposureTable()
@@ -298,7 +280,6 @@ def _tell_statement(
     """
     from characterisation.statements.verdict_words import fits_all, result_in_words
     from mitsim.report.set_words import with_sets
-    from mitsim.running.progress import say
     from mitsim.study.statement_file import read_statement
     from mitsim.study.virtual.stated import judged, statement_table
 
@@ -321,7 +302,7 @@ def _tell_statement(
 
 def score(
     study: StudyFile,
-    output: Out,
+    output: options.Out,
     top: Annotated[int, typer.Option(min=1, max=10000, help="Number of views to print for each measurement.")] = 10,
     measurement: Annotated[list[str] | None, typer.Option(help="Print only this measurement. Repeatable.")] = None,
     map_file: Annotated[
@@ -332,22 +313,21 @@ def score(
             help="A map.nc file, or the name of a sensor whose map comes with mitsim; default: the map of the study.",
         ),
     ] = "",
-    yes: Yes = False,
-    variant: Variant = None,
+    yes: options.Yes = False,
+    variant: options.Variant = None,
 ) -> None:
     """Predict the uncertainty of every measurement from each candidate view, without rendering; print the best.
 
     Example: mitsim study score scenes/two_pillars/study.toml -o runs/scores
     """
-    start(variant)
+    options.start(variant)
     from mitsim.report.best_views import best_views
-    from mitsim.running.progress import say
     from mitsim.study import open_study, report_lays
     from mitsim.study.scoring import score_study
     from mitsim.study.session import Session
 
-    check_folder(output)
-    chosen = open_study(study, performance_map=map_file, ask=asking(yes))
+    options.check_folder(output)
+    chosen = open_study(study, performance_map=map_file, ask=options.asking(yes))
     report_lays(chosen)
     for name in measurement or ():
         if name not in chosen.task.measurements:
@@ -373,7 +353,6 @@ def report(
     from mitsim.report.choice_page import write_choice_page
     from mitsim.report.page import write_report
     from mitsim.report.sheet import write_sheet
-    from mitsim.running.progress import say
     from mitsim.study.choice_document import CHOICE
 
     if pdf:

@@ -7,12 +7,15 @@ from typing import Annotated
 
 import typer
 
-from mitsim.cli.options import Out, Processes, Scheduler, Variant, check_folder, requested_workers, start
+from characterisation.files.errors import InputError
+from mitsim.cli import options
+from mitsim.running.progress import say
+from mitsim.running.time_limit import TimeLimit, ending_in_order, stopped_by_user
 
 
 def talk(
     file: Annotated[Path, typer.Argument(metavar="TALK", help="Talk TOML file: sensor, samples, views.")],
-    output: Out,
+    output: options.Out,
     kept: Annotated[
         bool, typer.Option("--kept", help="Draw from kept results alone, of any version; make nothing.")
     ] = False,
@@ -25,9 +28,9 @@ def talk(
         ),
     ] = None,
     minutes: Annotated[float | None, typer.Option(min=0.1, help="Time for the whole command [min].")] = None,
-    scheduler: Scheduler = None,
-    processes: Processes = 1,
-    variant: Variant = None,
+    scheduler: options.Scheduler = None,
+    processes: options.Processes = 1,
+    variant: options.Variant = None,
 ) -> None:
     """Make every figure of the talk "Task Specific Viewpoint Optimisation" again, beside the claim of its slide.
 
@@ -36,14 +39,10 @@ def talk(
 
     Example: mitsim study talk scenes/talk/talk.toml -o runs/talk --processes 2
     """
-    from characterisation.files.errors import InputError
-    from mitsim.running.time_limit import TimeLimit, ending_in_order, stopped_by_user
-
     limit = TimeLimit(None if minutes is None else 60 * minutes)
     if kept and fresh:
         raise InputError("--fresh", "", "--kept", "only one of the two")
-    start(variant)
-    from mitsim.running.progress import say
+    options.start(variant)
     from mitsim.talk.make import make, results_known
     from mitsim.talk.measured import measured_errors
     from mitsim.talk.page import write_talk
@@ -51,7 +50,7 @@ def talk(
     from mitsim.talk.talk_file import read_talk
 
     chosen = read_talk(file)
-    check_folder(output)
+    options.check_folder(output)
     others = () if fresh else (chosen.folder / chosen.file.kept,)
     results = Results(output / "kept", others, any_version=kept)
     errors = {} if measured is None else measured_errors(chosen, measured)
@@ -59,7 +58,7 @@ def talk(
         if kept:
             missing = results_known(chosen, results, tuple(errors))
         else:
-            workers = requested_workers(scheduler, processes)
+            workers = options.requested_workers(scheduler, processes)
             missing = make(chosen, results, output, workers, limit, tuple(errors))
         stopped = stopped_by_user()
     page = write_talk(chosen, results, output, missing, errors)

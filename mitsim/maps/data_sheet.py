@@ -27,6 +27,7 @@ from scipy import stats
 
 from characterisation.coupon.patches import Coupon, measure_patches
 from characterisation.features.fits import fit_plane, fit_sphere
+from characterisation.files.arrays import Floats
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.rendering import Rendering
@@ -41,8 +42,6 @@ from mitsim.scene.test_targets import FINISHES, ball, ball_on_plate, plate
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform, look_at
-
-Floats = NDArray[np.float64]
 
 #: side of a plate, over its distance from the sensor
 PLATE_SHARE = 0.25

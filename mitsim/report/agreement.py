@@ -24,10 +24,9 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.stats import t
 
+from characterisation.files.arrays import Floats
 from characterisation.scores.coverage import NORMAL_COVERAGE, coverage_interval
 from characterisation.scores.rank_agreement import spearman
-
-Floats = NDArray[np.float64]
 
 #: verdicts on the order that u gives the checked views
 CONFIRMED, REVERSED = "smaller u, smaller error", "smaller u, larger error: do not trust it"

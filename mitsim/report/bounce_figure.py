@@ -28,8 +28,8 @@ from mitsim.sensor.transforms import Transform
 #: width of the figure and of a picture [in]
 _WIDTH_IN, _WIDE_IN = 9.4, 4.1
 
-#: pixels of the part, and paths of each
-_PIXELS, _SAMPLES = 16_000, 256
+#: pixels of the part, paths of each, and the seed of the paths
+_PIXELS, _SAMPLES, _SEED = 16_000, 256, 1
 
 #: faces with a colour of their own; largest number of faces in the list, and of the faces one gets light from
 _COLOURED, _LISTED, _SOURCES = len(SHAPES), 12, 3
@@ -38,9 +38,7 @@ _COLOURED, _LISTED, _SOURCES = len(SHAPES), 12, 3
 _LEAST = 0.005
 
 
-def bounced_light(
-    scene: Scene, sensor: Sensor, pose: Transform, visible: VisibleSurfaces, seed: int = 1
-) -> LightFromFaces:
+def bounced_light(scene: Scene, sensor: Sensor, pose: Transform, visible: VisibleSurfaces) -> LightFromFaces:
     """Estimate the light of a view by face, in the part of the image that shows the part.
 
     Parameters
@@ -51,8 +49,6 @@ def bounced_light(
         world_from_sensor.
     visible
         Surfaces that the reference camera sees from there.
-    seed
-        Of the light paths.
 
     See Also
     --------
@@ -63,14 +59,14 @@ def bounced_light(
     step = max(1, math.floor(math.sqrt(len(rows) / _PIXELS)))
     coarse = camera.binned(step)
     if not len(rows):
-        return light_from_faces(scene, coarse, sensor.projector, pose, 1, seed)
+        return light_from_faces(scene, coarse, sensor.projector, pose, 1, _SEED)
     left, top = (max(0, int(one.min()) // step - 2) for one in (columns, rows))
     right, bottom = (
         min(size, int(one.max()) // step + 3)
         for one, size in ((columns, coarse.width), (rows, coarse.height))
     )  # fmt: skip
     roi = Roi(left, top, right - left, bottom - top)
-    return light_from_faces(scene, coarse, sensor.projector, pose, _SAMPLES, seed, roi)
+    return light_from_faces(scene, coarse, sensor.projector, pose, _SAMPLES, _SEED, roi)
 
 
 def bounce_figure(found: LightFromFaces, names: Sequence[str], title: str) -> Figure:

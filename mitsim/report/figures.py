@@ -28,8 +28,6 @@ from mitsim.report.findings import incidence_of_nodes
 from mitsim.report.style import colour_scale, write_png
 from mitsim.running.numbers import count, finish_name
 
-Floats = NDArray[np.float64]
-
 #: cells across a disc in which patches are counted
 _CELLS = 61
 

@@ -107,9 +107,10 @@ class RowValues:
     def texts(self) -> ResultRow:
         """Return the row of the table, as texts."""
         limit = self.share_limit
+        size = (self.tolerance[1] - self.tolerance[0]) / 2 if isinstance(self.tolerance, tuple) else self.tolerance
         accepted = NONE
         if self.rule and self.stated:
-            accepted = accepted_words(self.accepted, self.unit, _size(self.tolerance))
+            accepted = accepted_words(self.accepted, self.unit, size)
             accepted += ", bias subtracted" * (self.accepted is not None and self.rule.endswith(BIAS_SUBTRACTED))
         return ResultRow(
             name=self.name,
@@ -177,10 +178,6 @@ def accepted_words(readings: tuple[float | None, float] | None, unit: str, toler
         return "none"
     low, high = readings
     return accepted_text(-math.inf if low is None else low, high, tolerance) + _suffix(unit)
-
-
-def _size(tolerance: float | tuple[float, float] | None) -> float | None:
-    return (tolerance[1] - tolerance[0]) / 2 if isinstance(tolerance, tuple) else tolerance
 
 
 def _share(share: float) -> str:

@@ -23,12 +23,11 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike, NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.plots.labels import label_columns
 from characterisation.plots.part_pictures import EDGE_SHADE, innermost_pixel, viewer_frame
 from characterisation.plots.style import INK, MUTED, PAPER, drawing
 from mitsim.study.scene_geometry import SceneGeometry
-
-Floats = NDArray[np.float64]
 
 #: colour of faces by verdict (Okabe and Ito, safe for colour-blind readers), worst last; faces without measurements are
 #: grey
@@ -75,10 +74,7 @@ def face_verdicts(measurements: Mapping[str, tuple[Sequence[str], str]]) -> dict
 
 
 def placement_figure(
-    geometry: SceneGeometry,
-    poses: Sequence[tuple[str, ArrayLike]],
-    verdicts: Mapping[str, str],
-    stacked: bool = False,
+    geometry: SceneGeometry, poses: Sequence[tuple[str, ArrayLike]], verdicts: Mapping[str, str], stacked: bool = False
 ) -> Figure:
     """Draw a part with a sensor at each pose and its verdicts, as a figure of its own.
 
@@ -127,7 +123,7 @@ def draw_placement(
     """
     matrices = [np.asarray(pose, float) for _, pose in poses]
     with drawing():
-        middle = _middle(geometry)
+        middle = (geometry.corners.min(axis=(0, 1)) + geometry.corners.max(axis=(0, 1))) / 2
         turn = _viewpoint(matrices[0], middle)
         flat, depth = _projected(geometry.corners - middle, turn)
         whole, near = (figure.add_axes(place) for place in (_STACKED if stacked else _BESIDE))
@@ -144,11 +140,6 @@ def draw_placement(
         for axes in (whole, near):
             _make_room_for_texts(axes)
         _legend(figure, verdicts, geometry.camera, 2 if stacked else None)
-
-
-def _middle(geometry: SceneGeometry) -> Floats:
-    points = geometry.corners.reshape(-1, 3)
-    return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
 
 
 def _viewpoint(part_from_sensor: Floats, middle: Floats) -> Floats:

@@ -19,6 +19,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.plots.labels import round_length, scale_bar
 from characterisation.plots.part_pictures import EDGE_SHADE, shape_edges
 from characterisation.plots.style import FIELD, INK, MUTED, OTHER_SHAPE, SHAPES, bare, drawing
@@ -30,8 +31,6 @@ from mitsim.scene.visible_surfaces import VisibleSurfaces
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.working_volume import common_view, depth, in_working_volume
-
-Floats = NDArray[np.float64]
 
 _BACK = "#2b2d33"
 

@@ -118,7 +118,7 @@ def sheet_figures(declaration: Declaration, geometry: SceneGeometry | None) -> l
         _facts(page, declaration, size)
         _sign(page)
         for number, one in enumerate(pages, 1):
-            _foot(one, declaration, number, len(pages))
+            _foot(one, number, len(pages))
     return [one.figure for one in pages]
 
 
@@ -242,7 +242,7 @@ def _sign(page: Page) -> None:
             page.place += 0.03
 
 
-def _foot(page: Page, declaration: Declaration, number: int, of: int) -> None:
+def _foot(page: Page, number: int, of: int) -> None:
     page.place = MARGIN
     words = "Simulated, not traceable: no real sensor has measured this part."
     words += " Verdicts are about the measurement, not about a part."

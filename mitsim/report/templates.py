@@ -26,8 +26,7 @@ def rendered(template: str, content: Mapping[str, Any]) -> str:
 
 def write_page(path: Path, template: str, content: Mapping[str, Any]) -> Path:
     """Write a page atomically, and return its path."""
-    text = rendered(template, content)
-    write_text(path, text)
+    write_text(path, rendered(template, content))
     return path
 
 

@@ -21,9 +21,8 @@ import trimesh
 import xarray as xr
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.point_cloud import PointCloud
-
-Floats = NDArray[np.float64]
 
 #: limits of a page: clouds, points of one and of all of them (11 characters each), triangles of the part
 MOST_CLOUDS, MOST_POINTS, MOST_POINTS_IN_ALL, MOST_TRIANGLES = 60, 20_000, 120_000, 20_000

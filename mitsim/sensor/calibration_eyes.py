@@ -192,7 +192,7 @@ def _maps(path: list[_Named]) -> Iterator[list[_Named]]:
             if isinstance(inner, dict):
                 stated = inner.get("name")
                 own = key if many is not value else f"{key}.{stated if isinstance(stated, str) and stated else number}"
-                yield from _maps([*path, (_dotted(name, own), inner)])
+                yield from _maps([*path, (dotted(name, own), inner)])
 
 
 def _eye(path: list[_Named], depth: int, matrix: Composed) -> Eye:
@@ -200,7 +200,7 @@ def _eye(path: list[_Named], depth: int, matrix: Composed) -> Eye:
     own: list[_Named] = []
     for name, table in reversed(path[depth - 1 :]):
         own += [(name, table)]
-        own += [(_dotted(name, key), value) for key, value in table.items() if _is_beside(value)]
+        own += [(dotted(name, key), value) for key, value in table.items() if _is_beside(value)]
     around = [*own, *reversed(path[: depth - 1])]
     qualifying: dict[str, Any] = {}
     for _, table in reversed(around):
@@ -229,7 +229,7 @@ def _matrix(name: str, table: dict[str, Any]) -> Composed | None:
     for usual in sorted(_MATRICES & set(low)) if name else ():
         numbers = vector(table[low[usual]], 9)
         if numbers is not None:
-            return Composed(numbers.reshape(3, 3), (_dotted(name, low[usual]),), table)
+            return Composed(numbers.reshape(3, 3), (dotted(name, low[usual]),), table)
     four = vector(table.get(low.get("intrinsics", "")))
     keys = [next((low[each] for each in names if each in low), "") for names in (*_SINGLE, *_DOUBLE)]
     if all(keys[:4]):
@@ -243,7 +243,7 @@ def _matrix(name: str, table: dict[str, Any]) -> Composed | None:
         sources = [low["intrinsics"]]
     else:
         return None
-    return Composed(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), tuple(_dotted(name, each) for each in sources), {})
+    return Composed(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), tuple(dotted(name, each) for each in sources), {})
 
 
 def is_fisheye(table: dict[str, Any]) -> bool:
@@ -259,7 +259,7 @@ def _lens(maps: list[_Named], fisheye: bool) -> Composed | None:
         for each in sorted(_LENSES & set(low)):
             bent = vector(table[low[each]])
             if bent is not None:
-                return Composed(bent, (_dotted(name, low[each]),), table)
+                return Composed(bent, (dotted(name, low[each]),), table)
         names = [
             each for each in (_FISHEYE if fisheye else _BENT) if vector(table.get(low.get(each, "")), 1) is not None
         ]
@@ -267,7 +267,7 @@ def _lens(maps: list[_Named], fisheye: bool) -> Composed | None:
             order = _FISHEYE if fisheye else _BENT
             count = next(each for each in (4, 5, 8, 12, 14) if each > order.index(names[-1]))
             numbers = [_number(table[low[each]]) if each in names else 0.0 for each in order[:count]]
-            return Composed(np.array(numbers), tuple(_dotted(name, low[each]) for each in names), table)
+            return Composed(np.array(numbers), tuple(dotted(name, low[each]) for each in names), table)
     return None
 
 
@@ -281,7 +281,7 @@ def _size(maps: list[_Named]) -> Composed | None:
         for each in sorted(_SIZES & set(low)):
             found = size_of(table[low[each]])
             if found is not None:
-                return Composed(found, (_dotted(name, low[each]),), table)
+                return Composed(found, (dotted(name, low[each]),), table)
     return None
 
 
@@ -304,7 +304,7 @@ def _pose(maps: list[_Named]) -> dict[str, Composed]:
         key = _STEP if _STEP in table else _COMMON
         step = vector(table.get(key), 16)
         if step is not None:
-            motion, metres, source = step.reshape(4, 4), {"unit": "m"}, (_dotted(name, key),)
+            motion, metres, source = step.reshape(4, 4), {"unit": "m"}, (dotted(name, key),)
             return {
                 "rotation": Composed(motion[:3, :3], source, metres),
                 "translation": Composed(motion[:3, 3], source, metres),
@@ -317,8 +317,8 @@ def _pose(maps: list[_Named]) -> dict[str, Composed]:
             if of_librealsense and len(R) == 9 and np.ndim(table[turn]) == 1:
                 rotation, table = rotation.T, {"unit": "m"} | table
             return {
-                "rotation": Composed(rotation, (_dotted(name, turn),), table),
-                "translation": Composed(T, (_dotted(name, shift),), table),
+                "rotation": Composed(rotation, (dotted(name, turn),), table),
+                "translation": Composed(T, (dotted(name, shift),), table),
             }
     return {}
 
@@ -329,7 +329,8 @@ def _number(value: Any) -> float:
     return float("nan") if found is None else float(found[0])
 
 
-def _dotted(*names: str) -> str:
+def dotted(*names: str) -> str:
+    """Return names joined by dots, without the empty ones."""
     return ".".join(name for name in names if name)
 
 

@@ -121,15 +121,12 @@ def _with_matrices(value: Any, depth: int) -> Any:
     if depth > _DEEPEST:
         return None
     if isinstance(value, list):
-        return [_with_matrices(each, depth + 1) for each in value] if any(map(_is_nested, value)) else value
+        nested = any(isinstance(each, (dict, list)) for each in value)
+        return [_with_matrices(each, depth + 1) for each in value] if nested else value
     if not isinstance(value, dict):
         return value
     out = {name: _with_matrices(each, depth + 1) for name, each in value.items()}
     return matrix_of(out) if {"rows", "cols", "data"} <= set(out) else out
-
-
-def _is_nested(value: Any) -> bool:
-    return isinstance(value, (dict, list))
 
 
 def _of_opencv(file: Path, data: bytes) -> dict[str, Any]:

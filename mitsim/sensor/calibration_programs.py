@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.sensor.calibration_eyes import Composed, eyes_of, usual_values, vector
+from mitsim.sensor.calibration_eyes import Composed, dotted, eyes_of, usual_values, vector
 
 #: endings of names in MATLAB's toolbox and similar programs: one camera, the cameras of a pair, camera and projector
 _ENDINGS = ("", "_left", "_right", "_cam", "_proj", "_camera", "_projector")
@@ -85,10 +85,10 @@ def _toolbox_pair(pair: dict[str, Any], name: str) -> dict[str, Any]:
     units = next(({"unit": unit} for unit in stated if isinstance(unit, str) and unit), {})
     for number, camera in zip("12", cameras, strict=True):
         if isinstance(camera, dict):
-            out |= _toolbox_camera(camera, _dotted(name, f"CameraParameters{number}"), number, units)
+            out |= _toolbox_camera(camera, dotted(name, f"CameraParameters{number}"), number, units)
     motion, sources = _toolbox_pose(pair)
     if motion is not None:
-        names = tuple(_dotted(name, source) for source in sources)
+        names = tuple(dotted(name, source) for source in sources)
         out |= {"+R": Composed(motion[0], names, units), "+T": Composed(motion[1], names, units)}
     return out
 
@@ -139,7 +139,3 @@ def _toolbox_camera(camera: dict[str, Any], name: str, number: str, units: dict[
     if size is not None:
         out["+size2" if number == "2" else "+size"] = Composed(size[::-1], sources, units)
     return out
-
-
-def _dotted(*names: str) -> str:
-    return ".".join(name for name in names if name)

@@ -61,10 +61,7 @@ _MODELS = {
         ),
         "perspective",
     ),
-    **dict.fromkeys(
-        ("equidistant", "fisheye", "opencv_fisheye", "kannala_brandt", "kannalabrandt8", "kb4"),
-        "fisheye",
-    ),
+    **dict.fromkeys(("equidistant", "fisheye", "opencv_fisheye", "kannala_brandt", "kannalabrandt8", "kb4"), "fisheye"),
 }
 
 #: values of other names than ``distortion_model`` that are none of OpenCV's; other texts there may name a device

@@ -26,9 +26,8 @@ class DepthSettings(Document):
 
     def at_exposure(self, share: float) -> Self:
         """Return the settings for an exposure shorter by ``share`` than the one to which the limits refer."""
-        return (
-            self.model_copy(update={self.level_key: getattr(self, self.level_key) * share}) if self.level_key else self
-        )
+        changed = {self.level_key: getattr(self, self.level_key) * share} if self.level_key else {}
+        return self.model_copy(update=changed)
 
 
 class DecoderSettings(DepthSettings):

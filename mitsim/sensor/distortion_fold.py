@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from characterisation.files.arrays import Floats
 
 #: radii [1] at which the determinant is evaluated, and number of directions around the axis
 _RADII = np.geomspace(1e-3, 1e2, 600)

@@ -29,14 +29,7 @@ from pydantic import Field, field_validator, model_validator
 from characterisation.files.documents import Document
 from characterisation.files.errors import InputError
 from mitsim.sensor.image_role import Axis, Offset, Origin, Period, Role, Share, Steps, Wave
-from mitsim.sensor.image_sequence import (
-    FringeImages,
-    GrayImages,
-    Group,
-    ImageSequence,
-    PlainImages,
-    check_displayable,
-)
+from mitsim.sensor.image_sequence import FringeImages, GrayImages, Group, ImageSequence, PlainImages, check_displayable
 
 
 class PhaseShift(Document):

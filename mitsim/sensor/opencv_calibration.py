@@ -26,13 +26,7 @@ from mitsim.sensor.calibration_doubts import baseline_note, facing_note, lens_no
 from mitsim.sensor.calibration_eyes import size_of
 from mitsim.sensor.calibration_names import USUAL_NAMES, Names
 from mitsim.sensor.calibration_numbers import by_rows, checked_matrix, numbers_of, rotation_matrix
-from mitsim.sensor.calibration_qualifiers import (
-    lens_model,
-    of_images,
-    read_out_of,
-    rectified_pair,
-    unit_mm,
-)
+from mitsim.sensor.calibration_qualifiers import lens_model, of_images, read_out_of, rectified_pair, unit_mm
 from mitsim.sensor.calibration_tree import CalibrationTree, Found, read_tree
 
 
@@ -210,9 +204,8 @@ class _Values:
         if keys.file and what in ("matrix", "distortion", "size"):
             # a file of one eye uses the names of a single camera
             names = tuple(f"{keys.file}:{key}" for key in ((given,) if given else names + USUAL_NAMES[what][0]))
-        elif (
-            place == 2 and len(self.calibration_table.cameras) == 2 and not given
-        ):  # R and T are those of the second camera
+        elif place == 2 and len(self.calibration_table.cameras) == 2 and not given:
+            # R and T are those of the second camera
             names = tuple(key for key in names if key not in USUAL_NAMES[what][1])
         for key in names:
             found = self.tree.find(key)
@@ -267,14 +260,13 @@ def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[st
         if by_columns:
             values.notes.append(f"calibration {matrix.file.name}: {name}: its matrix is written by columns")
         read_out = read_out_of(table, matrix.file)
+        width, height = own.get("width"), own.get("height")
+        stated = (width, height) if isinstance(width, int) and isinstance(height, int) else None
         if read_out is not None:
-            width, height = own.get("width"), own.get("height")
-            images = (width, height) if isinstance(width, int) and isinstance(height, int) else values.size
-            K, size, note = of_images(K, size, read_out, images)
+            K, size, note = of_images(K, size, read_out, stated or values.size)
             if note:
                 values.notes.append(f"calibration {matrix.file.name}: {name}: {note}")
-        width, height = own.get("width"), own.get("height")
-        seen = (width, height) if isinstance(width, int) and isinstance(height, int) else size or values.size
+        seen = stated or size or values.size
         if place < 2 and read_out is None and seen and (note := principal_note(name, K, seen)):
             values.notes.append(f"calibration {matrix.file.name}: {note}")
         out |= {"focal_px": [float(K[0, 0]), float(K[1, 1])], "principal_px": [float(K[0, 2]), float(K[1, 2])]}

@@ -27,13 +27,7 @@ from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.projector import Projector
 from mitsim.sensor.projector_images import ImageFolder, ProjectorImages, allowed_images, read_images
 from mitsim.sensor.sensor import Sensor
-from mitsim.sensor.sensor_file import (
-    Purpose,
-    SensorFile,
-    absent_keys,
-    needed_keys,
-    with_depths,
-)
+from mitsim.sensor.sensor_file import Purpose, SensorFile, absent_keys, needed_keys, with_depths
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
 
 

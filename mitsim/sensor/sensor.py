@@ -26,12 +26,7 @@ from mitsim.sensor.projector_images import ProjectorImages, allowed_images, chec
 from mitsim.sensor.published_lengths import PublishedAccuracy, PublishedLengths
 from mitsim.sensor.published_noise import PublishedNoise
 from mitsim.sensor.rig_parameters import moved
-from mitsim.sensor.sensor_file import (
-    MisalignmentTable,
-    Purpose,
-    RoomTable,
-    needed_keys,
-)
+from mitsim.sensor.sensor_file import MisalignmentTable, Purpose, RoomTable, needed_keys
 from mitsim.sensor.unknowns import UnknownsTable
 
 

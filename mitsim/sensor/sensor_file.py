@@ -194,11 +194,7 @@ class SensorFile(Document):
     projector: ProjectorTable = ProjectorTable()
     imager: ImagerTable = ImagerTable()
     pattern: (
-        Annotated[
-            DotPattern | LightCode | ImageFolder | AmplitudeModulation,
-            Field(discriminator="kind"),
-        ]
-        | None
+        Annotated[DotPattern | LightCode | ImageFolder | AmplitudeModulation, Field(discriminator="kind")] | None
     ) = None
     exposure: Annotated[MattWhiteExposure | FixedExposure | AutomaticExposure, Field(discriminator="rule")] | None = (
         None

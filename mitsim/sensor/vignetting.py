@@ -44,10 +44,7 @@ def camera_illumination(corner: float | None, camera: Camera) -> NDArray[np.floa
 
 
 def relative_illumination(
-    corner: float,
-    principal: tuple[float, float],
-    size: tuple[int, int],
-    pixels: NDArray[np.floating] | None = None,
+    corner: float, principal: tuple[float, float], size: tuple[int, int], pixels: NDArray[np.floating] | None = None
 ) -> NDArray[np.float32]:
     """Return the illumination of image points relative to the principal point [1].
 

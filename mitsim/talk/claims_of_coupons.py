@@ -9,6 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.coupon.view_frame import in_view_frame
+from characterisation.files.arrays import Floats
 from characterisation.files.documents import read_toml
 from characterisation.lambert_projection import inverse_lambert_projection
 from mitsim.maps.campaign.plan import CampaignFile
@@ -20,8 +21,6 @@ from mitsim.talk.plan import validation_name
 from mitsim.talk.results import Results
 from mitsim.talk.slides import Claim, Slide, collected, largest_of, mean_of, verdict
 from mitsim.talk.talk_file import Talk
-
-Floats = NDArray[np.float64]
 
 #: normals of the region of self-blinding: within this angle of the mirror direction [deg]; ring beside it
 _BLIND_DEG, _RING_DEG = 8.0, (20.0, 35.0)

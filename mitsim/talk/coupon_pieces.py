@@ -13,10 +13,10 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from characterisation.coupon.patch_table import PATCHES, overall
 from characterisation.coupon.patches import Coupon, measure_patches
+from characterisation.files.arrays import Floats
 from characterisation.files.datasets import read_dataset
 from characterisation.files.documents import read_toml
 from characterisation.files.errors import InputError
@@ -30,8 +30,6 @@ from mitsim.maps.campaign.run import run_campaign
 from mitsim.maps.campaign.store import Finished
 from mitsim.maps.prediction import CharacterisedScene
 from mitsim.talk.talk_file import map_in, sensor_in
-
-Floats = NDArray[np.float64]
 
 #: azimuth of the tilts from the baseline: between it and the direction across
 _AZIMUTH_DEG = 45.0
@@ -145,10 +143,7 @@ def tilts(folder: str, place: CouponPlace, angles: tuple[float, ...]) -> xr.Data
     looks the same at every tilt, and ``metal_along_ray`` is of the coupon.
     """
     prepared = prepared_sensor(sensor_in(folder, place.sensor))
-    plans = {
-        "metal": campaign_of(folder, place),
-        "white": campaign_of(folder, replace(place, roughness=None)),
-    }
+    plans = {"metal": campaign_of(folder, place), "white": campaign_of(folder, replace(place, roughness=None))}
     rows: list[dict[str, float]] = []
     for angle in angles:
         clouds = {name: _taken(prepared, plan, tilted(angle)) for name, plan in plans.items()}

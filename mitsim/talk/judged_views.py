@@ -11,12 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.scores.deciles import deciles, mean_ranks
 from characterisation.tasks.task_file import Task
-
-Floats = NDArray[np.float64]
 
 #: scores that are compared, in words
 SCORES = {"V_m": "view score V_m", "risk": "predicted risk", "points": "number of points"}

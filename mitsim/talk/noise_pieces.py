@@ -13,13 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy import stats
 
+from characterisation.files.arrays import Floats
 from mitsim.maps.data_sheet import Piece, Residuals, measure_piece
 from mitsim.talk.talk_file import sensor_in
-
-Floats = NDArray[np.float64]
 
 #: bins of the histogram, over this many standard deviations
 _BINS, _REACH = 61, 4.5

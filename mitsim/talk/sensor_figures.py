@@ -14,6 +14,7 @@ from matplotlib.patches import Ellipse, Patch
 from numpy.typing import NDArray
 from scipy import stats
 
+from characterisation.files.arrays import Floats
 from characterisation.lambert_projection import lambert_projection
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.plots.clouds import depth_limits, residual_limit
@@ -26,8 +27,6 @@ from mitsim.report.style import colour_scale
 from mitsim.running.numbers import finish_name
 from mitsim.talk.coupon_pieces import NO_POINT, STEP_MM
 from mitsim.talk.noise_pieces import TwoNormals
-
-Floats = NDArray[np.float64]
 
 #: largest gradient that is drawn: incidence of 68 deg
 _GRADIENT = 2.5

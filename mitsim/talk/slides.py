@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from mitsim.talk.results import Results
 
@@ -59,22 +59,23 @@ def collected(results: Results, names: Mapping[str, str], slide: Slide) -> dict[
     return {key: one for key, one in found.items() if one is not None}
 
 
-def mean_of(values: ArrayLike) -> float:
-    """Return the mean of the finite values, NaN without any."""
+def finite(values: ArrayLike) -> NDArray[np.float64]:
+    """Return the finite values (n,); NaN alone without any."""
     known = np.asarray(values, float)
     known = known[np.isfinite(known)]
-    return float(known.mean()) if len(known) else math.nan
+    return known if len(known) else np.array([math.nan])
+
+
+def mean_of(values: ArrayLike) -> float:
+    """Return the mean of the finite values, NaN without any."""
+    return float(finite(values).mean())
 
 
 def median_of(values: ArrayLike) -> float:
     """Return the median of the finite values, NaN without any."""
-    known = np.asarray(values, float)
-    known = known[np.isfinite(known)]
-    return float(np.median(known)) if len(known) else math.nan
+    return float(np.median(finite(values)))
 
 
 def largest_of(values: ArrayLike) -> float:
     """Return the largest of the finite values, NaN without any."""
-    known = np.asarray(values, float)
-    known = known[np.isfinite(known)]
-    return float(known.max()) if len(known) else math.nan
+    return float(finite(values).max())

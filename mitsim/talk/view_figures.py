@@ -10,16 +10,14 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.plots.discs import disc
 from characterisation.plots.style import BLUE, INK, MUTED, SEQUENTIAL, VERMILION, drawing, figure_of
 from mitsim.report.style import colour_scale, plain_log
 from mitsim.report.view_figures import sphere_of_views, view_places
 from mitsim.running.numbers import unit_symbol
 from mitsim.talk.judged_views import QUANTITIES, SCORES, Judged, true_error
-
-Floats = NDArray[np.float64]
 
 
 def sphere(axes: Axes, scores: xr.Dataset, values: Floats, title: str, label: str, error: bool = False) -> None:

@@ -275,10 +275,7 @@ def check_exposure(sensor: Sensor) -> None:
 
 
 def coupon_pose(
-    normal: NDArray[np.float64],
-    distance: float,
-    axis: NDArray[np.float64],
-    eye: NDArray[np.float64] | None = None,
+    normal: NDArray[np.float64], distance: float, axis: NDArray[np.float64], eye: NDArray[np.float64] | None = None
 ) -> Transform:
     """Return ``sensor_from_coupon`` with the coupon's centre on the view axis.
 

@@ -52,7 +52,7 @@ def run_campaign(campaign: Campaign, source: Source, folder: str | Path) -> Perf
     remove_partial(captures)
     normals = file.normals()
     reached = campaign.reachable(normals)
-    _report_reach(campaign, normals, reached, Path(folder))
+    _report_reach(normals, reached, Path(folder))
     wanted = {series: [normals[reached]] for series in campaign.series}
     done: dict[tuple[str, str], Finished] = {}
     fresh = dict(wanted)
@@ -161,7 +161,7 @@ def _refined(
     return fresh, unresolved
 
 
-def _report_reach(campaign: Campaign, normals: NDArray[np.float64], reached: NDArray[np.bool_], folder: Path) -> None:
+def _report_reach(normals: NDArray[np.float64], reached: NDArray[np.bool_], folder: Path) -> None:
     """Report which orientations the stage cannot show, and list them in ``unreachable.csv``."""
     listed = folder / "unreachable.csv"
     listed.unlink(missing_ok=True)

@@ -19,10 +19,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
 from characterisation.coupon.view_frame import view_frame
+from characterisation.files.arrays import Floats
 from characterisation.files.atomic_io import write_json
 from characterisation.files.checked_files import read_json_object
 from characterisation.files.documents import Document, Name, validate
@@ -33,8 +34,6 @@ from characterisation.stage.turning_axes import LINE_PARAMETERS, TurningAxes, cr
 from mitsim.capture.calibration import RigidRows, Row3
 from mitsim.capture.devices.stage_connection import StageConnection
 from mitsim.sensor.transforms import Transform
-
-Floats = NDArray[np.float64]
 
 #: largest angle between a direction in ``[stage]`` and the calibrated one [deg]; more indicates another axis, or its
 #: sign

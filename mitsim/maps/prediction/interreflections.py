@@ -34,6 +34,7 @@ from importlib.resources import files
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.files.documents import Document, read_toml
 from characterisation.region_of_interest import Roi
 from mitsim.capture.simulated.indirect_light import smoothed
@@ -52,8 +53,6 @@ from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.vignetting import camera_illumination
-
-Floats = NDArray[np.float64]
 
 #: number of pixels of the coarse camera. With three times the pixels, paths and photons screening takes 1.3 to 1.7
 #: times as long. Least rank correlation with twelve times the paths, here and there: ensenso-n10 0.99 and 1.00,

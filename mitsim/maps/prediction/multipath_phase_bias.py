@@ -40,12 +40,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from mitsim.capture.simulated.indirect_light import smoothed
 from mitsim.maps.prediction.predictor import Ideal
 from mitsim.sensor.light_code import GrayCodePhaseShift, PhaseShift, patterns
 from mitsim.sensor.sensor import Sensor
 
-Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 #: standard deviation of the window that averages A_2 [px] of the sensor

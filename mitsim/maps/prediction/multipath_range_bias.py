@@ -17,13 +17,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from mitsim.capture.simulated.indirect_light import smoothed
 from mitsim.decoding.time_of_flight import joint_path
 from mitsim.maps.prediction.predictor import Ideal
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings, sample_variance
 
-Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 #: standard deviation of the window that averages A_2 [px] of the sensor, equal to that of rendered captures; a wider

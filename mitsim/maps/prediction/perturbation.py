@@ -15,14 +15,12 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from mitsim.maps.prediction.predictor import Ideal
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.raycast import Surfaces
 from mitsim.sensor.transforms import Transform
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

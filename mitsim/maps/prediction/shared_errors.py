@@ -10,11 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from mitsim.maps.prediction.perturbation import Perturbation, SceneView
-
-Floats = NDArray[np.float64]
 
 #: fraction of the variance of the displacements that may be neglected
 LEFT_OUT = 1e-3

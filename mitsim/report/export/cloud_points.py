@@ -18,10 +18,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.point_cloud import PointCloud
 from mitsim.sensor.transforms import Transform
-
-Floats = NDArray[np.float64]
 
 #: upper triangle of a symmetric 3 x 3 matrix, in the order of the files
 COVARIANCE = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")

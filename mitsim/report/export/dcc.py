@@ -94,8 +94,10 @@ def dcc_document(found: RunResults, declared: Declaration, issuer: Issuer) -> El
     result = _add(_add(root, "measurementResults"), "measurementResult")
     _text(result, "name", "Measurement uncertainty by virtual measurements")
     _methods(result, found, declared)
-    _software(_add(result, "usedSoftware"), found)
-    _equipment(result, found, issuer)
+    _software(_add(result, "usedSoftware"))
+    equipment = _add(_add(result, "measuringEquipments"), "measuringEquipment")
+    _text(equipment, "name", f"3D vision sensor {found.sensor}, simulated")
+    _identified(_add(equipment, "identifications"), "owner", issuer.serial, "serial number")
     results = _add(result, "results")
     for one in found.results:
         _result(results, one)
@@ -103,7 +105,7 @@ def dcc_document(found: RunResults, declared: Declaration, issuer: Issuer) -> El
 
 
 def _administrative(to: Element, found: RunResults, declared: Declaration, issuer: Issuer) -> None:
-    _software(_add(to, "dccSoftware"), found)
+    _software(_add(to, "dccSoftware"))
     core = _add(to, "coreData")
     _add(core, "countryCodeISO3166_1", issuer.country)
     _add(core, "usedLangCodeISO639_1", "en")
@@ -152,16 +154,10 @@ def _methods(to: Element, found: RunResults, declared: Declaration) -> None:
         _add(used, "norm", norm)
 
 
-def _software(to: Element, found: RunResults) -> None:
+def _software(to: Element) -> None:
     one = _add(to, "software")
     _text(one, "name", "mitsim")
     _add(one, "release", __version__)
-
-
-def _equipment(to: Element, found: RunResults, issuer: Issuer) -> None:
-    one = _add(_add(to, "measuringEquipments"), "measuringEquipment")
-    _text(one, "name", f"3D vision sensor {found.sensor}, simulated")
-    _identified(_add(one, "identifications"), "owner", issuer.serial, "serial number")
 
 
 def _result(to: Element, one: ExpectedResult) -> None:

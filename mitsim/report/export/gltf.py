@@ -97,12 +97,7 @@ class _Glb:
         return node
 
     def mesh(
-        self,
-        name: str,
-        vertices: NDArray[np.float64],
-        corners: ArrayLike,
-        mode: int,
-        material: int | None = None,
+        self, name: str, vertices: NDArray[np.float64], corners: ArrayLike, mode: int, material: int | None = None
     ) -> int:
         """Append a mesh of one primitive: vertices (n, 3) [mm], and indices of the ends or corners (m, 2 or 3)."""
         metres = (vertices / 1000).astype("<f4")

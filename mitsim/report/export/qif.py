@@ -115,19 +115,11 @@ def _datums(ids: Ids, found: RunResults) -> dict[str, list[Element] | None]:
         )
         for measurement, some in used.items()
     ]
-    return {
-        "DatumDefinitions": definitions or None,
-        "Transforms": transforms,
-        "DatumReferenceFrames": frames or None,
-    }
+    return {"DatumDefinitions": definitions or None, "Transforms": transforms, "DatumReferenceFrames": frames or None}
 
 
 def _datum(ids: Ids, name: str, precedence: str) -> Element:
-    simple = {
-        "DatumDefinitionId": ids.of("datum", name),
-        "MaterialModifier": "NONE",
-        "ReferencedComponent": "ACTUAL",
-    }
+    simple = {"DatumDefinitionId": ids.of("datum", name), "MaterialModifier": "NONE", "ReferencedComponent": "ACTUAL"}
     return element("Datum", {"SimpleDatum": simple, "Precedence": {"PrecedenceEnum": precedence}})
 
 

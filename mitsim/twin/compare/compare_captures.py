@@ -28,13 +28,14 @@ from typing import Any, Literal
 import numpy as np
 from scipy.stats import wasserstein_distance
 
+from characterisation.files.arrays import Floats
 from characterisation.files.atomic_io import json_values
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.decoding.cloud import Geometry, Settings, capture_geometry
 from mitsim.decoding.matching.stereo import StereoGeometry
 from mitsim.running.numbers import two_digits
-from mitsim.twin.compare.compared_quantities import QUANTITIES, Floats, Quantity
+from mitsim.twin.compare.compared_quantities import QUANTITIES, Quantity
 from mitsim.twin.compare.plain_image import plain_image
 from mitsim.twin.compare.rebuild import median_level
 from mitsim.twin.compare.specimen_patches import PATCH_PX, SpecimenPatches, contrast_window, specimen_patches
@@ -157,7 +158,7 @@ def compare_captures(
             "REAL", "specimen", found, f"{LEAST_PATCHES} or more", "use a larger --window, or a nearer view"
         )
     _check_place(real_patches, simulated_patches, where)
-    reasons, inapplicable = _reasons_not_comparable(real, simulated, projector_on), _inapplicable(real, geometry)
+    reasons, inapplicable = _reasons_not_comparable(simulated, projector_on), _inapplicable(real, geometry)
     rows = [_histogram_row(real_patches, simulated_patches, reasons, seed)]
     for number, quantity in enumerate(QUANTITIES):
         if quantity.name in inapplicable:
@@ -206,7 +207,7 @@ def _check_place(real_patches: SpecimenPatches, simulated_patches: SpecimenPatch
         )
 
 
-def _reasons_not_comparable(real: Capture, simulated: Capture, projector_on: bool) -> dict[str, str]:
+def _reasons_not_comparable(simulated: Capture, projector_on: bool) -> dict[str, str]:
     """Return the reasons why quantities cannot be compared, by name."""
     taken: dict[str, str] = simulated.settings.get("rebuilt", {}).get("taken", {})
     if projector_on == (simulated.settings.get("projector_on") is not False):

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.coupon.residual_field import Autocorrelation
+from characterisation.files.arrays import Floats
 from characterisation.point_cloud import Status
 from mitsim.twin.compare.rebuild import median_level
 from mitsim.twin.compare.specimen_patches import SpecimenPatches
 
-Floats = NDArray[np.float64]
 Picked = NDArray[np.intp]
 Figure = Callable[[SpecimenPatches, Picked], Floats]
 

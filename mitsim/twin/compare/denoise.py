@@ -16,9 +16,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.fft import dct
 
+from characterisation.files.arrays import Floats
 from mitsim.twin.finish.fine_detail import noise_of_levels
-
-Floats = NDArray[np.float64]
 
 #: side of a window [px]; standard deviations of the noise under which a coefficient is noise
 _SIDE_PX, _THRESHOLD = 8, 3.0

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from scipy.ndimage import laplace, map_coordinates
 
+from characterisation.files.arrays import Floats
 from mitsim.capture.simulated.exposing import LightOnImagers
 from mitsim.scene import backend
 from mitsim.scene.load import Scene, scene_from_dict
@@ -26,8 +26,6 @@ from mitsim.twin.compare.denoise import denoised
 from mitsim.twin.compare.plain_image import PlainImage
 from mitsim.twin.finish.place import Bend, Place
 from mitsim.twin.finish.specimen import image_mask
-
-Floats = NDArray[np.float64]
 
 #: reflectance of the twin's plate without texture; the fit determines only its product with the power
 REFLECTANCE = 0.85

@@ -29,6 +29,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.exposing import LightOnImagers
@@ -46,8 +47,6 @@ from mitsim.twin.compare.plate import REFLECTANCE, plate, printed, texture_of
 from mitsim.twin.finish.electrons import chip_of, linearised
 from mitsim.twin.finish.place import Place
 from mitsim.twin.finish.specimen import MARGIN_PX, image_mask
-
-Floats = NDArray[np.float64]
 
 #: rays per pixel
 SAMPLES = 16

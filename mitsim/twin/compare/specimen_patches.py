@@ -23,6 +23,7 @@ from scipy.ndimage import uniform_filter
 
 from characterisation.coupon.metrics import RayNoise, ray_noise_std
 from characterisation.coupon.residual_field import LARGEST_LAG, autocorrelation
+from characterisation.files.arrays import Floats
 from characterisation.point_cloud import PointCloud, Status
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
@@ -33,8 +34,6 @@ from mitsim.twin.compare.plain_image import plain_image
 from mitsim.twin.finish.fine_detail import finest_detail
 from mitsim.twin.finish.place import Place
 from mitsim.twin.finish.specimen import MARGIN_PX, image_mask, on_specimen
-
-Floats = NDArray[np.float64]
 
 PATCH_PX = 40
 

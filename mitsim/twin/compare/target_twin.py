@@ -13,7 +13,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from characterisation.features.fits import fit_plane, fit_sphere
 from characterisation.features.robust_fit import FitError
@@ -29,8 +28,6 @@ from mitsim.scene.load import Scene
 from mitsim.scene.test_targets import ball, plate
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
-
-Floats = NDArray[np.float64]
 
 #: rays per pixel
 SAMPLES = 16

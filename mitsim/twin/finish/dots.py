@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import fourier_gaussian
 from scipy.optimize import brentq
 
-from mitsim.twin.finish.observation import CouponView, Floats
+from characterisation.files.arrays import Floats
+from mitsim.twin.finish.observation import CouponView
 from mitsim.twin.finish.white_coupon import WhiteCouponRenderer, coupon_roi
 
 #: largest blur [px]

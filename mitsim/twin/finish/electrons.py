@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.sensor.image_formation import converter
@@ -26,8 +27,6 @@ from mitsim.sensor.imager import Imager
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.sensor import Sensor
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

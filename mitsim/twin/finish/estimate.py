@@ -26,9 +26,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares, nnls
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from mitsim.twin.finish.finish import LOG_ALPHA_RANGE, MetalFinish
-from mitsim.twin.finish.observation import CouponView, Floats
+from mitsim.twin.finish.observation import CouponView
 from mitsim.twin.finish.problem import FIRST_GRAIN, Problem, Residual
 
 #: number of alphas in the scan
@@ -81,10 +82,10 @@ class Fit:
     residuals: tuple[Residual, ...] = field(repr=False)
 
 
-def fit_views(views: Sequence[CouponView], finish: MetalFinish | None, where: str = "captures") -> Fit:
+def fit_views(views: Sequence[CouponView], finish: MetalFinish | None) -> Fit:
     """Fit alpha, the power and the wide-angle share of a coupon to its views.
 
-    ``finish`` is the metal and process of the coupon, None for a diffuse sheet. Messages name ``where``.
+    ``finish`` is the metal and process of the coupon, None for a diffuse sheet.
 
     Raises
     ------
@@ -96,7 +97,7 @@ def fit_views(views: Sequence[CouponView], finish: MetalFinish | None, where: st
         whole = sum(view.whole for view in views)
         free = f"{problem.count} of {whole} blocks on the coupon free of saturation"
         hint = "shorter exposures, other poses, or smaller blocks"
-        raise InputError(where, "images", free, f"{FEWEST_BLOCKS} or more", hint)
+        raise InputError("captures", "images", free, f"{FEWEST_BLOCKS} or more", hint)
     values, variance, grain = best_values(problem)
     residual, jacobian = problem.residual(values, variance), problem.jacobian(values, variance)
     degrees = max(problem.count - len(values), 1)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d, uniform_filter
 
-Floats = NDArray[np.float64]
+from characterisation.files.arrays import Floats
 
 #: weights along each axis, which keep the variance of white noise
 FINEST = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70.0)

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
@@ -34,8 +35,6 @@ from mitsim.sensor.sensor import Sensor
 from mitsim.twin.finish.electrons import PixelNoise, chip_of, linearised, pixel_noise
 from mitsim.twin.finish.place import Place
 from mitsim.twin.finish.white_coupon import Pattern, WhiteCouponRenderer, coupon_roi
-
-Floats = NDArray[np.float64]
 
 #: margin inside the coupon's edge that its blur may reach [px]
 _EDGE_PX = 5.0

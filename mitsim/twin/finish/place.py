@@ -22,11 +22,10 @@ from numpy.polynomial.legendre import legvander2d
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 from mitsim.sensor.transforms import Transform
-
-Floats = NDArray[np.float64]
 
 #: number of cells along the longer side of the recovered points
 _CELLS = 120

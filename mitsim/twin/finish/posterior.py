@@ -16,17 +16,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from characterisation.files.arrays import Floats
 from mitsim.scene.surface.processes import LARGEST_WIDE_ANGLE
 from mitsim.scene.surface.scatter import LARGEST_DEVIATION, Deviation, Scatter
 from mitsim.twin.finish.estimate import Fit, best_values, refine
 from mitsim.twin.finish.finish import MetalFinish
 from mitsim.twin.finish.observation import CouponView
 from mitsim.twin.finish.problem import Problem
-
-Floats = NDArray[np.float64]
 
 #: Beckmann shares that are fitted [1]; chi-square and results are smooth between them
 _SHARES = (0.0, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)

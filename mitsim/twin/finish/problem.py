@@ -24,9 +24,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from mitsim.scene.differentiable import Directions, SpecularLobe
 from mitsim.twin.finish.finish import MetalFinish
-from mitsim.twin.finish.observation import CouponView, Floats
+from mitsim.twin.finish.observation import CouponView
 
 #: largest correlation of neighbouring pixels in the grain, which falls to 1 / e at 4.4 px then
 _MOST_CORRELATED = 0.95

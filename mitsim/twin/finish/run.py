@@ -198,11 +198,8 @@ def fit_captures(
     views: list[CouponView] = []
     dots: list[Dots] = []
     places: list[Place] = []
-    renderer, calibration, unknown = (
-        WhiteCouponRenderer(with_rig(chosen, first.rig)),
-        calibration_table(first.rig),
-        False,
-    )
+    renderer, calibration = WhiteCouponRenderer(with_rig(chosen, first.rig)), calibration_table(first.rig)
+    unknown = False
     for index, folder in enumerate(track(list(captures), "captures", len(captures))):
         capture = read_capture(folder)
         if capture.sensor != first.sensor:

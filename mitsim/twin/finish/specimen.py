@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from characterisation.features.fits import fit_plane
 from characterisation.features.robust_fit import FitError
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
@@ -23,8 +24,6 @@ from mitsim.sensor.roi import roi_around
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.twin.finish.place import Bend, Place, fit_bend, found_place, known_place, plane_points
-
-Floats = NDArray[np.float64]
 
 #: margin inside the specimen's outline that is not used [px]: its edge is blurred, and matched with the background
 MARGIN_PX = 15.0

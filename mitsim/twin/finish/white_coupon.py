@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.rendering import Rendering
@@ -26,8 +27,6 @@ from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.roi import roi_around
 from mitsim.sensor.sensor import Sensor
 from mitsim.twin.finish.place import Place
-
-Floats = NDArray[np.float64]
 
 #: image in place of a sensor's patterns: the mean of all patterns; a uniform image of their mean level; the first one
 Pattern = Literal["mean", "level", "first"]

@@ -16,13 +16,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from characterisation.files.arrays import Floats
 from mitsim.decoding.cloud import capture_cloud, decoder_settings
 from mitsim.twin.sensor.input_captures import InputCapture
-
-Floats = NDArray[np.float64]
 
 #: terms of the series
 _HARMONICS = np.arange(1, 40, 2)

@@ -16,9 +16,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.sensor.pattern import DotPattern
@@ -32,8 +32,6 @@ from mitsim.twin.sensor.moments import MomentFit, Prior, match_moments
 from mitsim.twin.sensor.parameters import CORNER_BLUR, FLUX, SMOOTHING, Parameter, room_parameters, with_room
 from mitsim.twin.sensor.specimen_simulator import SpecimenSimulator
 from mitsim.twin.sensor.verdict import CHANCE
-
-Floats = NDArray[np.float64]
 
 #: side of a patch [px], and the least number of patches of a capture
 PATCH_PX, FEWEST_PATCHES = 40, 8

@@ -19,12 +19,11 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
+from characterisation.files.arrays import Floats
 from characterisation.region_of_interest import Roi
 from mitsim.sensor.camera import Camera
 from mitsim.twin.compare.specimen_patches import patch_corners
 from mitsim.twin.finish.fine_detail import finest_detail
-
-Floats = NDArray[np.float64]
 
 #: names of the features of a patch
 FIGURES = ("level", "contrast", "crossings", "sharpness", "noise in the dark half", "noise in the bright half", "grain")

@@ -19,9 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from mitsim.running.progress import say_progress
-
-Floats = NDArray[np.float64]
 
 #: features (n,) and their covariance (n, n) of simulation number i at parameters (k,)
 Simulate = Callable[[Floats, int], tuple[Floats, Floats]]

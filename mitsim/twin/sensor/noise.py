@@ -36,13 +36,14 @@ from mitsim.twin.sensor.photon_transfer import (
 )
 from mitsim.twin.sensor.response import first_knee, quiet_pixels
 
-Floats = NDArray[np.float64]
-
 #: largest number of pixels used in a group
 _PIXELS = 200_000
 
 #: range of the smoothing estimate [px], and its least significance in standard uncertainties
 _SMOOTHINGS, _SURE = (0.05, 3.0), 3.0
+
+#: variance of rounding to whole grey levels [DN^2]
+_ROUNDING = 1 / 12
 
 #: share of the specimen's pixels away from edges of the print, above which the noise is estimated from these alone
 _LEAST_QUIET = 0.2
@@ -96,13 +97,11 @@ def without_fixed_pattern(imager: Imager) -> Imager:
     return replace(imager, dsnu=0.0, prnu=0.0, row_noise=0.0, column_pattern=0.0)
 
 
-def smoothing_of(
-    image: NDArray[np.unsignedinteger], mask: NDArray[np.bool_], rounding: float = 1 / 12
-) -> tuple[float, float]:
+def smoothing_of(image: NDArray[np.unsignedinteger], mask: NDArray[np.bool_]) -> tuple[float, float]:
     """Return the standard deviation [px] of the Gaussian that smoothed an image's noise, and its uncertainty.
 
-    The correlation of neighbours in the finest detail is -0.8 for white noise and rises with smoothing. ``rounding``
-    [DN^2] is the white noise of whole grey levels; it is subtracted first.
+    The correlation of neighbours in the finest detail is -0.8 for white noise and rises with smoothing. The white
+    noise of whole grey levels is subtracted first.
     """
     fine = finest_detail(image.astype(float))
     size = 1.4826 * float(np.median(np.abs(fine[mask])))
@@ -112,10 +111,10 @@ def smoothing_of(
         both = usable[first] & usable[second]
         products.append(float((fine[first] * fine[second])[both].mean()))
     white_energy, white_product = _fine_moments(0.0)
-    left = energy - rounding * white_energy
+    left = energy - _ROUNDING * white_energy
     if left <= 0.1 * energy:
         return 0.0, float("inf")
-    correlation = (float(np.mean(products)) - rounding * white_product) / left
+    correlation = (float(np.mean(products)) - _ROUNDING * white_product) / left
     spread = np.sqrt(2 / (float(usable.sum()) * independent_share())) * energy / left
     low, high = (_correlation(s) for s in _SMOOTHINGS)
 

@@ -25,11 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
+from characterisation.files.arrays import Floats
 from mitsim.sensor.imager import Imager
 from mitsim.twin.finish.electrons import linearised
 from mitsim.twin.finish.fine_detail import FINEST, level_variances
-
-Floats = NDArray[np.float64]
 
 #: number of bins; least distance of a bin from either end of the grey levels, in standard deviations
 _BINS, _CLEAR = 24, 4.0

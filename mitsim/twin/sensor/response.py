@@ -33,12 +33,12 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from characterisation.files.arrays import Floats
 from mitsim.sensor.imager import Imager
 from mitsim.twin.compare.denoise import denoised
 from mitsim.twin.finish.fine_detail import FINEST, MEDIAN_SQUARE, finest_detail, noise_of_levels
 from mitsim.twin.sensor.photon_transfer import independent_share
 
-Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 #: side of a tile and its rim, which the weights reach [px]

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mitsim.sensor.imager import electrons_per_radiance
 from mitsim.sensor.sensor import Sensor
@@ -24,8 +23,6 @@ from mitsim.twin.sensor.estimate import FittedKey
 from mitsim.twin.sensor.figures import SpecimenField
 from mitsim.twin.sensor.input_captures import InputCapture
 from mitsim.twin.sensor.parameters import ROOM_KEYS
-
-Floats = NDArray[np.float64]
 
 _PATCH_PX, _FEWEST_FOR_TERMS = 20, 24
 

@@ -14,15 +14,13 @@ mounts are the same.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from mitsim.capture.capture import Capture
 from mitsim.decoding.cloud import Settings, capture_geometry
 from mitsim.decoding.matching.stereo import StereoGeometry
 from mitsim.twin.compare.specimen_patches import patch_rows
 from mitsim.twin.finish.place import Place
-
-Floats = NDArray[np.float64]
 
 #: least number of patches for a line; outlier limit in standard deviations
 _FEWEST, _CLIP = 6, 3.0

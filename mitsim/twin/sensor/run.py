@@ -14,7 +14,6 @@ from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
@@ -46,8 +45,6 @@ from mitsim.twin.sensor.room import RoomFit, fit_room
 from mitsim.twin.sensor.rows import row_turns
 from mitsim.twin.sensor.stripes import fit_stripes
 from mitsim.twin.sensor.verdict import Agreement, Verdict, verdict_of
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

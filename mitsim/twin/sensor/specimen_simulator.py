@@ -32,8 +32,6 @@ from mitsim.sensor.vignetting import camera_illumination
 from mitsim.twin.compare.plate import REFLECTANCE, plate
 from mitsim.twin.finish.place import Place
 
-Floats = NDArray[np.float64]
-
 #: rays per pixel; number of cached renders
 _SAMPLES, _KEPT = 16, 48
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
+from characterisation.files.arrays import Floats
 from mitsim.decoding.cloud import capture_pattern
 from mitsim.sensor.image_role import Role
 from mitsim.sensor.imager import Imager
@@ -28,8 +29,6 @@ from mitsim.twin.sensor.estimate import FittedKey
 from mitsim.twin.sensor.input_captures import InputCapture
 from mitsim.twin.sensor.noise import without_fixed_pattern
 from mitsim.twin.sensor.photon_transfer import one_image_line
-
-Floats = NDArray[np.float64]
 
 #: side of the window around a pixel that must be uniform, and its largest variation as a share of white
 _EVEN_PX, _EVEN_SHARE = 7, 0.3
