@@ -243,3 +243,13 @@ def test_the_bottom_of_a_deep_bore_is_seen_and_what_is_inside_is_not(tmp_path):
     )
     assert shapes["bottom"].front_hits > 0
     assert shapes["buried"].front_hits + shapes["buried"].back_hits == 0
+
+
+def test_a_part_far_from_the_origin_is_reported(tmp_path, n10):
+    """Single precision has steps of 2^-23 of a power of two: 0.0156 mm at 200 m."""
+    for metres, told in ((5, False), (200, True)):
+        place = f'<transform name="to_world"><scale value="40"/><translate x="{1000 * metres}"/></transform>'
+        scene = scene_of(tmp_path, f'<shape type="cube" id="block">{place}{WHITE}</shape>')
+        pose = look_at(scene.centre + np.array([0, 0, 500]), scene.centre, (0, 1, 0))
+        found = findings(inspect(scene), n10, pose, visible_surfaces(scene, n10.rig, pose), False)
+        assert any("rounded to 0.016 mm" in one.what for one in found) is told
