@@ -293,5 +293,5 @@ def test_a_rotation_about_a_unit_vector_keeps_sizes_and_others_are_refused(tmp_p
         box = f'<transform name="to_world"><scale x="20" y="15" z="10"/>{turn}</transform>'
         body = f'<default name="along" value="0.70710678"/><shape type="cube" id="a">{box}</shape>'
         assert inspect(scene_of(tmp_path, body)).shapes[0].area == pytest.approx(5200, rel=1e-4)
-        with pytest.raises(InputError, match='a unit vector: x="0.7071068" y="0.7071068" z="0"'):
+        with pytest.raises(InputError, match=r'a unit vector: x="0\.7071068" y="0\.7071068" z="0"'):
             scene_of(tmp_path, body.replace("0.7071", "0.8071"))
