@@ -7,7 +7,7 @@ rays from all directions (:mod:`mitsim.scene.first_hits`) -> counts of hits on t
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,11 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.coupon.orientations import sphere_directions
+from characterisation.files.errors import InputError
 from mitsim.scene.backend import mi
 from mitsim.scene.first_hits import first_hits
 from mitsim.scene.load import Scene, bounds_of
 from mitsim.scene.materials import Finish
 from mitsim.scene.mesh_facts import MeshFacts, mesh_facts
+from mitsim.scene.xml_check import checked_trees
 
 Floats = NDArray[np.float64]
 
@@ -100,6 +102,14 @@ def inspect(scene: Scene) -> SceneFacts:
     rows = zip(scene.shapes, scene.names, scene.finishes, front_hits.tolist(), back_hits.tolist(), strict=True)
     shapes = tuple(_count_escaping_rays(scene, _facts(*row, types, size * _MERGE), size) for row in rows)
     return SceneFacts(shapes, scene.bounds, _merged_mesh(shapes, size * _MERGE), _emitters(scene))
+
+
+def shape_facts(scene: Scene, names: Collection[str]) -> tuple[ShapeFacts, ...]:
+    """Return the facts about the shapes of these names, without hits of rays."""
+    types = _types_in_xml(Path(scene.where))
+    size = float(np.linalg.norm(scene.bounds[1] - scene.bounds[0]))
+    rows = zip(scene.shapes, scene.names, scene.finishes, strict=True)
+    return tuple(_facts(*row, 0, 0, types, size * _MERGE) for row in rows if row[1] in names)
 
 
 def _facts(
@@ -268,12 +278,12 @@ def _value(parent: Any, key: str) -> float:
 def _types_in_xml(path: Path) -> dict[str, tuple[str, str]]:
     """Return the types of each named shape and of its BSDF in the XML, by the id of the shape."""
     try:
-        root = ElementTree.parse(path).getroot()
-    except (OSError, ElementTree.ParseError):
+        every = [element for root in checked_trees(path) for element in root.iter()]
+    except InputError:
         return {}  # the scene was not loaded from a file
-    types = {str(e.get("id")): str(e.get("type")) for e in root.iter("bsdf")}
+    types = {str(e.get("id")): str(e.get("type")) for e in every if e.tag == "bsdf"}
     out = {}
-    for shape in root.iter("shape"):
+    for shape in (e for e in every if e.tag == "shape"):
         own = shape.find("bsdf")
         references = [types[str(r.get("id"))] for r in shape.iter("ref") if r.get("id") in types]
         bsdf = str(own.get("type")) if own is not None else references[0] if references else "diffuse (Mitsuba's own)"

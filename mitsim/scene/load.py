@@ -24,7 +24,7 @@ from mitsim.scene import backend
 from mitsim.scene.materials import Finish, loading, register
 from mitsim.scene.scene_errors import explain_error
 from mitsim.scene.surface.scatter import NOMINAL, Deviation
-from mitsim.scene.xml_check import checked_xml
+from mitsim.scene.xml_check import check_rotations, checked_trees
 from mitsim.sensor.poses import as_pose
 from mitsim.sensor.transforms import Transform
 
@@ -267,14 +267,30 @@ def _wrap(scene: Any, finishes: dict[str, Finish], where: str) -> Scene:
         raise InputError(where, "shape", f"a scene {size:g} mm across", "1 mm to 100 m", hint)
     _share_kernels(scene)
     names = tuple(shape.id() or f"shape_{i}" for i, shape in enumerate(shapes))
+    for name, shape in zip(names, shapes, strict=True):
+        _check_round(where, name, shape)
     changeable = all(shape.class_name() != "Instance" for shape in shapes)
     on_shapes = [shape.bsdf().id() for shape in shapes]
     changeable = changeable and set(finishes) <= set(on_shapes)
     return Scene(scene, names, tuple(finishes.get(name) for name in on_shapes), bounds, where, changeable)
 
 
+def _check_round(where: str, name: str, shape: Any) -> None:
+    """Reject a sphere or cylinder whose section is an ellipse: Mitsuba draws a circle, but samples the ellipse."""
+    kind = shape.class_name()
+    if kind not in ("Sphere", "Cylinder"):
+        return
+    axes = np.array(backend.mi.traverse(shape)["to_world"].matrix, float).reshape(4, 4)[:3, :3]
+    products = axes.T @ axes
+    if kind == "Cylinder":  # its length is independent
+        products[2, 2] = products[0, 0]
+    if np.abs(products - products[0, 0] * np.eye(3)).max() > 1e-4 * products[0, 0]:
+        found = f"a {kind.lower()} that to_world scales unequally or shears"
+        raise InputError(where, f"shape {name}", found, "a circular section", "mesh other forms: mitsim part")
+
+
 def _check_xml(path: Path, parameters: dict[str, str]) -> None:
-    root = checked_xml(path)
+    root, *_ = trees = checked_trees(path)
     if root.tag != "scene":
         raise InputError(path, "", f"the root element <{root.tag}>", "<scene version='3.0.0'>")
     known = [str(d.get("name")) for d in root.iter("default")]
@@ -282,6 +298,7 @@ def _check_xml(path: Path, parameters: dict[str, str]) -> None:
         if name not in known:
             allowed = ", ".join(known) or "none: the scene has no <default>"
             raise InputError(path, name, "a parameter that the scene does not have", allowed, nearest(name, known))
+    check_rotations(path, trees, parameters)
 
 
 def _one_line(error: Exception) -> str:

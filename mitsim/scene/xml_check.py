@@ -7,10 +7,11 @@ a pipe waits forever.
 from __future__ import annotations
 
 import hashlib
+import math
 import re
 import stat
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,11 +42,14 @@ _FILE_PLUGINS = {"bitmap", "envmap", "gridvolume", "measured", "ply", "obj", "se
 #: deepest chain of includes; a longer one is taken for a cycle
 _MOST_INCLUDES = 16
 
+#: largest deviation of the length of an axis from 1: 5 um in 100 mm
+_UNIT = 5e-5
+
 _ENCODING = re.compile(rb"""^[^>]*?encoding\s*=\s*["']([^"']*)["']""")
 
 
-def checked_xml(path: Path) -> ElementTree.Element:
-    """Read a scene XML and its includes, reject what Mitsuba cannot handle, and return the root element.
+def checked_trees(path: Path) -> list[ElementTree.Element]:
+    """Read a scene XML and its includes, reject what Mitsuba cannot handle, and return their root elements.
 
     Raises
     ------
@@ -53,7 +57,31 @@ def checked_xml(path: Path) -> ElementTree.Element:
         If a file is missing, does not parse, is not UTF-8, or is too large or too deeply nested. Also if it refers to
         something that is not a regular file.
     """
-    return _with_includes(path)[0][1]
+    return [root for _, root in _with_includes(path)]
+
+
+def check_rotations(path: Path, trees: Sequence[ElementTree.Element], parameters: Mapping[str, str]) -> None:
+    """Check that every rotation is about a unit vector: Mitsuba 3.9 scales and shears shapes by others.
+
+    Raises
+    ------
+    InputError
+        For the first that is not, with the unit vector.
+    """
+    elements = [element for root in trees for element in root.iter()]
+    values = {str(e.get("name")): str(e.get("value")) for e in elements if e.tag == "default"} | dict(parameters)
+    for element in elements:
+        if element.tag != "rotate":
+            continue
+        words = element.get("value", " ".join(element.get(axis, "0") for axis in "xyz"))
+        try:
+            axis = [float(word) for word in _filled_in(words, values).replace(",", " ").split()]
+        except ValueError:
+            continue  # Mitsuba reports it
+        length = math.hypot(*axis)
+        if abs(length - 1) > _UNIT and 0 < length < math.inf:
+            unit = " ".join(f'{name}="{one / length:.7g}"' for name, one in zip("xyz", axis, strict=False))
+            raise InputError(path, "rotate", f"an axis of length {length:.6g}", f"a unit vector: {unit}")
 
 
 def scene_files(path: Path, parameters: Mapping[str, str]) -> list[Path]:
@@ -65,7 +93,7 @@ def scene_files(path: Path, parameters: Mapping[str, str]) -> list[Path]:
     Raises
     ------
     InputError
-        As :func:`checked_xml`.
+        As :func:`checked_trees`.
     """
     trees = _with_includes(path)
     elements = [element for _, root in trees for element in root.iter()]

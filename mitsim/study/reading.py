@@ -30,6 +30,7 @@ from mitsim.maps.campaign.missing_finishes import (
 )
 from mitsim.maps.campaign.plan import Campaign, check_exposure, read_campaign, sensor_checksum
 from mitsim.running.progress import say
+from mitsim.scene.authoring.check_task import check_geometry
 from mitsim.scene.load import Scene, load_scene
 from mitsim.scene.materials import Finish
 from mitsim.scene.ray_casting.triangles import triangles
@@ -145,6 +146,7 @@ def open_study(
     )
     check_features(task, folder / file.task, scene.names)
     check_nominal_values(task, folder / file.task)
+    check_geometry(task, folder / file.task, scene)
     file = _with_limits(path, file, task)
     radius = float(np.linalg.norm(scene.bounds[1] - scene.bounds[0])) / 2
     standoffs = chosen_standoffs(path, file.views, sensor, radius)

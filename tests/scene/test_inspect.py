@@ -19,6 +19,7 @@ from mitsim.scene.visible_surfaces import visible_surfaces
 from mitsim.sensor.transforms import look_at
 
 WHITE = '<bsdf type="matt_white"/>'
+SKEW = '<rotate x="3" y="3" angle="90"/><scale value="10"/>'
 TEN = '<transform name="to_world"><scale value="10"/></transform>'
 
 
@@ -204,6 +205,7 @@ def test_lamps_have_their_flux_and_delta_materials_are_known(tmp_path):
             "type",
             "'machined_metal'",
         ),
+        (f'<shape type="cube" id="a"><transform name="to_world">{SKEW}</transform></shape>', "rotate", 'y="0.7071068"'),
         ('<bsdf type="diffuse" id="finish"/><shape type="sphere" id="a"><ref id="finsh"/></shape>', "ref", "'finish'"),
         (
             '<bsdf type="machined_metal" id="f"><float name="Raa" value="1"/></bsdf><shape type="sphere" id="a"/>',
@@ -243,3 +245,53 @@ def test_the_bottom_of_a_deep_bore_is_seen_and_what_is_inside_is_not(tmp_path):
     )
     assert shapes["bottom"].front_hits > 0
     assert shapes["buried"].front_hits + shapes["buried"].back_hits == 0
+
+
+def test_a_part_far_from_the_origin_is_reported(tmp_path, n10):
+    """Single precision has steps of 2^-23 of a power of two: 0.0156 mm at 200 m."""
+    for metres, told in ((5, False), (200, True)):
+        place = f'<transform name="to_world"><scale value="40"/><translate x="{1000 * metres}"/></transform>'
+        scene = scene_of(tmp_path, f'<shape type="cube" id="block">{place}{WHITE}</shape>')
+        pose = look_at(scene.centre + np.array([0, 0, 500]), scene.centre, (0, 1, 0))
+        found = findings(inspect(scene), n10, pose, visible_surfaces(scene, n10.rig, pose), False)
+        assert any("rounded to 0.016 mm" in one.what for one in found) is told
+
+
+@pytest.mark.parametrize(
+    ("kind", "scale", "right"),
+    [
+        ("sphere", 'x="2"', False),
+        ("sphere", 'z="2"', False),
+        ("sphere", 'value="2"', True),
+        ("cylinder", 'y="2"', False),
+        ("cylinder", 'z="2"', True),
+    ],
+)
+def test_spheres_and_cylinders_of_elliptical_section_are_refused(tmp_path, kind, scale, right):
+    """Mitsuba draws circles with the scale along x, and samples points of ellipses."""
+    turned = f'<transform name="to_world"><scale {scale}/><rotate x="0.6" y="0.8" angle="40"/></transform>'
+    body = f'<shape type="{kind}" id="a">{WHITE}<float name="radius" value="20"/>{turned}</shape>'
+    if right:
+        assert scene_of(tmp_path, body).names == ("a",)
+    else:
+        with pytest.raises(InputError, match=f"shape a: found a {kind} that to_world scales unequally"):
+            scene_of(tmp_path, body)
+
+
+def test_a_finish_of_an_included_file_has_its_type(tmp_path):
+    (tmp_path / "finish.xml").write_text('<scene version="3.0.0"><bsdf type="roughconductor" id="f"/></scene>')
+    _, shapes = facts_of(
+        tmp_path, f'<include filename="finish.xml"/><shape type="cube" id="a">{TEN}<ref id="f"/></shape>'
+    )
+    assert shapes["a"].bsdf == "roughconductor"
+
+
+def test_a_rotation_about_a_unit_vector_keeps_sizes_and_others_are_refused(tmp_path):
+    """Mitsuba 3.9.1 makes a cube of 90 x 90 x 70 mm of a box of 40 x 30 x 20 mm that is turned about (1, 1, 0)."""
+    for axis in ('x="0.7071" y="0.7071"', 'value="0.70710678, 0.70710678, 0"', 'x="$along" y="$along"'):
+        turn = f'<rotate {axis} angle="90"/>'
+        box = f'<transform name="to_world"><scale x="20" y="15" z="10"/>{turn}</transform>'
+        body = f'<default name="along" value="0.70710678"/><shape type="cube" id="a">{box}</shape>'
+        assert inspect(scene_of(tmp_path, body)).shapes[0].area == pytest.approx(5200, rel=1e-4)
+        with pytest.raises(InputError, match=r'a unit vector: x="0\.7071068" y="0\.7071068" z="0"'):
+            scene_of(tmp_path, body.replace("0.7071", "0.8071"))

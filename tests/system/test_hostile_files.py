@@ -20,7 +20,7 @@ from mitsim.capture.recordings.ply import decode_ply
 from mitsim.report.choice_page import write_choice_page
 from mitsim.scene.authoring.read_mesh import read_mesh
 from mitsim.scene.surface.measured import read_height_map, read_profile
-from mitsim.scene.xml_check import checked_xml
+from mitsim.scene.xml_check import checked_trees
 from mitsim.sensor.calibration_tree import read_tree
 from mitsim.sensor.projector_images import counted
 from mitsim.study.scene_geometry import read_scene_geometry
@@ -84,7 +84,7 @@ def test_what_is_no_file_is_not_read(tmp_path, kind):
         lambda p: read_toml(p, Number),
         read_cloud,
         read_grey,
-        checked_xml,
+        checked_trees,
         read_profile,
         lambda p: read_tree([p]),
         lambda p: read_height_map(p, 1.0),
@@ -106,14 +106,14 @@ def test_what_is_no_file_is_not_read(tmp_path, kind):
 )
 def test_scenes_that_mitsuba_would_not_survive(tmp_path, inside, told):
     (tmp_path / "scene.xml").write_text(SCENE.format(inside), encoding="utf-8")
-    refused(checked_xml, tmp_path / "scene.xml", match=told)
+    refused(checked_trees, tmp_path / "scene.xml", match=told)
 
 
 @pytest.mark.parametrize("encoding", ["gb18030", "latin-1", "utf-16"])
 def test_scenes_in_other_encodings(tmp_path, encoding):
     text = f"<?xml version='1.0' encoding='{encoding}'?>" + SCENE.format("<!-- ü -->")
     (tmp_path / "scene.xml").write_bytes(text.encode(encoding))
-    refused(checked_xml, tmp_path / "scene.xml", match="UTF-8")
+    refused(checked_trees, tmp_path / "scene.xml", match="UTF-8")
 
 
 @pytest.mark.parametrize(

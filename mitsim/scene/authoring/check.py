@@ -41,6 +41,9 @@ _SLIVERS = 0.01
 #: edges closer than this share of the part's size close one another; number of neighbours searched
 _CLOSED, _NEIGHBOURS = 1e-4, 16
 
+#: spacing of single-precision lengths at the part above which it is reported [mm]; noise of sensors is 10 um and more
+_ROUNDED_MM = 1e-3
+
 #: up to this number of back-side pixels are rays through the seam of two faces
 _CRACK_PX = 10
 
@@ -270,6 +273,10 @@ def _why_outside(sensor: Sensor, points: np.ndarray) -> str:
 def _whole(facts: SceneFacts, sensor: Sensor, open_edges: int) -> Iterator[SceneFinding]:
     """Yield findings about size, units, gaps and light of the whole scene."""
     yield from _size(sorted((facts.bounds[1] - facts.bounds[0]).tolist(), reverse=True), sensor)
+    far = float(np.abs(facts.bounds).max())
+    if (rounded := float(np.spacing(np.float32(far)))) > _ROUNDED_MM:
+        what = f"the part lies up to {far / 1000:.0f} m from the origin, where lengths are rounded to {rounded:.2g} mm"
+        yield SceneFinding("warning", "", what, "Export the part with an origin near it, before it becomes a mesh")
     parts = [shape for shape in facts.shapes if not shape.emitter]
     cut = all(shape.kind not in _STOCK for shape in parts)
     each_closed = all(shape.mesh is not None and shape.mesh.closed for shape in parts)

@@ -1,6 +1,7 @@
 """Check a task against the scene: its features, their nominal geometry, and the nominal values of its measurements.
 
 Signal chain: facts about the shapes (:mod:`mitsim.scene.inspect`), features and measurements of a task -> findings.
+A study refuses errors among those about geometry, because errors of measurements are counted from there.
 """
 
 from __future__ import annotations
@@ -11,18 +12,26 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from characterisation.features.surfaces import Cylinder
+from characterisation.features.surfaces import Cone, Cylinder, Plane, tangents
 from characterisation.files.documents import Document, read_toml
-from characterisation.files.errors import nearest
+from characterisation.files.errors import InputError, nearest
 from characterisation.tasks.decision_table import Decision
 from characterisation.tasks.task_file import Feature, Measurement, Task
 from characterisation.tasks.task_reading import misstated, read_task
-from mitsim.scene.authoring.face import surface_distance
+from mitsim.running.progress import say
+from mitsim.scene.authoring.face import Floats, surface_distance
 from mitsim.scene.authoring.finding import SceneFinding, Severity
-from mitsim.scene.inspect import SceneFacts, ShapeFacts
+from mitsim.scene.inspect import SceneFacts, ShapeFacts, shape_facts
+from mitsim.scene.load import Scene
 
 #: largest distance of nominal geometry from the shape's surface [mm]; beyond the second it is an error
 NOMINAL_MM, MISTAKE_MM = 0.05, 1.0
+
+#: share of a circle that lies on the edge of its face; the end of a slot is half a circle
+_ON_EDGE = 0.25
+
+#: an outline is this much shorter or longer than its feature at most; that of a disc has corners on its rim
+_SHORTER, _LONGER = 0.5, 1.1
 
 
 class TaskFeatures(Document):
@@ -61,13 +70,16 @@ def task_findings(facts: SceneFacts, task: TaskFeatures) -> Iterator[SceneFindin
         yield SceneFinding("note", "task", "it has no measurements yet", "Add a measurement before a study")
     for name, feature in task.features.items():
         if not feature.shaped:
-            continue  # it is derived from others
-        if name not in names:
+            plane = feature.of[0] if feature.kind in ("circle", "edge_point") and feature.of else ""
+            if plane in names:
+                yield from _figure(facts.shapes[names.index(plane)], name, feature)
+        elif name not in names:
             hint = nearest(name, names)
             advice = f"D{hint[1:]}" if hint else f"The shapes are: {', '.join(names)}"
             yield SceneFinding("error", name, "a feature of the task without a shape in the scene", advice)
         else:
             yield from _nominal(facts.shapes[names.index(name)], feature)
+            yield from _outline(facts.shapes[names.index(name)], feature)
             yield from _bore(facts.shapes[names.index(name)], feature, task)
     if task.measurements:
         whole = Task(features=task.features, measurements=task.measurements, decision=task.decision)
@@ -79,11 +91,83 @@ def task_findings(facts: SceneFacts, task: TaskFeatures) -> Iterator[SceneFindin
                 )
 
 
+def check_geometry(task: Task, task_path: str | Path, scene: Scene) -> None:
+    """Check that nominal geometry lies on the shapes of the scene; report what is off by less than an error.
+
+    Raises
+    ------
+    InputError
+        For the first feature that is over :data:`MISTAKE_MM` off.
+    """
+    shapes = {one.name: one for one in shape_facts(scene, set(task.shapes))}
+    for name, feature in task.features.items():
+        if feature.shaped:
+            found = [*_nominal(shapes[name], feature), *_outline(shapes[name], feature)]
+        else:
+            found = [*_figure(shapes[feature.of[0]], name, feature)] if feature.of else []
+        for one in found:
+            if one.severity == "error":
+                raise InputError(task_path, f"features.{name}", one.what, "the geometry of the scene", one.advice)
+            say(f"warning: {name}: {one.what}. {one.advice}")
+
+
+def _figure(face: ShapeFacts, name: str, feature: Feature) -> Iterator[SceneFinding]:
+    """Yield a finding if a circle or a point of an edge does not lie on the edge of its face."""
+    if feature.kind not in ("circle", "edge_point") or face.mesh is None or not face.mesh.open_edges:
+        return
+    places, share = np.array([feature.point_mm], float), 1.0
+    if feature.kind == "circle":
+        normal = face.normals.mean(axis=0)
+        angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)[:, None]
+        along, across = tangents(normal / np.linalg.norm(normal))
+        places = places + float(feature.radius_mm or 0.0) * (np.cos(angle) * along + np.sin(angle) * across)
+        share = _ON_EDGE
+    start, end = np.moveaxis(face.mesh.open_edge_ends, 1, 0)
+    way = end - start
+    local = places[:, None] - start
+    at = np.clip(np.einsum("ijk,jk->ij", local, way) / np.maximum((way**2).sum(axis=1), 1e-30), 0, 1)
+    off = np.linalg.norm(local - at[..., None] * way, axis=-1).min(axis=1)
+    worst = float(np.quantile(off, share))
+    if worst > NOMINAL_MM:
+        severity: Severity = "error" if worst > MISTAKE_MM else "warning"
+        what = f"the {feature.kind.replace('_', ' ')} is {worst:.3g} mm off the edge of {face.name}"
+        advice = "Correct its point" + (" or radius_mm, half the diameter" if feature.kind == "circle" else "")
+        yield SceneFinding(severity, name, what, advice)
+
+
+def _outline(shape: ShapeFacts, feature: Feature) -> Iterator[SceneFinding]:
+    """Yield a finding if the outline of a plane or an axis is much smaller or larger than the shape."""
+    if feature.outline_mm is None:
+        return
+    surface, corners = feature.nominal(), _corners(shape)
+    if isinstance(surface, Plane):
+        angle = np.pi * np.arange(4)[:, None] / 4
+        along, across = tangents(surface.normal)
+        ways = np.cos(angle) * along + np.sin(angle) * across
+    else:
+        assert isinstance(surface, Cylinder | Cone)
+        ways = surface.axis[None]
+    spans = np.ptp(np.array(feature.outline_mm) @ ways.T, axis=0), np.ptp(corners @ ways.T, axis=0)
+    ratio = spans[0] / np.maximum(spans[1], 1e-9)
+    worst = int(np.abs(np.log(np.maximum(ratio, 1e-9))).argmax())
+    if ratio.min() < _SHORTER or ratio.max() > _LONGER:
+        what = (
+            f"outline_mm spans {spans[0][worst]:.4g} mm in a direction in which the shape has {spans[1][worst]:.4g} mm"
+        )
+        yield SceneFinding(
+            "warning", shape.name, what, "Zones are evaluated over the outline: give the corners or ends"
+        )
+
+
+def _corners(shape: ShapeFacts) -> Floats:
+    """Return places (n, 3) [mm] on a shape: the vertices of a mesh."""
+    return shape.points if shape.mesh is None else shape.mesh.vertices
+
+
 def _nominal(shape: ShapeFacts, feature: Feature) -> Iterator[SceneFinding]:
     """Yield a finding if the nominal geometry of a task does not lie on the shape of that name."""
     surface = feature.nominal()
-    corners = shape.points if shape.mesh is None else shape.mesh.vertices
-    worst = float(np.abs(surface_distance(surface, corners)).max(initial=0.0))
+    worst = float(np.abs(surface_distance(surface, _corners(shape))).max(initial=0.0))
     if worst > NOMINAL_MM:
         severity: Severity = "error" if worst > MISTAKE_MM else "warning"
         what = f"the shape is up to {worst:.3g} mm off the nominal {feature.kind} of the task"

@@ -146,6 +146,9 @@ class _TaskBuilder:
             return left_out(f"it is {_what(one.first if not first else one.second or Target())}")
         remarks = list(one.notes)
         tolerance = _deviations(one)
+        if one.limits is not None and tolerance is None:
+            remarks.append(f"its limits {one.limits[0]:g} and {one.limits[1]:g} are not in increasing order")
+            self.task.in_part.append(f"{described}{on}: without its tolerance, because {remarks[-1]}")
         made: list[tuple[str, str, tuple[Face, ...], float]] = []
         if one.second is None:
             made = self._sizes(one, first)
@@ -216,7 +219,8 @@ class _TaskBuilder:
             said = (*one.notes, *zone.remarks)
             name = f"{zone.of.name}_{zone.kind}"
             self.add(name, DrawnMeasurement(zone.kind, features, 0.0, "mm", one.zone, one.number, said))
-            self.task.in_part += [f"{described} of {zone.of.name}: {remark}" for remark in zone.remarks]
+            told = (*(note for note in one.notes if not note.startswith("zone:")), *zone.remarks)
+            self.task.in_part += [f"{described} of {zone.of.name}: {remark}" for remark in told]
         self.task.left_out += [f"{described}{f' of {name}' if name else on}: {why}" for name, why in made.left_out]
 
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+#: note of a tolerance whose zone is not centred on the surface
+UNEQUAL = "its zone lies unequally about the surface"
+
 
 @dataclass(frozen=True)
 class Target:

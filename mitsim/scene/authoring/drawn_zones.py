@@ -14,7 +14,7 @@ import numpy as np
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
 from characterisation.tasks.places import mid_plane
 from characterisation.tasks.zones import Datum, frame_fault
-from mitsim.scene.authoring.drawn_characteristics import GeometricTolerance
+from mitsim.scene.authoring.drawn_characteristics import UNEQUAL, GeometricTolerance
 from mitsim.scene.authoring.face import Face
 
 #: two sides belong to a slot or a web if their normals are opposite within this cosine
@@ -98,6 +98,10 @@ def _zone(one: GeometricTolerance, side: Side, datums: Sequence[Side | None]) ->
     """Return the zone of one side, or the reason why a task has none."""
     surface = side.surface
     flat, axis = isinstance(surface, Plane), isinstance(surface, Cylinder | Cone)
+    if UNEQUAL in one.notes:
+        return f"{UNEQUAL}, and those of a task lie equally about it"
+    if axis and one.kind != "symmetry" and any(note.startswith("zone:") and "plane" in note for note in one.notes):
+        return "its zone lies between two planes, and those of an axis in a task are cylinders"
     match one.kind:
         case "flatness" if flat:
             return Zone("flatness", side)

@@ -43,6 +43,9 @@ _APART = 0.02
 #: placeholders of CAD programs for faces without a name
 _NO_NAME = re.compile(r"(none|null|unnamed|advanced_?face|face|surface|shape|body|solid|\W)*[\d\W_]*", re.IGNORECASE)
 
+#: ids of finishes in a scene (:func:`~mitsim.scene.authoring.part_folder.finish_names`)
+_FINISH = re.compile(r"finish(_[0-9a-f]{6}|_none)?", re.IGNORECASE)
+
 #: longest name from a CAD file [bytes], and longest name of an assembly's part before it
 _LONGEST, _LONGEST_PART = 60, 30
 
@@ -69,15 +72,18 @@ def with_names(faces: Sequence[Face]) -> list[Face]:
 
 
 def _unique(names: dict[int, str], faces: Sequence[Face]) -> list[str]:
-    """Return unique names by number of the face; different groups may have produced equal names."""
+    """Return unique names by number of the face; different groups may have produced equal names.
+
+    Names of files differ in more than capital letters, and no name is that of a finish in the scene.
+    """
     taken: dict[str, int] = {}
     out: dict[int, str] = {}
     for number in sorted(names, key=lambda one: (names[one], _place(faces[one]).round(4).tolist()[::-1])):
-        name = names[number]
-        while name in taken:
-            taken[names[number]] += 1
-            name = f"{names[number]}_{taken[names[number]]}"
-        taken[name] = 1
+        base = name = f"face_{names[number]}" if _FINISH.fullmatch(names[number]) else names[number]
+        while name.casefold() in taken:
+            taken[base.casefold()] += 1
+            name = f"{base}_{taken[base.casefold()]}"
+        taken[name.casefold()] = 1
         out[number] = name
     return [out[number] for number in range(len(faces))]
 

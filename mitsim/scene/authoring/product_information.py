@@ -12,7 +12,13 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import Any
 
-from mitsim.scene.authoring.drawn_characteristics import Dimension, GeometricTolerance, ProductInformation, Target
+from mitsim.scene.authoring.drawn_characteristics import (
+    UNEQUAL,
+    Dimension,
+    GeometricTolerance,
+    ProductInformation,
+    Target,
+)
 from mitsim.scene.authoring.part21 import Entity, Enumeration, Reference, StepText, Typed
 from mitsim.scene.authoring.units import unit_size
 
@@ -42,7 +48,7 @@ _TARGETS = ("DATUM_TARGET", "PLACED_DATUM_TARGET_FEATURE")
 _TEXTURES = ("SURFACE_TEXTURE_REPRESENTATION",)
 _MODIFIERS = ("GEOMETRIC_TOLERANCE_WITH_MODIFIERS", "MODIFIED_GEOMETRIC_TOLERANCE")
 _RESTRICTIONS = {
-    "UNEQUALLY_DISPOSED_GEOMETRIC_TOLERANCE": "its zone lies unequally about the surface",
+    "UNEQUALLY_DISPOSED_GEOMETRIC_TOLERANCE": UNEQUAL,
     "GEOMETRIC_TOLERANCE_WITH_DEFINED_UNIT": "it holds for each length of the feature",
     "GEOMETRIC_TOLERANCE_WITH_DEFINED_AREA_UNIT": "it holds for each area of the feature",
     "GEOMETRIC_TOLERANCE_WITH_MAXIMUM_TOLERANCE": "its zone has a maximum",

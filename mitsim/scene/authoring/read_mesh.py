@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,12 @@ from mitsim.sensor.calibration_qualifiers import LENGTHS_MM, UNITS_MM
 
 STEP = (".step", ".stp", ".p21")
 _MESHES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf", ".3mf")
+
+#: formats with polygons, which trimesh divides into fans
+_POLYGONS = (".obj", ".ply", ".off")
+
+#: cosine of the angle between the normals of triangles that fold back on one another
+_FOLDED = -0.99999
 
 _LARGEST_FILE = 1024**3
 
@@ -75,7 +82,7 @@ def _load(path: Path) -> Any:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return trimesh.load_scene(path)
+            return trimesh.load_scene(path, process=False)  # else it leaves out vertices that are not numbers
     except ImportError as error:
         package = getattr(error, "name", None) or str(error)
         raise InputError(
@@ -83,8 +90,8 @@ def _load(path: Path) -> Any:
         ) from None
     except Exception as error:  # the reader raises any exception on damaged files
         reason = " ".join(str(error).split())[:120] or type(error).__name__
-        allowed = f"a {path.suffix.lower().lstrip('.').upper()} file"
-        raise InputError(path, "", f"an unreadable file ({reason})", allowed) from None
+        allowed = f"a file of the format {path.suffix.lower().lstrip('.').upper()}"
+        raise InputError(path, "", f"an unreadable file ({reason})", allowed, "save the part as STL or STEP") from None
 
 
 def _scale(path: Path, scene: Any, units: str | None) -> tuple[float, tuple[str, ...]]:
@@ -129,13 +136,38 @@ def _gathered(path: Path, scene: Any, scale: float) -> Mesh:
         triangles.append(np.asarray(mesh.faces, np.int64)[:, ::turn] + start)
         start += len(mesh.vertices)
     if not triangles:
-        raise InputError(path, "", "no triangles", "a mesh of the part's surface")
+        raise InputError(path, "", "no triangles, or only a part of a file", "a mesh of the part's surface")
     points = np.concatenate(vertices) * scale
     corners = np.concatenate(triangles)
     if not np.isfinite(points).all() or corners.min() < 0 or corners.max() >= len(points):
         raise InputError(path, "", "vertices that are not numbers, or triangles without vertices", "a valid mesh")
     check_size(path, points[np.unique(corners)])
+    if path.suffix.lower() in _POLYGONS and (folded := _folded(points, corners)):
+        hint = "export triangles, or STEP or STL: polygons that are not convex are not divided correctly"
+        raise InputError(path, "", f"{folded} triangles that fold back on a neighbour", "a surface without folds", hint)
     return Mesh(points, corners)
+
+
+def _folded(points: Floats, triangles: Ints) -> int:
+    """Count pairs of neighbours, also across a triangle without area, that lie in one plane on the same side of it."""
+    mesh = trimesh.Trimesh(points, triangles, process=False)
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    if not mesh.is_winding_consistent:
+        trimesh.repair.fix_winding(mesh)  # type: ignore[no-untyped-call]
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    normals = np.cross(b - a, c - a)
+    longest = np.max([((b - a) ** 2).sum(1), ((c - b) ** 2).sum(1), ((a - c) ** 2).sum(1)], axis=0)
+    length = np.linalg.norm(normals, axis=1)
+    flat = length <= 1e-7 * longest
+    normals /= np.where(flat, np.inf, length)[:, None]
+    pairs = mesh.face_adjacency
+    across = defaultdict(list)
+    for one, other in pairs[flat[pairs].any(axis=1)].tolist():
+        across[one].append(other)
+        across[other].append(one)
+    linked = [(one, other) for at in np.flatnonzero(flat) for one in across[at] for other in across[at] if one < other]
+    every = np.concatenate([pairs, np.array(linked, int).reshape(-1, 2)])
+    return int((np.einsum("ij,ij->i", normals[every[:, 0]], normals[every[:, 1]]) < _FOLDED).sum())
 
 
 def check_size(path: Path, points: Floats) -> None:

@@ -39,6 +39,7 @@ from mitsim.scene.authoring.face import (
     surface_distance,
 )
 from mitsim.scene.authoring.part21 import StepText, read_step_text
+from mitsim.scene.authoring.placements import check_placements
 from mitsim.scene.authoring.segment_mesh import components
 from mitsim.scene.authoring.units import step_units, unit_assumed, unit_words
 from mitsim.sensor.calibration_qualifiers import LENGTHS_MM
@@ -111,6 +112,7 @@ def read_step(path: str | Path, fineness: Fineness = _DEFAULT, units: str | None
     if not step_installed():
         raise InputError(path, "", "a STEP file, which needs OpenCASCADE", "an STL, PLY or OBJ file", _INSTALL)
     text = read_step_text(path)
+    check_placements(path, text)
     scale, unit_remarks = _scale(path, text, units)
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "faces.npz"

@@ -104,6 +104,37 @@ def test_what_a_task_knows_becomes_measurements_and_the_rest_is_listed(drawn, tm
 
 
 @needs_step
+def test_zones_that_a_task_does_not_have_are_left_out_with_the_reason(tmp_path, step_here):
+    """A zone of an axis between two planes, a profile with an offset zone, and limits in the wrong order."""
+    path = write_step([("bracket", bracket(), None)], tmp_path / "bracket.step", "AP242DIS")
+    face = {one.name: one.entities[0] for one in read_part(path).faces}
+    drawing = Drawing(path.read_text())
+    add, mm = drawing.add, drawing.measure
+    system = drawing.system(
+        *(drawing.datum(one, face[n]) for one, n in zip("ABC", ("bottom", "back", "left"), strict=True))
+    )
+    for name, form in (
+        ("bore_12mm_left", "within two parallel planes"),
+        ("bore_12mm_right", "cylindrical or circular"),
+    ):
+        made = drawing.tolerance("POSITION", mm(0.3), drawing.aspect(face[name]), system)
+        shape = add(f"TOLERANCE_ZONE_FORM('{form}')")
+        add(f"TOLERANCE_ZONE('',$,#{drawing.shape},.F.,(#{made}),#{shape})")
+    offset = f"UNEQUALLY_DISPOSED_GEOMETRIC_TOLERANCE(#{mm(0.15)})"
+    drawing.tolerance("SURFACE_PROFILE", mm(0.2), drawing.aspect(face["front"]), system, offset)
+    drawing.plus_minus(
+        drawing.size("diameter", face["boss_20mm"], items=(mm(20.0, "nominal value"),)), mm(0.2), mm(-0.1)
+    )
+    path.write_text(drawing.whole())
+    made = read_part(path).drawing
+    assert set(made.measurements) == {"bore_12mm_right_position", "boss_20mm_diameter"}
+    assert made.measurements["boss_20mm_diameter"].tolerance is None
+    assert any("20.2 and 19.9 are not in increasing order" in one for one in made.in_part)
+    assert any("of bore_12mm_left: its zone lies between two planes" in one for one in made.left_out)
+    assert any("of front: its zone lies unequally about the surface" in one for one in made.left_out)
+
+
+@needs_step
 def test_limits_of_a_drawing_count_from_the_model(tmp_path, step_here):
     """Both bores are 12 mm: a drawing that states 12.1 with limits about the model keeps these; 14 is a fault."""
     path = write_step([("bracket", bracket(), None)], tmp_path / "bracket.step", "AP242DIS")

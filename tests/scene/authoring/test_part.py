@@ -318,6 +318,63 @@ def test_a_part_in_metres_is_noticed(tmp_path):
         read_mesh(tmp_path / "plate.stl")
 
 
+@pytest.mark.parametrize("suffix", [".stl", ".obj"])
+def test_vertices_that_are_not_numbers_are_refused(tmp_path, suffix):
+    box = trimesh.creation.box((40, 30, 20))
+    path = tmp_path / f"box{suffix}"
+    if suffix == ".stl":
+        data = bytearray(box.export(file_type="stl"))
+        data[96:100] = np.float32(np.nan).tobytes()
+        path.write_bytes(bytes(data))
+    else:
+        places = ["v nan 0 0", *(f"v {x} {y} {z}" for x, y, z in box.vertices[1:])]
+        path.write_text("\n".join([*places, *(f"f {a} {b} {c}" for a, b, c in box.faces + 1)]))
+    with pytest.raises(InputError, match="vertices that are not numbers"):
+        read_mesh(path)
+
+
+CHANNEL = [(0, 0), (30, 0), (30, 30), (20, 30), (20, 10), (10, 10), (10, 30), (0, 30)]
+
+
+def prism(path, outline, first):
+    """A prism of polygons, whose ends begin at the corner of this number."""
+    count = len(outline)
+    ends = [(first + one) % count for one in range(count)]
+    polygons = [[count + one for one in ends], ends[::-1]]
+    polygons += [[one, (one + 1) % count, (one + 1) % count + count, one + count] for one in range(count)]
+    places = [(x, y, z) for z in (0, 10) for x, y in outline]
+    if path.suffix == ".obj":
+        lines = [f"v {x} {y} {z}" for x, y, z in places]
+        lines += ["f " + " ".join(str(one + 1) for one in polygon) for polygon in polygons]
+    else:
+        lines = ["ply", "format ascii 1.0", f"element vertex {2 * count}"]
+        lines += [f"property double {axis}" for axis in "xyz"] + [f"element face {len(polygons)}"]
+        lines += ["property list uchar int vertex_indices", "end_header"]
+        lines += [f"{x} {y} {z}" for x, y, z in places]
+        lines += [f"{len(polygon)} {' '.join(map(str, polygon))}" for polygon in polygons]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".ply"])
+def test_polygons_that_are_not_convex_are_refused_and_convex_ones_are_read(tmp_path, suffix):
+    """The reader divides them into fans, which cover a channel and what is outside it, from whatever corner."""
+    square = prism(tmp_path / f"square{suffix}", [(0, 0), (30, 0), (30, 15), (30, 30), (0, 30)], 2)
+    assert trimesh.Trimesh(*(lambda mesh: (mesh.vertices, mesh.triangles))(read_mesh(square))).volume == pytest.approx(
+        9e3
+    )
+    for first in range(len(CHANNEL)):
+        with pytest.raises(InputError, match="fold back on a neighbour"):
+            read_mesh(prism(tmp_path / f"channel{suffix}", CHANNEL, first))
+
+
+def test_mixed_winding_is_no_fold(tmp_path):
+    box = trimesh.creation.box((40, 30, 20))
+    box.faces[::3] = box.faces[::3, ::-1]
+    box.export(tmp_path / "box.obj")
+    assert len(read_mesh(tmp_path / "box.obj").triangles) == 12
+
+
 def test_gltf_is_in_metres_and_its_nodes_are_placed(tmp_path):
     scene = trimesh.Scene()
     for x in (0.0, 0.1):

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import random
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from characterisation.files.documents import checked_name
+from characterisation.files.errors import InputError
 from mitsim.scene.authoring.check_task import read_features
 from mitsim.scene.authoring.fineness import fineness_for, sensor_sigma_mm
 from mitsim.scene.authoring.naming import identifier, size, with_names
@@ -193,6 +195,51 @@ def test_a_name_that_a_person_gave_is_kept_and_a_programs_counter_is_not(tmp_pat
     assert len(names & {"boss_20mm", "bottom", "top"}) == 2
     assert "sealing_face_Ø20" in names
     assert identifier("3 Löcher") == "face_3_Löcher"
+
+
+def test_names_differ_from_ids_of_finishes_and_in_more_than_capital_letters(tmp_path):
+    """Mitsuba has one name for shapes and finishes, and some file systems one for Seal.ply and SEAL.ply."""
+    from mitsim.scene.authoring.part_folder import write_part
+
+    path = write_step([("one", solid("Cylinder", 10.0, 30.0), None)], tmp_path / "one.step")
+    given = iter(["finish", "Seal", "SEAL"])
+    head, *rest = path.read_text().split("ADVANCED_FACE('',")
+    path.write_text(head + "".join(f"ADVANCED_FACE('{next(given)}',{one}" for one in rest))
+    write_part(path, tmp_path / "made")
+    names = load_scene(tmp_path / "made/made.xml", 850).names
+    assert sorted(name.casefold() for name in names) == ["face_finish", "seal", "seal_2"]
+
+
+AXES = {1: "1.,0.,0.", 2: "0.,1.,0.", 3: "0.,0.,1."}
+
+
+def component(path, scale="1.", **axes):
+    """A part placed 100 mm along x by an operator with these axes and this scale."""
+    text = write_step([("one", solid("Box", 40.0, 30.0, 20.0), None)], path).read_text()
+    brep = re.search(r"#\d+ = ADVANCED_BREP_SHAPE_REPRESENTATION\('',\((#\d+),(#\d+)\),(#\d+)\);", text)
+    origin, body, context = brep.groups()
+    ways = {number: axes.get(f"axis{number}", way) for number, way in AXES.items()}
+    lines = [f"#900{number}=DIRECTION('',({way}));" for number, way in ways.items()]
+    lines += [
+        "#9004=CARTESIAN_POINT('',(100.,0.,0.));",
+        f"#9005=CARTESIAN_TRANSFORMATION_OPERATOR_3D('','',$,#9001,#9002,#9004,{scale},#9003);",
+        f"#9006=SHAPE_REPRESENTATION('',({body},{origin}),{context});",
+        f"#9007=REPRESENTATION_MAP({origin},#9006);",
+        "#9008=MAPPED_ITEM('',#9007,#9005);",
+    ]
+    text = text.replace(f"({origin},{body})", f"({origin},#9008)", 1)
+    path.write_text(text.replace("ENDSEC;\nEND-ISO", "\n".join([*lines, "ENDSEC;\nEND-ISO"])))
+    return path
+
+
+def test_components_are_placed_or_refused_where_opencascade_misplaces_them(tmp_path):
+    """It turns a mirrored component by half a turn, and leaves a scaled one at its size."""
+    for scale, axes, low in (("1.", {}, (100, 0, 0)), ("$", {"axis1": AXES[2], "axis2": "-1.,0.,0."}, (70, 0, 0))):
+        faces = read_step(component(tmp_path / "placed.step", scale, **axes)).faces
+        assert np.concatenate([face.vertices for face in faces]).min(axis=0) == pytest.approx(low, abs=1e-9)
+    for scale, axes, says in (("1.", {"axis1": "-1.,0.,0."}, "mirrored"), ("2.", {}, "scaled by 2")):
+        with pytest.raises(InputError, match=f"#9005.*placed {says}"):
+            read_step(component(tmp_path / "other.step", scale, **axes))
 
 
 FOREIGN = ("Dichtfläche", "поверхность", "シール面", "พื้นผิว", "סגר")

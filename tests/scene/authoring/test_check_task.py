@@ -1,0 +1,75 @@
+"""Features of a task against the shapes of a scene: places and sizes that do not belong to the part."""
+
+from __future__ import annotations
+
+import pytest
+import trimesh
+
+from characterisation.files.errors import InputError
+from characterisation.tasks.task_reading import read_task
+from mitsim.scene.authoring.check_task import check_geometry
+from mitsim.scene.authoring.part_folder import Finishing, write_part
+from mitsim.scene.load import load_scene
+
+RIM = '[features.rim]\nkind = "circle"\nof = ["top"]\npoint_mm = [0, 0, 5]\nradius_mm = 4\n'
+EDGE = (
+    '[features.edge]\nkind = "edge_point"\nof = ["top"]\npoint_mm = [20, 0, 5]\ndirection = [1, 0, 0]\nreach_mm = 2\n'
+)
+SIZE = '[measurements.size]\nkind = "diameter"\nfeatures = ["bore_8mm"]\nnominal = 8\nunit = "mm"\n'
+
+
+@pytest.fixture(scope="module")
+def washer(tmp_path_factory):
+    """A washer of radii 4 and 20 mm, 10 mm high: its scene, and the task of mitsim part with two figures."""
+    folder = tmp_path_factory.mktemp("washer")
+    trimesh.creation.annulus(4.0, 20.0, 10.0, sections=128).export(folder / "washer.stl")
+    write_part(folder / "washer.stl", folder / "washer", finishing=Finishing(named="matt_white"))
+    return load_scene(folder / "washer/washer.xml", 850), (folder / "washer/task.toml").read_text() + RIM + EDGE + SIZE
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "error", "says"),
+    [
+        ("radius_mm = 4\n", "radius_mm = 8\n", True, "the circle is 4 mm off the edge of top"),
+        ("point_mm = [0, 0, 5]", "point_mm = [9, 0, 5]", True, "off the edge of top"),
+        ("radius_mm = 4\n", "radius_mm = 4.2\n", False, "the circle is 0.2 mm off the edge of top"),
+        ("point_mm = [20, 0, 5]", "point_mm = [14, 0, 5]", True, "the edge point is 6 mm off the edge of top"),
+        ("radius_mm = 20.0", "radius_mm = 22.0", True, "the shape is up to 2 mm off the nominal cylinder"),
+        ("radius_mm = 20.0", "radius_mm = 20.5", False, "the shape is up to 0.5 mm off the nominal cylinder"),
+        (
+            "[0.0, 0.0, 5.0]]",
+            "[0.0, 0.0, 50.0]]",
+            False,
+            "outline_mm spans 55 mm in a direction in which the shape has 10 mm",
+        ),
+        ("[0.0, 0.0, 5.0]]", "[0.0, 0.0, -4.6]]", False, "outline_mm spans 0.4 mm"),
+    ],
+)
+def test_geometry_that_is_not_that_of_the_scene_is_refused_or_told(washer, tmp_path, capsys, old, new, error, says):
+    scene, text = washer
+    path = tmp_path / "task.toml"
+    path.write_text(text)
+    check_geometry(read_task(path), path, scene)
+    assert capsys.readouterr().err == ""
+    assert old in text
+    path.write_text(text.replace(old, new))
+    if error:
+        with pytest.raises(InputError, match=says):
+            check_geometry(read_task(path), path, scene)
+    else:
+        check_geometry(read_task(path), path, scene)
+        assert says in capsys.readouterr().err
+
+
+def test_the_end_of_a_slot_is_on_the_edge_of_its_face(tmp_path, capsys):
+    """Half of its circle is."""
+    half = trimesh.creation.annulus(4.0, 20.0, 10.0, sections=128)
+    half.update_faces(half.triangles_center[:, 0] > 0)
+    half.export(tmp_path / "half.stl")
+    made = write_part(tmp_path / "half.stl", tmp_path / "half", finishing=Finishing(named="matt_white"))
+    assert "top" in {face.name for face in made.faces}
+    path = tmp_path / "task.toml"
+    size = SIZE.replace("bore_8mm", "rim")
+    path.write_text((tmp_path / "half/task.toml").read_text() + RIM + size)
+    check_geometry(read_task(path), path, load_scene(tmp_path / "half/half.xml", 850))
+    assert "rim" not in capsys.readouterr().err
