@@ -74,6 +74,14 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _one_process() -> Iterator[None]:
+    """Commands in the process of a test make few trials, and several tests run at once: they start no workers."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mitsim.running.executor.fitting_processes", lambda: 1)
+        yield
+
+
 @pytest.fixture(scope="session")
 def scenes() -> Path:
     """The folder of authored scenes."""

@@ -191,7 +191,8 @@ def check_no_workers(scheduler: str | None, processes: int, allowed: str, hint: 
 def requested_workers(scheduler: str | None, processes: int) -> Executor | None:
     """Return the workers of a scheduler, or processes on this machine; None if this process works alone.
 
-    ``processes`` of 0 means as many as cores and memory allow, or one on a CUDA device, which it uses completely.
+    ``processes`` of 0 means as many as cores and memory allow, or one on a CUDA device, which it uses completely. A
+    scheduler has workers of its own.
 
     Raises
     ------
@@ -205,7 +206,7 @@ def requested_workers(scheduler: str | None, processes: int) -> Executor | None:
     from mitsim.scene.backend import cuda_devices
 
     if scheduler is not None:
-        if processes != 1:
+        if processes > 1:
             raise InputError("--processes", "", processes, "not with --scheduler", "its workers are processes")
         return Cluster(scheduler)
     if processes == 0:

@@ -40,7 +40,7 @@ _FEWEST = 8
 
 @dataclass(frozen=True)
 class TriedChange:
-    """A change with its ``stated`` measurements, those that were missed only, and the ``seconds`` that it took."""
+    """A change with the statements of all measurements by name, and the ``seconds`` that it took."""
 
     change: Change
     stated: dict[str, Statement]
@@ -115,7 +115,7 @@ def find_remedies(
             change.release()
             gc.collect()
         seconds = time.monotonic() - began
-        tried = TriedChange(change, {name: stated[name] for name in missed if name in stated}, seconds)
+        tried = TriedChange(change, stated, seconds)
         if tried.trials < _FEWEST:
             found.untried.append(change.words)
             continue
@@ -132,13 +132,14 @@ def find_remedies(
 def of_missed(found: Remedies | None, missed: dict[str, Statement]) -> Remedies | None:
     """Return remedies for the measurements that a longer statement misses; None if it misses none.
 
-    Nothing was tried for a measurement that only the longer statement misses.
+    Changes were chosen for the measurements that were missed before; they may help others too.
     """
     if not missed:
         return None
-    before = Remedies({}) if found is None else found
-    untried = [f"changes for {name}" for name in missed if name not in before.missed]
-    return replace(before, missed=missed, untried=[*before.untried, *untried])
+    now = Remedies(missed) if found is None else replace(found, missed=missed)
+    known = () if found is None else found.missed
+    untried = [f"changes for {name}" for name in now.open if name not in known]
+    return replace(now, untried=[*now.untried, *untried])
 
 
 def all_changes(now: Shortfall, limit: TimeLimit) -> Iterator[Change]:
@@ -182,13 +183,13 @@ def remedies_document(found: Remedies) -> dict[str, Any]:
             }
             for name, one in found.missed.items()
         },
-        "tried": [_entry(one) for one in found.tried],
+        "tried": [_entry(one, found.missed) for one in found.tried],
         "impossible": [{"words": one.words, "reason": why} for one, why in found.failed],
         "untried": list(found.untried),
     }
 
 
-def _entry(tried: TriedChange) -> dict[str, Any]:
+def _entry(tried: TriedChange, missed: Iterable[str]) -> dict[str, Any]:
     change = tried.change
     return {
         "change": change.kind,
@@ -198,7 +199,7 @@ def _entry(tried: TriedChange) -> dict[str, Any]:
         "captures": change.captures,
         "trials": tried.trials,
         "seconds": round(tried.seconds, 1),
-        "measurements": {name: _measured(one, change) for name, one in tried.stated.items()},
+        "measurements": {name: _measured(tried.stated[name], change) for name in missed if name in tried.stated},
     }
 
 

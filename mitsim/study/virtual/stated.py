@@ -96,10 +96,10 @@ def state_view(
 ) -> StatedView:
     """State every measurement from one view at its exposures, and reuse finished trials.
 
-    Draws of the race are not used: they selected the view, and are biased in its favour. Trials end when every
-    measurement is settled (JCGM 101:2008, 7.9), when they have the number of the study, or when time is over. If the
-    study names no number, they also end when every standard uncertainty is known well enough, but not before the
-    default number: few trials of errors with long tails show too little of the tails.
+    Draws of the race are not used: they selected the view, and are biased in its favour. Trials end when they have the
+    number of the study, or when time is over. They end before if every verdict is decided, and every measurement is
+    settled (JCGM 101:2008, 7.9) or, where the study names no number, every standard uncertainty is known well enough.
+    The latter does not count before the default number: few trials of errors with long tails show too little of them.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def state_view(
         Replaces the study's number of trials, which are then made whether or not fewer would settle the statement.
     limit
         Time of the statement. A study that names no number of trials may make :data:`MOST_WITHIN_A_LIMIT` within it,
-        and ends when it is settled; without a limit, :data:`MOST`.
+        and does not end at a known uncertainty; without a limit, :data:`MOST`.
     after_batch
         Receives the statement, without a budget, after every :data:`BATCH` trials but the last.
     """
@@ -127,9 +127,12 @@ def state_view(
             wanted = statement_trials(counts[-1])
         made = [trial for trial in wanted if trial in trials.known(view.number)]
         so_far = StatedView(view, _statements(study, trials, view, made), planned)
-        if limit.over() or (table is None and count > BATCH and _settled(so_far.statements)):
+        if limit.over():
             break
-        if by_known and count >= least and _known_to(so_far.statements, rules.known_to):
+        decided = all(one.verdict != "not decided" for one in so_far.statements)
+        if table is None and count > BATCH and decided and _settled(so_far.statements):
+            break
+        if by_known and count >= least and decided and _known_to(so_far.statements, rules.known_to):
             break
         if after_batch is not None:
             after_batch(so_far)

@@ -143,6 +143,7 @@ def test_processes_follow_cores_and_memory(monkeypatch):
     assert fitting_processes() == 1
     monkeypatch.setattr(executor, "available_memory", lambda: 1 << 50)
     assert fitting_processes() == 16
+    monkeypatch.setattr(executor, "fitting_processes", fitting_processes)
     for devices, expected in ((1, type(None)), (0, Pool)):  # one process uses a whole CUDA device
         monkeypatch.setattr("mitsim.scene.backend.cuda_devices", lambda devices=devices: devices)
         assert type(requested_workers(None, 0)) is expected

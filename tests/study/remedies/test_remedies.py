@@ -160,15 +160,15 @@ def test_without_time_nothing_is_confirmed_and_the_changes_are_named() -> None:
 
 
 def test_a_longer_statement_takes_remedies_away_and_names_what_was_not_tried() -> None:
-    spray = Fake("spray", ("a", "b"), a=0.02, b=0.02)
+    spray = Fake("spray", ("a", "b"), a=0.02, b=0.02, c=0.02)
     found = find_remedies(missed("a", "b"), [spray.change], 40)
     assert of_missed(found, {}) is None and of_missed(None, {}) is None
-    longer = of_missed(found, missed("b", "c"))
+    longer = of_missed(found, missed("c", "d"))  # the change was not chosen for c, and helps it
     assert longer is not None
     assert remedies_in_words(RemediesEntry.model_validate(remedies_document(longer))) == [
-        "with spray: b (u 0.020 mm, before 0.80 mm) fits (40 virtual measurements)",
-        "c: not tried",
-        "not tried for lack of time: changes for c",
+        "with spray: c (u 0.020 mm, before 0.80 mm) fits (40 virtual measurements)",
+        "d: not tried",
+        "not tried for lack of time: changes for d",
     ]
 
 
