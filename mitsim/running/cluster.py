@@ -73,9 +73,13 @@ class Cluster:
         work: Callable[[Plain], Result],
         prepared: Callable[[Item], Hashable] | None = None,
     ) -> Iterator[tuple[Item, Result]]:
-        """Yield items with their results, see :meth:`~mitsim.running.executor.Executor.distribute`.
+        """Yield items with their results, as they are finished.
 
-        The scheduler chooses the worker, whatever it has ``prepared``.
+        Parameters
+        ----------
+        items, order, work, prepared
+            As of :meth:`~mitsim.running.executor.Executor.distribute`. The scheduler chooses
+            the worker, whatever it has prepared.
 
         Raises
         ------

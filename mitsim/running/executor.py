@@ -147,7 +147,13 @@ class Pool:
         work: Callable[[Plain], Result],
         prepared: Callable[[Item], Hashable] | None = None,
     ) -> Iterator[tuple[Item, Result]]:
-        """Yield items with their results, see :meth:`Executor.distribute`; dead processes are replaced."""
+        """Yield items with their results, as they are finished; dead processes are replaced.
+
+        Parameters
+        ----------
+        items, order, work, prepared
+            As of :meth:`Executor.distribute`.
+        """
         name_of, deaths = prepared or (lambda _: None), 0
         waiting: deque[Item] = deque(items)
         running: dict[Future[Result], Item] = {}
