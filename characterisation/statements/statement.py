@@ -33,10 +33,11 @@ from characterisation.statements.coverage import (
     expanded_uncertainty,
     standard_errors,
 )
-from characterisation.statements.decision import Decided, Tolerance, Verdict, decide
+from characterisation.statements.decision import Decided, Verdict, decide
 from characterisation.statements.losses import Loss
 from characterisation.statements.one_sided import OneSidedErrors
 from characterisation.statements.size_dependence import SizeDependence
+from characterisation.statements.tolerance import Tolerance
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -17,7 +17,8 @@ from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.samples import Samples
 from characterisation.maps.shipped import map_path, shipped_maps
-from characterisation.statements.decision import needed, tolerance_of
+from characterisation.statements.decision import needed
+from characterisation.statements.tolerance import tolerance_of
 from characterisation.tasks.task_file import Task
 from characterisation.tasks.task_reading import check_features, check_nominal_values, read_task
 from mitsim.maps.campaign.missing_finishes import (

@@ -15,8 +15,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from characterisation.statements.coverage import coverage_interval
-from characterisation.statements.decision import Tolerance, decide
+from characterisation.statements.decision import decide
 from characterisation.statements.one_sided import OneSidedErrors
+from characterisation.statements.tolerance import Tolerance
 from characterisation.tasks.decision_table import Decision
 from characterisation.tasks.folded import FoldedValue, folded_values
 from tests.characterisation.tasks.test_folded_values import CASES, task

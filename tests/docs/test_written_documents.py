@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from characterisation.statements.budget import BudgetLine
-from characterisation.statements.decision import plus_minus
 from characterisation.statements.statement import statement
+from characterisation.statements.tolerance import plus_minus
 from characterisation.tasks.result import Repeatability, Result
 from mitsim.capture.devices.stage_connection import BAUD
 from mitsim.capture.simulated.truth import Truth, encode_exr, read_exr

@@ -11,7 +11,8 @@ import xarray as xr
 
 from characterisation.files.datasets import Schema, Variable, read_dataset
 from characterisation.files.errors import InputError
-from characterisation.statements.decision import demand, tolerance_of
+from characterisation.statements.decision import demand
+from characterisation.statements.tolerance import tolerance_of
 from characterisation.tasks.task_file import Task
 from mitsim.maps.campaign.run import write_netcdf
 from mitsim.running.progress import say

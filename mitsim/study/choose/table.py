@@ -13,8 +13,9 @@ from dataclasses import replace
 import numpy as np
 
 from characterisation.files.atomic_io import json_values
-from characterisation.statements.decision import Verdict, decide, mostly_lost, needed, tolerance_of
+from characterisation.statements.decision import Verdict, decide, mostly_lost, needed
 from characterisation.statements.statement import Statement
+from characterisation.statements.tolerance import tolerance_of
 from characterisation.statements.verdict_words import result_in_words
 from mitsim.running.numbers import or_nan, two_digits
 from mitsim.running.text_table import aligned

@@ -10,9 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from characterisation.statements.decision import tolerance_of
 from characterisation.statements.one_sided import OneSidedErrors
 from characterisation.statements.statement import Statement, statement
+from characterisation.statements.tolerance import tolerance_of
 from mitsim.running.time_limit import TimeLimit
 from mitsim.study.session import Session
 from mitsim.study.virtual.drawn_numbers import related, statement_trials

@@ -21,9 +21,9 @@ from typing import Any, Protocol
 
 from characterisation.files.atomic_io import json_values, write_text
 from characterisation.scores.view_sets import ViewSet
-from characterisation.statements.decision import tolerance_of
 from characterisation.statements.losses import losses
 from characterisation.statements.statement import Statement, statement
+from characterisation.statements.tolerance import tolerance_of
 from mitsim.running.numbers import beside, percent, two_digits
 from mitsim.running.progress import say, track
 from mitsim.running.text_table import aligned

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from characterisation.statements.budget import budget, largest_line
-from characterisation.statements.decision import tolerance_of
 from characterisation.statements.losses import losses, lost_features
 from characterisation.statements.one_sided import stated_errors
 from characterisation.statements.size_dependence import DrawnNumber, size_dependence
 from characterisation.statements.statement import Statement, statement
+from characterisation.statements.tolerance import tolerance_of
 from characterisation.statements.verdict_words import Judged
 from characterisation.tasks.decision_table import BIAS_SUBTRACTED
 from mitsim.running.numbers import MINUS, NONE, SPACE, accepted_text, beside, interval_text, percent, two_digits

@@ -9,16 +9,9 @@ from scipy.stats import binom, gamma, norm, t
 
 from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
-from characterisation.statements.decision import (
-    Tolerance,
-    acceptance,
-    decide,
-    global_risks,
-    needed,
-    plus_minus,
-    tolerance_of,
-)
+from characterisation.statements.decision import acceptance, decide, global_risks, needed
 from characterisation.statements.statement import statement
+from characterisation.statements.tolerance import Tolerance, plus_minus, tolerance_of
 from characterisation.statements.verdict_words import Judged, result_in_words
 from characterisation.tasks.decision_table import Decision
 from characterisation.tasks.task_file import Task

@@ -7,9 +7,10 @@ import pytest
 from scipy.stats import gamma, ncx2, norm, rice
 
 from characterisation.statements.coverage import coverage_interval
-from characterisation.statements.decision import Tolerance, acceptance, decide, global_risks, needed
+from characterisation.statements.decision import acceptance, decide, global_risks, needed
 from characterisation.statements.one_sided import OneSidedErrors
 from characterisation.statements.statement import AT_THE_LIMIT, FAR_FROM_NOMINAL, statement
+from characterisation.statements.tolerance import Tolerance
 from characterisation.tasks.decision_table import Decision
 from characterisation.tasks.deviations import (
     form_basis,

@@ -5,7 +5,6 @@ import pytest
 from scipy.stats import binom, expon, norm
 
 from characterisation.statements.coverage import coverage_interval, expanded_interval
-from characterisation.statements.decision import plus_minus
 from characterisation.statements.selection import (
     EXCESS,
     EXCESS_OF_VIEWS,
@@ -17,6 +16,7 @@ from characterisation.statements.selection import (
     sampled,
 )
 from characterisation.statements.statement import numerical_tolerance, statement
+from characterisation.statements.tolerance import plus_minus
 from characterisation.tasks.decision_table import BIAS_SUBTRACTED, Decision
 
 

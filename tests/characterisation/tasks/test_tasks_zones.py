@@ -10,7 +10,8 @@ from characterisation.features.fitted import with_covariance
 from characterisation.features.surfaces import Cylinder, Plane
 from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
-from characterisation.statements.decision import decide, tolerance_of
+from characterisation.statements.decision import decide
+from characterisation.statements.tolerance import tolerance_of
 from characterisation.tasks.measurement_model import evaluate, measurement_model
 from characterisation.tasks.places import mid_plane
 from characterisation.tasks.task_file import Task

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from characterisation.statements.decision import plus_minus
 from characterisation.statements.statement import statement
+from characterisation.statements.tolerance import plus_minus
 from mitsim.report.choice_page import page_content, write_choice_page
 from mitsim.report.first_screen import of_choice
 from mitsim.study.choice_document import ChoiceDocument

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from characterisation.statements.decision import plus_minus
 from characterisation.statements.statement import statement
+from characterisation.statements.tolerance import plus_minus
 from mitsim.study import StatementTable
 from mitsim.study.choose import read_candidates, rounds
 from mitsim.study.choose.rounds import able_to_win, race_and_state, state_by_screening

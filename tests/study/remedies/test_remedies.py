@@ -11,8 +11,9 @@ from scipy.stats import norm
 
 from characterisation.files.errors import InputError
 from characterisation.statements.budget import BudgetLine
-from characterisation.statements.decision import demand, plus_minus
+from characterisation.statements.decision import demand
 from characterisation.statements.statement import Statement, statement
+from characterisation.statements.tolerance import plus_minus
 from characterisation.tasks.decision_table import Decision
 from mitsim.running.time_limit import OutOfTimeError, TimeLimit
 from mitsim.study.remedies.bounds import EXPOSURE, Effect, can_fit, least_shares, least_uncertainty

@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.stats import norm
 
-from characterisation.statements.decision import plus_minus
 from characterisation.statements.statement import statement
+from characterisation.statements.tolerance import plus_minus
 from characterisation.tasks.decision_table import Decision
 from mitsim.study.virtual.stated import statement_table
 
