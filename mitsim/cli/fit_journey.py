@@ -82,7 +82,7 @@ def map_and_run(journey: Journey, sensor: Path) -> None:
     """
     from mitsim.report.figures import write_map_figures
     from mitsim.report.page import write_report
-    from mitsim.study import StudyFile, open_study, report_lays
+    from mitsim.study import StudyFile, open_study, report_doubts
     from mitsim.study.run import run_study
 
     begun = time.monotonic()
@@ -94,7 +94,7 @@ def map_and_run(journey: Journey, sensor: Path) -> None:
     run = journey.folder / "run"
     file = read_toml(journey.study, StudyFile).model_copy(update={"sensor": str(sensor.resolve())})
     chosen = open_study(journey.study, file, performance_map=made / "map.nc", ask=journey.ask)
-    report_lays(chosen)
+    report_doubts(chosen)
     run_study(chosen, run, journey.minutes, None)
     write_report(run)
     say(f"report: {run / 'report.html'}, {time_in_words(time.monotonic() - begun)} after the fit")

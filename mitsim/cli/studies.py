@@ -67,7 +67,7 @@ def run(
     limit = TimeLimit(None if minutes is None else 60 * minutes)
     options.start(variant)
     from mitsim.report.page import write_report
-    from mitsim.study import open_study, report_lays, with_plan
+    from mitsim.study import open_study, report_doubts, with_plan
     from mitsim.study.remedies.entries import remedies_in_words
     from mitsim.study.run import run_within
     from mitsim.study.run_folder import read_run
@@ -75,7 +75,7 @@ def run(
     options.check_folder(output)
     chosen = with_plan(open_study(study, ask=options.asking(yes)), plan)
     options.keep_finished(output, overwrite, "run.json")
-    report_lays(chosen)
+    report_doubts(chosen)
     workers = options.requested_workers(scheduler, processes)
     with ending_in_order():
         stated = run_within(chosen, output, limit, workers, lambda: write_report(output))
@@ -120,7 +120,7 @@ def choose(
 
     from characterisation.statements.verdict_words import fits_all
     from mitsim.report.choice_page import write_choice_page
-    from mitsim.study import report_lays, with_plan
+    from mitsim.study import report_doubts, with_plan
     from mitsim.study.choice_document import CHOICE, judged, read_choice
     from mitsim.study.choose import choose_sensor, read_candidates
     from mitsim.study.choose.sensor_result import SensorResult
@@ -136,7 +136,7 @@ def choose(
     if done is not None and done.finished:
         options.keep_finished(output, overwrite, CHOICE)
         (output / CHOICE).unlink()
-    report_lays(candidates[0].study)
+    report_doubts(candidates[0].study)
     for one in excluded:
         say(f"{one.name} is excluded: {one.reason}")
     if candidates[0].study.file.set is not None:
@@ -322,13 +322,13 @@ def score(
     """
     options.start(variant)
     from mitsim.report.best_views import best_views
-    from mitsim.study import open_study, report_lays
+    from mitsim.study import open_study, report_doubts
     from mitsim.study.scoring import score_study
     from mitsim.study.session import Session
 
     options.check_folder(output)
     chosen = open_study(study, performance_map=map_file, ask=options.asking(yes))
-    report_lays(chosen)
+    report_doubts(chosen)
     for name in measurement or ():
         if name not in chosen.task.measurements:
             raise InputError("--measurement", "", name, ", ".join(chosen.task.measurements))

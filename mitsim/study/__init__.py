@@ -8,7 +8,7 @@ from mitsim.study.reading import Study as Study
 from mitsim.study.reading import finishes_of_features as finishes_of_features
 from mitsim.study.reading import open_study as open_study
 from mitsim.study.reading import read_map as read_map
-from mitsim.study.reading import report_lays as report_lays
+from mitsim.study.reading import report_doubts as report_doubts
 from mitsim.study.reading import with_plan as with_plan
 from mitsim.study.tables import CharacterisationTable as CharacterisationTable
 from mitsim.study.tables import ExposureTable as ExposureTable

@@ -31,7 +31,7 @@ from mitsim.maps.campaign.missing_finishes import (
 )
 from mitsim.maps.campaign.plan import Campaign, check_exposure, read_campaign, sensor_checksum
 from mitsim.running.progress import say
-from mitsim.scene.authoring.check_task import check_geometry
+from mitsim.scene.authoring.check_task import report_geometry
 from mitsim.scene.load import Scene, load_scene
 from mitsim.scene.materials import Finish
 from mitsim.scene.ray_casting.triangles import triangles
@@ -147,7 +147,6 @@ def open_study(
     )
     check_features(task, folder / file.task, scene.names)
     check_nominal_values(task, folder / file.task)
-    check_geometry(task, folder / file.task, scene)
     file = _with_limits(path, file, task)
     radius = float(np.linalg.norm(scene.bounds[1] - scene.bounds[0])) / 2
     standoffs = chosen_standoffs(path, file.views, sensor, radius)
@@ -191,8 +190,9 @@ def finishes_of_features(study: Study) -> dict[str, Finish | None]:
     return {name: study.scene.finishes[study.scene.names.index(name)] for name in study.task.shapes}
 
 
-def report_lays(study: Study) -> None:
-    """Report the features of the study whose machining marks have no given direction."""
+def report_doubts(study: Study) -> None:
+    """Report features whose machining marks have no direction, or that do not lie on the shapes of the scene."""
+    report_geometry(study.task, study.scene)
     finishes = finishes_of_features(study)
     for sentence in lays_in_words({name: one.scatter for name, one in finishes.items() if one is not None}):
         say(sentence)

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from mitsim.study import finishes_of_features, open_study, report_lays
+from mitsim.study import finishes_of_features, open_study, report_doubts
 
 
 def test_a_study_names_the_features_whose_marks_have_no_direction(scenes, capsys):
@@ -11,7 +11,7 @@ def test_a_study_names_the_features_whose_marks_have_no_direction(scenes, capsys
         "aluminium/ground Ra 0.74 um",
         "aluminium/ground Ra 0.37 um",
     }
-    report_lays(study)
+    report_doubts(study)
     told = capsys.readouterr().err
     assert told.startswith("plane and 2 more: lay not given") and told.count("\n") == 1 and len(told) < 120
 
@@ -19,5 +19,5 @@ def test_a_study_names_the_features_whose_marks_have_no_direction(scenes, capsys
 def test_a_study_of_matt_faces_says_nothing(scenes, capsys):
     study = open_study(scenes / "two_pillars" / "study.toml", mapped=False)
     white = replace(study.scene, finishes=[None] * len(study.scene.finishes))
-    report_lays(replace(study, scene=white))
+    report_doubts(replace(study, scene=white))
     assert capsys.readouterr().err == ""

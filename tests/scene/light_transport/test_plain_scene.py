@@ -101,7 +101,7 @@ def test_scenes_that_are_not_plain_take_the_long_way(scenes):
     assert single_plane(load_scene(scenes / "two_pillars/two_pillars.xml", 850)) is None
     lit = {"a": shape("rectangle"), "sky": {"type": "constant"}}
     assert single_plane(scene_from_dict(lit, 460)) is None
-    assert single_plane(scene_from_dict({"a": shape("sphere")}, 460)) is None
+    assert single_plane(scene_from_dict({"a": {"type": "sphere", "bsdf": metal()}}, 460)) is None
     several = {"a": shape("rectangle"), "b": shape("rectangle", x=10.0, type="matt_white")}
     assert single_bsdf(scene_from_dict(several, 460)) is None
 

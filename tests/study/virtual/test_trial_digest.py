@@ -80,14 +80,14 @@ def test_a_mesh_belongs_to_it_by_way_of_parameters_paths_and_includes(folder, me
     (folder / "other").mkdir()
     monkeypatch.chdir(folder / "other")
     assert digest(folder) == before  # wherever the program runs
-    ball(folder / mesh, 11.5, -40 if "left" in mesh else 40)
+    ball(folder / mesh, 9, -40 if "left" in mesh else 40)
     assert digest(folder) != before
 
 
 def test_a_mesh_of_another_parameter_belongs_to_it(folder):
     shutil.copy(folder / "meshes" / "left.ply", folder / "small.ply")
     before, other = digest(folder), digest(folder, parameters={"mesh": "small"})
-    ball(folder / "small.ply", 11.5, -40)
+    ball(folder / "small.ply", 9, -40)
     assert digest(folder) == before and digest(folder, parameters={"mesh": "small"}) != other
 
 
@@ -127,7 +127,7 @@ def test_kept_trials_of_a_case_are_not_those_of_another_mesh(folder):
         return {kind: one.trials.digest for kind, one in trials_by_kind(case, case.open(), folder / "run").items()}
 
     before = digests()
-    ball(part / "right.ply", 11.5, 40)
+    ball(part / "right.ply", 9, 40)
     after = digests()
     assert not set(before.values()) & set(after.values())
 
@@ -139,5 +139,5 @@ def test_workers_prepare_a_part_anew_if_its_mesh_has_changed(folder):
 
     before = order_digest()
     assert order_digest() == before
-    ball(folder / "right.ply", 11.5, 40)
+    ball(folder / "right.ply", 9, 40)
     assert order_digest() != before
