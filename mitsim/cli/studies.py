@@ -103,7 +103,7 @@ def choose(
     plan: PlanExposures = False,
     require_fit: RequireFit = False,
     scheduler: options.Scheduler = None,
-    processes: options.Processes = 0,
+    processes: options.Processes = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print choice.json in place of the table.")] = False,
     overwrite: options.Overwrite = False,
     yes: options.Yes = False,
