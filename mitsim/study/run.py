@@ -39,7 +39,7 @@ from mitsim.running.time_limit import TimeLimit, stopped_by_user
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import Study
 from mitsim.study.early_answers import Answers, Clock
-from mitsim.study.remedies.change import Shortfall
+from mitsim.study.remedies.change import Shortfall, missed_by
 from mitsim.study.remedies.confirm import Remedies, all_changes, find_remedies, of_missed, remedies_document
 from mitsim.study.run_record import draw_clouds, write_record
 from mitsim.study.scoring import score_study, write_raced
@@ -166,7 +166,7 @@ def run_within(
         stated = session.state(stated.view, None, plan.rest_limit(limit))
         write_json(folder / "statement.json", statement_document(session, stated))
         if _seeks_remedies(study):
-            remedies = of_missed(remedies, Shortfall(session, stated, scores, raced, search, folder).missed)
+            remedies = of_missed(remedies, missed_by(stated))
     clock.lap("state further")
     tried = [] if limit.over() else _confirm(session, chosen, search)
     chosen = tried[-1].chosen if tried else chosen

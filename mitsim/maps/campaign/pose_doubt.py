@@ -14,11 +14,17 @@ import numpy as np
 from characterisation.coupon.patches import Coupon
 from characterisation.point_cloud import PointCloud
 
-#: largest tilt [deg] and offset [share of the distance] that raise no doubt; a sensor's own errors are smaller
-_TILT_DEG, _OFFSET = 5.0, 0.01
+#: largest tilt that raises no doubt [deg]; a sensor's own is smaller; chosen
+_TILT_DEG = 5.0
 
-#: least number of points of the plane, and least share of those inside the outline
-_LEAST, _MOST = 500, 0.5
+#: largest offset that raises no doubt [share of the distance]; a sensor's own is smaller; chosen
+_OFFSET = 0.01
+
+#: least number of points of the plane, so that their noise tilts it by far less than the limit; chosen
+_LEAST_POINTS = 500
+
+#: least share of the points inside the outline that lie in the plane: most of them; chosen
+_LEAST_SHARE = 0.5
 
 
 def pose_doubt(cloud: PointCloud, coupon: Coupon) -> str:
@@ -28,14 +34,14 @@ def pose_doubt(cloud: PointCloud, coupon: Coupon) -> str:
     inside = (np.abs(x) < coupon.width / 2) & (np.abs(y) < coupon.height / 2)
     inside &= np.abs(z) < max(coupon.width, coupon.height)
     x, y, z = x[inside], y[inside], z[inside]
-    if len(z) < _LEAST:
+    if len(z) < _LEAST_POINTS:
         return ""
     terms, kept = np.stack([np.ones_like(x), x, y], axis=1), np.ones(len(z), bool)
     for _ in range(4):
         plane = np.linalg.lstsq(terms[kept], z[kept], rcond=None)[0]
         off = np.abs(z - terms @ plane)
         kept = off <= 4 * float(np.median(off))
-    if kept.sum() < max(_LEAST, _MOST * len(z)):
+    if kept.sum() < max(_LEAST_POINTS, _LEAST_SHARE * len(z)):
         return ""
     noise, slope = float(np.std((z - terms @ plane)[kept])), float(np.hypot(*plane[1:]))
     tilt, half = math.degrees(math.atan(slope)), min(coupon.width, coupon.height) / 2

@@ -65,22 +65,17 @@ def read_features(path: str | Path) -> TaskFeatures:
 
 def task_findings(facts: SceneFacts, task: TaskFeatures) -> Iterator[SceneFinding]:
     """Yield findings about features and measurements of a task, against the shapes of the scene."""
-    names = [shape.name for shape in facts.shapes]
+    shapes = {shape.name: shape for shape in facts.shapes}
     if not task.measurements:
         yield SceneFinding("note", "task", "it has no measurements yet", "Add a measurement before a study")
     for name, feature in task.features.items():
-        if not feature.shaped:
-            plane = feature.of[0] if feature.kind in ("circle", "edge_point") and feature.of else ""
-            if plane in names:
-                yield from _figure(facts.shapes[names.index(plane)], name, feature)
-        elif name not in names:
-            hint = nearest(name, names)
-            advice = f"D{hint[1:]}" if hint else f"The shapes are: {', '.join(names)}"
+        yield from _geometry(shapes, name, feature)
+        if name in shapes and feature.shaped:
+            yield from _bore(shapes[name], feature, task)
+        elif feature.shaped:
+            hint = nearest(name, list(shapes))
+            advice = f"D{hint[1:]}" if hint else f"The shapes are: {', '.join(shapes)}"
             yield SceneFinding("error", name, "a feature of the task without a shape in the scene", advice)
-        else:
-            yield from _nominal(facts.shapes[names.index(name)], feature)
-            yield from _outline(facts.shapes[names.index(name)], feature)
-            yield from _bore(facts.shapes[names.index(name)], feature, task)
     if task.measurements:
         whole = Task(features=task.features, measurements=task.measurements, decision=task.decision)
         for name in whole.measurements:
@@ -95,12 +90,17 @@ def report_geometry(task: Task, scene: Scene) -> None:
     """Report nominal geometry that does not lie on the shapes of the scene: errors are counted from there."""
     shapes = {one.name: one for one in shape_facts(scene, set(task.shapes))}
     for name, feature in task.features.items():
-        if feature.shaped:
-            found = [*_nominal(shapes[name], feature), *_outline(shapes[name], feature)]
-        else:
-            found = [*_figure(shapes[feature.of[0]], name, feature)] if feature.of else []
-        for one in found:
+        for one in _geometry(shapes, name, feature):
             say(f"warning: {name}: {one.what}. {one.advice}")
+
+
+def _geometry(shapes: dict[str, ShapeFacts], name: str, feature: Feature) -> Iterator[SceneFinding]:
+    """Yield findings about a feature whose geometry does not lie on its shape, if the scene has that."""
+    if not feature.shaped and feature.of and feature.of[0] in shapes:
+        yield from _figure(shapes[feature.of[0]], name, feature)
+    elif feature.shaped and name in shapes:
+        yield from _nominal(shapes[name], feature)
+        yield from _outline(shapes[name], feature)
 
 
 def _figure(face: ShapeFacts, name: str, feature: Feature) -> Iterator[SceneFinding]:

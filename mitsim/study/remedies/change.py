@@ -59,7 +59,12 @@ class Shortfall:
     @property
     def missed(self) -> dict[str, Statement]:
         """Return the statements of the measurements that do not fit, by name."""
-        return {one.measurement: one for one in self.stated.statements if one.verdict in MISSED}
+        return missed_by(self.stated)
+
+
+def missed_by(stated: StatedView) -> dict[str, Statement]:
+    """Return the statements of a view's measurements that do not fit, by name."""
+    return {one.measurement: one for one in stated.statements if one.verdict in MISSED}
 
 
 @dataclass(frozen=True)
