@@ -12,6 +12,8 @@ import math
 import numpy as np
 
 from characterisation.coupon.patches import Coupon
+from characterisation.features.fits import fit_plane
+from characterisation.features.robust_fit import FitError
 from characterisation.point_cloud import PointCloud
 
 #: largest tilt that raises no doubt [deg]; a sensor's own is smaller; chosen
@@ -33,22 +35,24 @@ def pose_doubt(cloud: PointCloud, coupon: Coupon) -> str:
     x, y, z = axes @ (cloud.points[cloud.valid].astype(float) - coupon.centre).T
     inside = (np.abs(x) < coupon.width / 2) & (np.abs(y) < coupon.height / 2)
     inside &= np.abs(z) < max(coupon.width, coupon.height)
-    x, y, z = x[inside], y[inside], z[inside]
-    if len(z) < _LEAST_POINTS:
+    count = int(inside.sum())
+    if count < _LEAST_POINTS:
         return ""
-    terms, kept = np.stack([np.ones_like(x), x, y], axis=1), np.ones(len(z), bool)
-    for _ in range(4):
-        plane = np.linalg.lstsq(terms[kept], z[kept], rcond=None)[0]
-        off = np.abs(z - terms @ plane)
-        kept = off <= 4 * float(np.median(off))
-    if kept.sum() < max(_LEAST_POINTS, _LEAST_SHARE * len(z)):
+    try:
+        fit = fit_plane(np.stack([x, y, z], axis=1)[inside])
+    except FitError:
         return ""
-    noise, slope = float(np.std((z - terms @ plane)[kept])), float(np.hypot(*plane[1:]))
+    if fit.count < max(_LEAST_POINTS, _LEAST_SHARE * count):
+        return ""
+    normal = fit.normal if fit.normal[2] > 0 else -fit.normal
+    steep = max(float(normal[2]), 1e-9)
+    slope, offset = math.hypot(*normal[:2]) / steep, float(normal @ fit.point) / steep  # at the coupon's centre
     tilt, half = math.degrees(math.atan(slope)), min(coupon.width, coupon.height) / 2
+    noise = fit.residual_std
     tilted = tilt > _TILT_DEG and slope * half > noise
-    if not tilted and abs(plane[0]) <= max(_OFFSET * float(np.linalg.norm(coupon.centre)), noise):
+    if not tilted and abs(offset) <= max(_OFFSET * float(np.linalg.norm(coupon.centre)), noise):
         return ""
     return (
-        f"the points lie in a plane {tilt:.1f} deg and {plane[0]:+.1f} mm from the coupon at its pose: check the pose, "
+        f"the points lie in a plane {tilt:.1f} deg and {offset:+.1f} mm from the coupon at its pose: check the pose, "
         "or give mitsim import the window of the coupon (--coupon)"
     )
