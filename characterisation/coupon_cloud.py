@@ -14,17 +14,16 @@ from dataclasses import replace
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from characterisation.coupon.patches import Coupon, measure_patches
 from characterisation.features.fits import fit_plane
 from characterisation.features.robust_fit import FitError
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.pinhole_grid import PINHOLE_RMS_PX, pinhole_of
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.region_of_interest import Roi
-
-Floats = NDArray[np.float64]
 
 #: approximate number of points used to fit the plane of the coupon
 _FITTED = 50_000

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from characterisation.files.arrays import Floats
 
 
 def lambert_projection(normals: NDArray[np.floating]) -> Floats:

@@ -21,11 +21,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from characterisation.features.robust_fit import MEDIAN_TO_STD
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.files.threads import thread_count
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, PointCloud, ViewGrid
-
-Floats = NDArray[np.float64]
 
 #: rows and columns of a window of a grid
 Window = tuple[slice, slice]

@@ -40,10 +40,9 @@ from numpy.typing import NDArray
 
 from characterisation.acceptance.vdi_2634 import plane_distances
 from characterisation.coupon.patches import Coupon
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
-
-Floats = NDArray[np.float64]
 
 #: share of the points excluded at either end of the depths (rs-depth-quality, depthai-experiments)
 TRIMMED_SHARE = 0.005

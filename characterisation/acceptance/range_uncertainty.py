@@ -15,12 +15,11 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from characterisation.acceptance.vdi_2634 import REJECTED_SHARE, plane_distances
 from characterisation.features.form import DEGREE
-
-Floats = NDArray[np.float64]
+from characterisation.files.arrays import Floats
 
 #: number of ranges that are drawn; the standard deviation of 100 is known to 7 %
 DRAWS = 100

@@ -28,9 +28,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
-
-Floats = NDArray[np.float64]
 
 #: share of the points, those farthest from the surface, that may be rejected; *assumed*
 REJECTED_SHARE = 0.003

@@ -27,7 +27,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-Floats = NDArray[np.float64]
+from characterisation.files.arrays import Floats
 
 
 def disc_offsets(radius_px: float) -> NDArray[np.int64]:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import betaincinv
 
-Floats = NDArray[np.float64]
+from characterisation.files.arrays import Floats
 
 #: degrees of freedom that the fit of a plane takes
 PLANE_PARAMETERS = 3

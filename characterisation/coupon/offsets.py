@@ -38,8 +38,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from characterisation.coupon.discs import disc_offsets
-
-Floats = NDArray[np.float64]
+from characterisation.files.arrays import Floats
 
 #: distances (from, to) of neighbours that touch, in diameters of a patch
 TOUCHING = (0.9, 1.25)

@@ -34,10 +34,9 @@ from characterisation.coupon.metrics import (
 from characterisation.coupon.offsets import known_offset, neighbour_products
 from characterisation.coupon.patch_table import patch_table
 from characterisation.coupon.view_frame import in_view_frame
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, PointCloud, ViewGrid
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from characterisation.files.arrays import Floats
 
 #: largest lag that is evaluated [px]
 LARGEST_LAG = 8

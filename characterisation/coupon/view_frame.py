@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from characterisation.files.arrays import Floats
 
 
 def view_frame(view: NDArray[np.floating], baseline: NDArray[np.floating]) -> Floats:

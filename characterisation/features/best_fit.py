@@ -32,8 +32,7 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.features.robust_fit import CLIP, FitError, robust_std
 from characterisation.features.surfaces import Surface
-
-Floats = NDArray[np.float64]
+from characterisation.files.arrays import Floats
 
 #: points of a shape from one view that are used
 POINTS = 2000

@@ -21,11 +21,11 @@ from typing import Any, Literal
 import numpy as np
 import xarray as xr
 
+from characterisation.files.arrays import Floats
 from characterisation.maps.light import Light, light_variables
 from characterisation.maps.performance_map import SCHEMA_VERSION, PerformanceMap
 from characterisation.maps.pooled_offsets import pool_offsets
 from characterisation.maps.pooling import pool
-from characterisation.maps.tables import Floats
 
 #: unknown quantity, and whether it was changed by one standard deviation down (low) or up (high)
 Variant = tuple[str, Literal["low", "high"]]

@@ -25,8 +25,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.files.datasets import Variable
-from characterisation.maps.tables import AT_KNOT, FIELDS, Floats, Surface
+from characterisation.maps.tables import AT_KNOT, FIELDS, Surface
 
 #: dimensions of the fields over the directions of a lay
 LAY_NODES = ("sample", "lay", "distance", "b", "a")

@@ -24,7 +24,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from characterisation.files.arrays import Floats
 
 #: (largest radius of the kernel, cell size): rows of one cluster and cell are joined, since a wide kernel needs no fine
 #: data. Up to the first radius, rows are not joined

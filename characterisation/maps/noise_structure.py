@@ -11,11 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.lambert_projection import lambert_projection
 from characterisation.maps.light import Light
 from characterisation.maps.performance_map import PerformanceMap
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.files.atomic_io import write_netcdf
 from characterisation.files.checked_files import dataset_digest
 from characterisation.files.datasets import Schema, Variable, read_dataset
@@ -36,7 +37,7 @@ from characterisation.maps.lay import SCHEMA as LAY_SCHEMA
 from characterisation.maps.light import SCHEMA as LIGHT_SCHEMA
 from characterisation.maps.light import Light, lights_of
 from characterisation.maps.samples import Samples
-from characterisation.maps.tables import FIELDS, Floats, Surface, between_samples
+from characterisation.maps.tables import FIELDS, Surface, between_samples
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,13 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from characterisation.coupon.offsets import noise_area
+from characterisation.files.arrays import Floats
 from characterisation.lambert_projection import lambert_projection
 from characterisation.maps.pooling import capture_numbers, patch_normals
-
-Floats = NDArray[np.float64]
 
 #: radius of the kernel over which captures are pooled, in the equal-area plane: 0.0175 is about 1 deg. It is wide
 #: because A and p / sigma vary slowly, and one capture determines them poorly

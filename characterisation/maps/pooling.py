@@ -45,10 +45,9 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 from threadpoolctl import threadpool_limits
 
 from characterisation.coupon.metrics import LEAST_DEGREES
+from characterisation.files.arrays import Floats
 from characterisation.lambert_projection import inverse_lambert_projection, lambert_projection
 from characterisation.maps.local_regression import LocalFit, Observations, Slopes, local_fit
-
-Floats = NDArray[np.float64]
 
 #: least effective number of patches in a kernel, except the widest
 LEAST_ROWS = 10

@@ -11,12 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError, nearest
 from characterisation.maps.light import Light, lies_between, same_light
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

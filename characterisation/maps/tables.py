@@ -32,9 +32,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
+from characterisation.files.arrays import Floats
 from characterisation.files.threads import in_threads
 
-Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
 #: variables of the map, in the order of the answer

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from scipy.stats import wasserstein_distance
 
 from characterisation.coupon.patch_table import Overall
-
-Floats = NDArray[np.float64]
+from characterisation.files.arrays import Floats
 
 #: limit of the mean absolute residual of F [1], per sample and distance
 FRACTION_LIMIT = 0.05

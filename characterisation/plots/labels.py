@@ -5,13 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.plots.style import INK, MUTED
-
-Floats = NDArray[np.float64]
 
 #: rows of labels in the height of a picture
 _ROWS = 7

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-Floats = NDArray[np.float64]
+from characterisation.files.arrays import Floats
 
 #: share of its colour that remains on the edge of a shape
 EDGE_SHADE = 0.55

@@ -13,11 +13,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from characterisation.coupon.metrics import recovered_fraction
-
-Floats = NDArray[np.float64]
+from characterisation.files.arrays import Floats
 
 #: number of standard uncertainties with which errors are compared, and the share of a normal variable within them
 COVERAGE_FACTOR = 2.0

@@ -24,10 +24,9 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.scores.rank_agreement import spearman
-
-Floats = NDArray[np.float64]
 
 #: number of bins, beside that of impossible views
 BINS = 10

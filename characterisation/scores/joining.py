@@ -38,14 +38,12 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from characterisation.features.figures import Circle, EdgePoint
 from characterisation.features.surfaces import tangents
+from characterisation.files.arrays import Floats
 from characterisation.scores.view_sets import NOTHING
-
-Floats = NDArray[np.float64]
 
 Joining = Literal["exact", "robot", "stage", "targets", "best_fit"]
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.scores.joining import (
     JoinedView,
@@ -27,8 +27,6 @@ from characterisation.scores.view_sets import FeatureInformation, ViewSet, fewes
 from characterisation.tasks.measurement_model import InputQuantity, measurement_model
 from characterisation.tasks.prediction import ExpectedInput, joint_quadratic_form
 from characterisation.tasks.task_file import Task
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

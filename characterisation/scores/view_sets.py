@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import Bounds, LinearConstraint, milp
 
-Floats = NDArray[np.float64]
+from characterisation.files.arrays import Floats
 
 #: returns the actual u_m (measurements,) of views chosen by 0 or 1, in the way that they are joined
 Joined = Callable[[Floats], Floats]

@@ -18,13 +18,12 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
 from characterisation.features.surfaces import unit
+from characterisation.files.arrays import Floats
 from characterisation.files.documents import Document, Name
-
-Floats = NDArray[np.float64]
 
 #: largest deviation of a reached normal from the wanted one [rad]
 TOLERANCE = 1e-6

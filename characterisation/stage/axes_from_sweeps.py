@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 from scipy.linalg import lstsq
 from scipy.spatial.transform import Rotation
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.stage.turning_axes import TurningAxes, rotation_about
-
-Floats = NDArray[np.float64]
 
 #: largest change of the angle of an axis at rest [rad]
 SAME = float(np.radians(0.5))

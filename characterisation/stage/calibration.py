@@ -16,14 +16,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.stage.axes_from_sweeps import axes_from_rotations, undetermined
 from characterisation.stage.turning_axes import LINE_PARAMETERS, TurningAxes
-
-Floats = NDArray[np.float64]
 
 #: least noise that is distinguished from rounding: of rotations [rad], of positions [mm]
 SMALLEST_DEVIATIONS = (1e-8, 1e-5)

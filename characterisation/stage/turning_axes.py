@@ -15,12 +15,11 @@ from dataclasses import dataclass
 from functools import reduce
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from characterisation.features.surfaces import tangents
-
-Floats = NDArray[np.float64]
+from characterisation.files.arrays import Floats
 
 #: parameters of a small change of one line
 LINE_PARAMETERS = 4

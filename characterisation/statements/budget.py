@@ -17,13 +17,12 @@ from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
+from characterisation.files.arrays import Floats
 from characterisation.statements.one_sided import OneSidedErrors, stated_errors
 from characterisation.statements.variance_components import RESIDUAL, Components, components
-
-Floats = NDArray[np.float64]
 
 #: lines that no group of unknowns explains: common to the captures of a day, and new in each capture
 INTERACTION, NOISE = "interaction", "noise"

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import beta, binom, t
 
-Floats = NDArray[np.float64]
+from characterisation.files.arrays import Floats
 
 #: coverage probability of the intervals
 COVERAGE = 0.95

@@ -42,6 +42,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.stats import norm, t
 
+from characterisation.files.arrays import Floats
 from characterisation.statements.coverage import (
     BLOCKS,
     COVERAGE,
@@ -53,8 +54,6 @@ from characterisation.statements.coverage import (
 )
 from characterisation.statements.one_sided import OneSidedErrors, stated_errors, without_bias
 from characterisation.statements.tolerance import Tolerance
-
-Floats = NDArray[np.float64]
 
 #: errors (n,) of trials, or those of a value that folds
 Errors = Floats | OneSidedErrors

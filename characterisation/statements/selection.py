@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import digamma, polygamma
 
-Floats = NDArray[np.float64]
+from characterisation.files.arrays import Floats
 
 #: standard uncertainty of the logarithm of the map's u, common to all views
 PRIOR_COMMON = 1.0

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import spearmanr
 
-Floats = NDArray[np.float64]
+from characterisation.files.arrays import Floats
 
 #: largest probability that a dependence is reported although no number has one (Bonferroni); chosen
 _CHANCE = 0.01

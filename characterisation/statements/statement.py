@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.statements.budget import BudgetLine
 from characterisation.statements.coverage import (
@@ -41,8 +42,6 @@ from characterisation.statements.tolerance import Tolerance
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-Floats = NDArray[np.float64]
 
 Part = Literal["any part", "part at the limit of the tolerance", "part far from nominal"]
 

@@ -28,7 +28,7 @@ from scipy.optimize import nnls
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-Floats = NDArray[np.float64]
+from characterisation.files.arrays import Floats
 
 #: name of the component of what no other explains: independent from trial to trial
 RESIDUAL = "residual"

@@ -48,10 +48,9 @@ from characterisation.features.credibility import most_uncertain
 from characterisation.features.fits import COVERAGE, GATE, LEAST_BELONGING, LEAST_GATE_MM
 from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import GRAZING_COSINE, Surface
+from characterisation.files.arrays import Floats
 from characterisation.maps.pooled_offsets import DISC_RADIUS
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE
-
-Floats = NDArray[np.float64]
 
 #: l [px] of the correlation of persistent noise; *assumed*
 PERSISTENT_REACH_PX = 60.0

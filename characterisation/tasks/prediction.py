@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from characterisation.features.figures import Circle, EdgePoint, crossings, edge_covariance
@@ -25,11 +24,10 @@ from characterisation.features.form import Form, form_modes
 from characterisation.features.pose_fit import PoseFit, pose_jacobian
 from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import Cone, Cylinder, Plane
+from characterisation.files.arrays import Floats
 from characterisation.tasks.covariance import ExpectedFit, ExpectedPoints, expected_fit, expected_sums, solved, usable
 from characterisation.tasks.measurement_model import InputQuantity, evaluate, measurement_model
 from characterisation.tasks.task_file import Task
-
-Floats = NDArray[np.float64]
 
 #: step of the parameters for the quadratic form of a measurement, in units of their standard deviations
 STEP = 1e-3

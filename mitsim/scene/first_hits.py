@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import known_to_device, vectors_to_device, vectors_to_host
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.coupon.orientations import sphere_directions
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from mitsim.scene.backend import mi
 from mitsim.scene.first_hits import first_hits
@@ -23,8 +24,6 @@ from mitsim.scene.load import Scene, bounds_of
 from mitsim.scene.materials import Finish
 from mitsim.scene.mesh_facts import MeshFacts, mesh_facts
 from mitsim.scene.xml_check import checked_trees
-
-Floats = NDArray[np.float64]
 
 #: points on each shape
 _SAMPLES = 2048

@@ -16,13 +16,12 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.plots.labels import label_columns, round_length, scale_bar
 from characterisation.plots.part_pictures import EDGE_SHADE, innermost_pixel, shape_edges, viewer_frame
 from characterisation.plots.style import INK, OTHER_SHAPE, SHAPES, axes_for, figure_of
 from mitsim.scene.first_hits import Hits, first_hits
 from mitsim.sensor.transforms import Transform
-
-Floats = NDArray[np.float64]
 
 #: rays along the longer side of the picture
 _RAYS = 520

@@ -11,14 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from mitsim.scene.first_hits import first_hits
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.raycast import PixelRays, cast, shapes_met
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.rig_parameters import eyes
 from mitsim.sensor.transforms import Transform
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.files.atomic_io import atomic_write
 from characterisation.files.checked_files import LARGEST_FILE, read_bounded
 from characterisation.files.errors import InputError
@@ -21,8 +22,6 @@ from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.triangles import triangles_by_shape
 from mitsim.sensor.rig_parameters import eyes as eyes_of
 from mitsim.sensor.sensor import Sensor
-
-Floats = NDArray[np.float64]
 
 #: name of the file in a run's folder
 GEOMETRY_FILE = "stand.npz"

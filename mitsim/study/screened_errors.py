@@ -7,13 +7,11 @@ that represent it, for a decision rule.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import norm
 
+from characterisation.files.arrays import Floats
 from characterisation.tasks.folded import folded_values
 from characterisation.tasks.task_file import Task
-
-Floats = NDArray[np.float64]
 
 #: equally likely values of a standard normal distribution
 _NORMAL = norm.ppf((np.arange(400) + 0.5) / 400)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from characterisation.coupon.orientations import sphere_directions
 from characterisation.features.surfaces import unit
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from mitsim.running.progress import track_if_long
 from mitsim.sensor.sensor import Sensor
@@ -29,8 +30,6 @@ from mitsim.sensor.working_volume import in_image
 from mitsim.views.collision import BodyBox, Obstacle, is_inside, is_near, obstacle, sensor_box
 from mitsim.views.reach import reach_directions, reach_rotations, stage_from_part, stage_from_sensor
 from mitsim.views.table import PartStage, ViewsTable
-
-Floats = NDArray[np.float64]
 
 #: step by which a sensor that is too near is moved out [mm]
 STEP_MM = 10.0

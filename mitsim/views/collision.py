@@ -25,11 +25,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from trimesh.grouping import unique_rows
 
+from characterisation.files.arrays import Floats
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.views.table import MARGIN_MM, SensorBody
-
-Floats = NDArray[np.float64]
 
 #: winding number above which a place is inside: half-way from 0 to 1
 _INSIDE = 0.5

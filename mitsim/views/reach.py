@@ -24,17 +24,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from characterisation.coupon.view_frame import view_frame
+from characterisation.files.arrays import Floats
 from characterisation.stage.angles import Reach, about_one, about_two, least_motion, turned
 from characterisation.stage.turning_axes import rotation_about
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.views.table import PartStage
-
-Floats = NDArray[np.float64]
 
 _Z = np.array([0.0, 0.0, 1.0])
 

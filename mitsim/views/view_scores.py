@@ -20,6 +20,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.features.robust_fit import FitError
+from characterisation.files.arrays import Floats
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.scores.view_score import rank_views, score_views, view_statistics
 from characterisation.tasks.covariance import LEAST_CHANCE, ExpectedPoints
@@ -51,8 +52,6 @@ from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
 from mitsim.sensor.transforms import Transform
 from mitsim.views import View
-
-Floats = NDArray[np.float64]
 
 __all__ = ["LEAST_CHANCE", "MATT_WHITE", "score_candidates", "with_poses"]
 

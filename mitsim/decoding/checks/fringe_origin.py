@@ -17,14 +17,13 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from mitsim.decoding.checks.code_lines import CodeLines
 from mitsim.decoding.structured_light.gray_code import decode_stripes
 from mitsim.decoding.structured_light.phase_shift import fit_phases
 from mitsim.sensor.image_role import Axis, Origin, Role, Wave, offset_in_pixels, origin_shift
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, LightCode
-
-Floats = NDArray[np.float64]
 
 #: least number of edges, and least share of the changes of a stripe's number that are by one: along a surface one bit
 #: changes at a time, and of bits in another order or exchanged with complements at most two thirds of the changes are

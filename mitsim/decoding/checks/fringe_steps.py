@@ -17,11 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from mitsim.decoding.checks.code_lines import CodeLines
 from mitsim.sensor.image_role import Axis
 from mitsim.sensor.light_code import GrayCode
-
-Floats = NDArray[np.float64]
 
 #: weight of the sums that is reported: 4 % of the modulation. A lamp flickers by 1 %
 _CONTRADICTION = 0.04

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
 from mitsim.decoding.checks.code_lines import CodeLines
@@ -26,8 +27,6 @@ from mitsim.decoding.checks.fringe_origin import CHANGES, FringeChange, describe
 from mitsim.sensor.image_role import Axis
 from mitsim.sensor.image_sequence import FringeImages, ImageSequence
 from mitsim.sensor.light_code import GrayCode, LightCode, roles
-
-Floats = NDArray[np.float64]
 
 #: pixels on either side of a jump that have to be smooth
 _SIDE = 3

@@ -21,8 +21,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
 from mitsim.decoding.checks.code_lines import CodeLines
@@ -37,7 +37,6 @@ from mitsim.sensor.image_role import Axis, Offset
 from mitsim.sensor.image_sequence import GrayImages, ImageSequence
 from mitsim.sensor.light_code import GrayCode, LightCode, axes, roles
 
-Floats = NDArray[np.float64]
 Origins = dict[Axis, Offset]
 
 #: approximate number of pixels evaluated along either side of the image

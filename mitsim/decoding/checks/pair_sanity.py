@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from characterisation.files.arrays import Floats
 from mitsim.decoding.checks.rig_sanity import COARSE, half_stripe
 from mitsim.decoding.checks.row_texture import LARGEST_SPREAD, rectified, textured_row_error, uniform_light_mean
 from mitsim.decoding.coded_images import CodedImages
@@ -26,8 +27,6 @@ from mitsim.sensor.image_role import Axis
 from mitsim.sensor.light_code import roles
 
 Levels = NDArray[np.unsignedinteger[Any]]
-Floats = NDArray[np.float64]
-
 #: largest row error of a pair [px]; a stereo matcher begins to lose points at about this
 LARGEST_ROW_ERROR = 0.3
 

@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.point_cloud import Status
 from mitsim.decoding.structured_light.geometry import offset_from_projector
 from mitsim.decoding.structured_light.projector_coordinate import ProjectorCoordinate
@@ -21,8 +21,6 @@ from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis
 from mitsim.sensor.light_code import LightCode, axes
 from mitsim.sensor.transforms import Transform
-
-Floats = NDArray[np.float64]
 
 #: least share of the baseline across the stripes; below, depth has half the sensitivity that another axis gives
 LEAST_ACROSS = 0.5

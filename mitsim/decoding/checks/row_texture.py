@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from characterisation.files.arrays import Floats
 from characterisation.point_cloud import PointCloud
 from mitsim.decoding.matching.row_error import MAXIMUM_ROWS, row_error
 from mitsim.decoding.matching.stereo import StereoGeometry
@@ -24,8 +25,6 @@ from mitsim.decoding.structured_light.two_cameras import find_coordinates
 from mitsim.sensor.image_role import Role
 
 Levels = NDArray[np.unsignedinteger[Any]]
-Floats = NDArray[np.float64]
-
 #: range of row offsets of a code of columns, which has the disparity whatever they are
 _ROWS = 6
 

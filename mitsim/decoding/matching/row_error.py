@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from characterisation.files.arrays import Floats
 from mitsim.decoding.matching.stereo import StereoGeometry
-
-Floats = NDArray[np.float64]
 
 #: largest offset that is tested, up and down [rows]: farther, a matcher finds hardly a point
 MAXIMUM_ROWS = 2

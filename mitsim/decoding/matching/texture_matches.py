@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-Floats = NDArray[np.float64]
+from characterisation.files.arrays import Floats
 
 #: longest side of the images that are compared [px]; larger ones are averaged
 _LONGEST_PX = 1000

@@ -24,6 +24,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError, nearest
 from characterisation.files.threads import in_threads
 from characterisation.point_cloud import ViewGrid
@@ -33,8 +34,6 @@ from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.distortion_fold import inverse_fold_radii
 from mitsim.sensor.image_role import Axis
 from mitsim.sensor.light_code import LightCode, axes
-
-Floats = NDArray[np.float64]
 
 #: intended error of the polynomial w(u) against the exact projection [projector px]
 TARGET_ERROR_PX = 1e-5

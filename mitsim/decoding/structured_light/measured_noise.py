@@ -23,11 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from characterisation.files.arrays import Floats
 from mitsim.decoding.grey_levels import MeasuredNoise
 from mitsim.decoding.structured_light.phase_shift import fit_phases
 from mitsim.sensor.image_role import Axis, Role
-
-Floats = NDArray[np.float64]
 
 #: approximate number of pixels that are used, in rows and columns at equal steps. From n squared residuals the standard
 #: deviation follows to 0.82 / sqrt(n): to 1.5 % for one residual a pixel and 16 levels, to less for more residuals. A

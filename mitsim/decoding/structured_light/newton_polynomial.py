@@ -11,10 +11,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.files.threads import in_threads
 from mitsim.decoding.blocks import row_bands
-
-Floats = NDArray[np.float64]
 
 
 def polynomial(

@@ -18,9 +18,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.point_cloud import Status
-
-Floats = NDArray[np.float64]
 
 #: signed light (H, W) of a bit, by its number (0 is the finest): positive where it is lit, 0 where pattern and inverse
 #: are equal

@@ -13,13 +13,14 @@ import numpy as np
 from pydantic import Field
 
 from characterisation.features.surfaces import Cone, Cylinder, Plane, tangents
+from characterisation.files.arrays import Floats
 from characterisation.files.documents import Document, read_toml
 from characterisation.files.errors import nearest
 from characterisation.tasks.decision_table import Decision
 from characterisation.tasks.task_file import Feature, Measurement, Task
 from characterisation.tasks.task_reading import misstated, read_task
 from mitsim.running.progress import say
-from mitsim.scene.authoring.face import Floats, surface_distance
+from mitsim.scene.authoring.face import surface_distance
 from mitsim.scene.authoring.finding import SceneFinding, Severity
 from mitsim.scene.inspect import SceneFacts, ShapeFacts, shape_facts
 from mitsim.scene.load import Scene

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere, tangents
+from characterisation.files.arrays import Floats
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 

@@ -20,7 +20,8 @@ from decimal import ROUND_HALF_UP, Decimal
 import numpy as np
 
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
-from mitsim.scene.authoring.face import Face, Floats, Torus
+from characterisation.files.arrays import Floats
+from mitsim.scene.authoring.face import Face, Torus
 
 #: names of directions along x, y, z: (minus, plus)
 SIDES = (("left", "right"), ("front", "back"), ("bottom", "top"))

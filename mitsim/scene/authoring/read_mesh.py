@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError, nearest
-from mitsim.scene.authoring.face import Floats, Ints
+from mitsim.scene.authoring.face import Ints
 from mitsim.scene.authoring.units import commented_unit, unit_assumed, unit_words
 from mitsim.sensor.calibration_qualifiers import LENGTHS_MM, UNITS_MM
 

@@ -25,19 +25,11 @@ from typing import Any
 import numpy as np
 
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from mitsim.running.progress import say_progress
 from mitsim.scene.authoring import step_mesh, step_worker
-from mitsim.scene.authoring.face import (
-    Face,
-    Floats,
-    Ints,
-    Surface,
-    Torus,
-    outward_normals,
-    same_surface,
-    surface_distance,
-)
+from mitsim.scene.authoring.face import Face, Ints, Surface, Torus, outward_normals, same_surface, surface_distance
 from mitsim.scene.authoring.part21 import StepText, read_step_text
 from mitsim.scene.authoring.placements import check_placements
 from mitsim.scene.authoring.segment_mesh import components

@@ -17,7 +17,8 @@ import trimesh
 from characterisation.features.fits import fit_cylinder, fit_sphere
 from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import Cylinder, Plane, Sphere, tangents
-from mitsim.scene.authoring.face import TOLERANCE_MM, Face, Floats, Ints, Surface, outward_normals, surface_distance
+from characterisation.files.arrays import Floats
+from mitsim.scene.authoring.face import TOLERANCE_MM, Face, Ints, Surface, outward_normals, surface_distance
 
 #: a normal is perpendicular to an axis within this sine: 0.6 deg
 _ACROSS = 0.01

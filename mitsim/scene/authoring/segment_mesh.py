@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
-from mitsim.scene.authoring.face import Face, Floats, Ints, same_surface
+from mitsim.scene.authoring.face import Face, Ints, same_surface
 from mitsim.scene.authoring.recognise import recognised
 
 #: largest number of faces; a mesh with more is a scan or noise, not a machined part

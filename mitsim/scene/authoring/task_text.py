@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere, tangents
+from characterisation.files.arrays import Floats
 from mitsim.scene.authoring.drawing_task import DrawnTask
 from mitsim.scene.authoring.drawn_zones import middle_outline
-from mitsim.scene.authoring.face import Face, Floats
+from mitsim.scene.authoring.face import Face
 
 #: kinds of face that a task supports
 MEASURED = (Plane, Cylinder, Sphere, Cone)

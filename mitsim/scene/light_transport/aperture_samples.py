@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-Floats = NDArray[np.float64]
+from characterisation.files.arrays import Floats
 
 #: radii (c, p) of the two blurs [px] for which the order is optimised
 _BLURS = ((0.15, 0.1), (0.45, 0.45), (0.45, -0.45), (0.0, 0.45), (0.9, 0.9))

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.first_hits import shape_indices
@@ -24,8 +25,6 @@ from mitsim.scene.ray_casting.eye import Eye
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.projector import Projector
 from mitsim.sensor.transforms import Transform
-
-Floats = NDArray[np.float64]
 
 #: paths at once
 _TOGETHER = 1 << 21

@@ -15,13 +15,11 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from characterisation.files.arrays import Floats
 from mitsim.scene.backend import mi
 from mitsim.scene.load import Scene, bounds_of
-
-Floats = NDArray[np.float64]
 
 #: corners around a circle
 _ANGLES = np.linspace(0, 2 * np.pi, 129)

@@ -20,9 +20,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from characterisation.acceptance.vdi_2634 import flatness_error
+from characterisation.files.arrays import Floats
 from mitsim.decoding.structured_light.geometry import MINIMUM_CHANGE_PX, axis_across
 from mitsim.sensor.camera import Camera, Rig, stereo_rectification
 from mitsim.sensor.light_code import LightCode, axes
@@ -30,8 +30,6 @@ from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import moved, path_error
 from mitsim.sensor.sensor import Sensor
 from mitsim.study.calibration.board import seen_by_all
-
-Floats = NDArray[np.float64]
 
 #: half the depth of the measuring volume, relative to the middle of the working range
 _HALF_DEPTH = 0.15

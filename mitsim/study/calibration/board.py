@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError, nearest
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.transforms import Transform
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -27,12 +27,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from characterisation.files.arrays import Floats
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.rig_parameters import MATRIX_NAMES, POSE_NAMES, distortion_names, moved, parameter_names
 from mitsim.sensor.transforms import Transform
 from mitsim.study.calibration.board import Board
-
-Floats = NDArray[np.float64]
 
 #: columns of OpenCV's Jacobian after rotation, translation and fx fy cx cy: the coefficients
 _ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")

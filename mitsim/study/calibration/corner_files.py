@@ -29,14 +29,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.files.checked_files import read_text_bounded
 from characterisation.files.errors import InputError
 from mitsim.capture.grey_image import read_grey
 from mitsim.sensor.calibration_formats import read_documents
 from mitsim.study.calibration.board import Board
 from mitsim.study.calibration.recorded import RecordedBoard
-
-Floats = NDArray[np.float64]
 
 #: pixel (2,) of every corner, by pose and camera
 Seen = dict[str, dict[str, dict[int, Floats]]]

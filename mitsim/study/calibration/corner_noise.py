@@ -18,8 +18,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from mitsim.decoding.cloud import unknown_code
 from mitsim.decoding.grey_levels import grey_level_variance
 from mitsim.decoding.matching.reference_matching import reference_geometry
@@ -32,8 +32,6 @@ from mitsim.sensor.point_spread import point_spread
 from mitsim.sensor.projector_images import ProjectorImages
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.sensor_file import AutomaticExposure
-
-Floats = NDArray[np.float64]
 
 #: reflectance of the board's white and black; *assumed* for print on matt paper or ceramic
 WHITE, BLACK = 0.85, 0.05

@@ -17,9 +17,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2, norm
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from mitsim.sensor.rig_parameters import parameter_differences
 from mitsim.study.calibration.board import Board
@@ -31,8 +31,6 @@ from mitsim.study.calibration.recorded import (
     largest_tilt,
     tilt_hint,
 )
-
-Floats = NDArray[np.float64]
 
 #: probability with which halves of a right calibration count as different
 _RISK = 0.01

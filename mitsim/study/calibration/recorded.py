@@ -25,6 +25,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.rig_covariance import RigCovariance
@@ -33,8 +34,6 @@ from mitsim.sensor.rig_parameters import parameter_names, parameter_values
 from mitsim.sensor.transforms import Transform
 from mitsim.study.calibration import bundle
 from mitsim.study.calibration.board import Board
-
-Floats = NDArray[np.float64]
 
 #: One sigma of the prior of a lens, all *assumed*. Principal point relative to the size, along columns and rows;
 #: projectors shift their image.

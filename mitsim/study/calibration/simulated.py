@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.rig_parameters import distortion_names, parameter_differences, parameter_names
@@ -22,8 +22,6 @@ from mitsim.sensor.rig_parameters import eyes as all_eyes
 from mitsim.sensor.transforms import Transform
 from mitsim.study.calibration import bundle
 from mitsim.study.calibration.board import Board
-
-Floats = NDArray[np.float64]
 
 #: termination of OpenCV's estimate of one eye, which is only a start; that of its tutorials
 _COARSE = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 30, 1e-6)

@@ -15,10 +15,10 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from characterisation.features.fits import fit_plane
 from characterisation.features.robust_fit import FitError
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
@@ -31,8 +31,6 @@ from mitsim.sensor.sensor import Sensor
 from mitsim.study.calibration.accuracy import measured_points
 from mitsim.study.calibration.board import Board
 from mitsim.study.calibration.corner_files import found_corners, turned_alike
-
-Floats = NDArray[np.float64]
 
 #: number of rigs drawn, and the seed of the draws
 _DRAWS, _SEED = 200, 1

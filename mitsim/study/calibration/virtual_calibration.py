@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.drift import Drift, with_drift
@@ -28,8 +29,6 @@ from mitsim.study.calibration.accuracy import Accuracy, accuracy
 from mitsim.study.calibration.board import Board, board_poses, default_board
 from mitsim.study.calibration.bundle import BoardView, Linearised, linearise
 from mitsim.study.calibration.corner_noise import coordinate_noise, corner_noise
-
-Floats = NDArray[np.float64]
 
 #: default number of poses; calibration handbooks recommend 15 to 25
 POSES = 20

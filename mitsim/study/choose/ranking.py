@@ -13,9 +13,9 @@ import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
+from characterisation.files.arrays import Floats
 
 #: demand by screening, relative to the limit of the decision rule, above which a sensor is not measured
 LARGEST_DEMAND = 3.0

@@ -10,14 +10,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.statements.statement import Statement
 from mitsim.study.choose.candidates import CandidateSensor
 from mitsim.study.choose.ranking import rank_keys
 from mitsim.study.session import Session
 from mitsim.study.virtual.race import Raced
 from mitsim.study.virtual.stated import StatedView
-
-Floats = NDArray[np.float64]
 
 
 @dataclass

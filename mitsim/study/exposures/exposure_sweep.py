@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from characterisation.features.fits import belonging
 from characterisation.features.robust_fit import CLIP, robust_std
 from characterisation.features.surfaces import GRAZING_COSINE, Surface
+from characterisation.files.arrays import Floats
 from characterisation.point_cloud import PointCloud, Status
 from characterisation.tasks.task_file import Task
 from mitsim.running.time_limit import OutOfTimeError, TimeLimit
@@ -38,8 +39,6 @@ from mitsim.study import MINIMUM_POINTS
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.world import Trial
 from mitsim.views import View
-
-Floats = NDArray[np.float64]
 
 #: first number of the seeds of a sweep, which keeps its noise independent of that of the trials
 _STREAM = 77

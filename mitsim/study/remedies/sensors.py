@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.maps.shipped import shipped_maps
 from mitsim.running.progress import say
@@ -26,8 +26,6 @@ from mitsim.study.remedies.change import SCREENING_FACTOR, Change, ChangedStudy,
 from mitsim.study.session import Session
 from mitsim.views import View
 from mitsim.views.view_scores import screening_risk
-
-Floats = NDArray[np.float64]
 
 #: directions in which another sensor is screened, and sensors that are proposed
 _DIRECTIONS, _MOST = 6, 2

@@ -17,11 +17,11 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 
 import numpy as np
-from numpy.typing import NDArray
 
 from characterisation.features.best_fit import best_fit, motion_matrix
 from characterisation.features.fits import belonging
 from characterisation.features.robust_fit import FitError
+from characterisation.files.arrays import Floats
 from characterisation.point_cloud import PointCloud
 from characterisation.scores.joining import pose_covariance
 from characterisation.tasks.evaluation import measure, measure_points
@@ -30,8 +30,6 @@ from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.trials import Outcome
 from mitsim.study.virtual.world import Trial
 from mitsim.views import View
-
-Floats = NDArray[np.float64]
 
 #: seed of the streams of pose errors, different from those of the groups of unknowns
 _POSE_STREAM = 31

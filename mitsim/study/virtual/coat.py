@@ -16,14 +16,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.point_cloud import ViewGrid
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.raycast import Surfaces
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.unknowns import CoatUnknowns
 from mitsim.study.virtual.form import along_rays
-
-Floats = NDArray[np.float64]
 
 #: finish of the faces that are sprayed: no part is made of it
 SPRAY = "matt_white"

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.point_cloud import PointCloud
 from mitsim.sensor.transforms import Transform
 from mitsim.study.virtual.world import DrawnValues
-
-Floats = NDArray[np.float64]
 
 
 def displaced(

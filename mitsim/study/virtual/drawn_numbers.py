@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from characterisation.files.arrays import Floats
 from characterisation.statements.budget import INTERACTION
 from characterisation.statements.size_dependence import DrawnNumber
 from mitsim.study import Study
@@ -36,7 +37,6 @@ from mitsim.study.virtual.world import (
     seed_day,
 )
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 #: days of a statement, then the trial that captures the first of them again

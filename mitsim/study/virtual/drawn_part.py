@@ -10,9 +10,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from characterisation.files.arrays import Floats
 from mitsim.scene.light_transport.plain_scene import distinct_bsdfs
 from mitsim.scene.light_transport.room_light import directional_albedos
 from mitsim.scene.load import Scene, load_scene
@@ -20,8 +18,6 @@ from mitsim.scene.surface.scatter import Deviation
 from mitsim.study import Study
 from mitsim.study.virtual.drawn_finish import finish_deviation
 from mitsim.study.virtual.world import Unknowns
-
-Floats = NDArray[np.float64]
 
 
 class DrawnPart:

@@ -21,6 +21,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud
@@ -45,8 +46,6 @@ from mitsim.study.virtual.screening import screen
 from mitsim.study.virtual.trials import Outcome
 from mitsim.study.virtual.world import BEYOND, DrawnValues, Unknowns
 from mitsim.views import View
-
-Floats = NDArray[np.float64]
 
 #: number of points of a cloud whose displacement by the calibration is computed; a polynomial of direction and inverse
 #: distance interpolates between them

@@ -20,14 +20,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.statements.selection import Standing, joint_samples, judge
 from mitsim.running.progress import say, say_progress, track
 from mitsim.study.virtual.trials import Outcome, TrialFolder
 from mitsim.study.virtual.world import Trial
 from mitsim.views import View
 from mitsim.views.view_scores import screening_risk
-
-Floats = NDArray[np.float64]
 
 #: first trials of every view on the shortlist, and trials per later batch. Few trials of many views find a better view
 #: than many trials of few (tests/benchmarks/race_starts.py, on the open cases of scenes/parts)

@@ -57,8 +57,6 @@ from mitsim.study.virtual.view_light import LightOfViews, ViewLight, regions, se
 from mitsim.study.virtual.world import DrawnValues, Trial, Unknowns
 from mitsim.views import View
 
-Floats = NDArray[np.float64]
-
 #: number of standard deviations of its placement by which the part may be displaced and still be inside the window
 _PLACEMENTS = 3.0
 

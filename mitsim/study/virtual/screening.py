@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.tasks.measurement_model import InputQuantity
 from mitsim.maps.prediction import Effect, Predictor
@@ -27,8 +28,6 @@ from mitsim.study.calibration.accuracy import measured_points
 from mitsim.study.virtual.study_unknowns import study_unknowns
 from mitsim.study.virtual.world import Unknowns, scaled_baseline, scaled_focal
 from mitsim.views.view_scores import score_candidates, scoring_order
-
-Floats = NDArray[np.float64]
 
 #: number of places along each axis of the box around a part, and in all views together, for which displacements are
 #: computed

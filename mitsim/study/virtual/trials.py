@@ -21,9 +21,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
+from characterisation.files.arrays import Floats
 from characterisation.files.atomic_io import json_values
 from characterisation.files.documents import Document
 from characterisation.files.errors import InputError
@@ -33,8 +33,6 @@ from characterisation.tasks.result import Result
 from characterisation.tasks.task_file import Task
 from mitsim.running.numbers import or_nan
 from mitsim.study.virtual.world import Trial
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from characterisation.files.arrays import Floats
 from characterisation.region_of_interest import Roi
 from mitsim.capture.simulated.kept_light import KeptLight
 from mitsim.capture.simulated.simulate import SimulatedSensor
@@ -21,8 +19,6 @@ from mitsim.scene.light_transport.room_light import SeenSurfaces
 from mitsim.scene.load import Scene
 from mitsim.sensor.roi import roi_around
 from mitsim.sensor.transforms import Transform
-
-Floats = NDArray[np.float64]
 
 #: pixels traced around the part, for the blur of the lens and the blocks of the matcher
 _MARGIN_PX = 12
