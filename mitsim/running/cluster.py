@@ -71,7 +71,7 @@ class Cluster:
         items: Sequence[Item],
         order: Callable[[Item], Plain],
         work: Callable[[Plain], Result],
-        prepared: Callable[[Item], Hashable] | None = None,
+        prepared: Callable[[Item], tuple[Hashable, Hashable]] | None = None,
     ) -> Iterator[tuple[Item, Result]]:
         """Yield items with their results, as they are finished.
 

@@ -51,7 +51,7 @@ class Executor(Protocol):
         items: Sequence[Item],
         order: Callable[[Item], Plain],
         work: Callable[[Plain], Result],
-        prepared: Callable[[Item], Hashable] | None = None,
+        prepared: Callable[[Item], tuple[Hashable, Hashable]] | None = None,
     ) -> Iterator[tuple[Item, Result]]:
         """Yield items with the results of ``work``, a module-level function, on their orders, as they are finished.
 
@@ -62,7 +62,8 @@ class Executor(Protocol):
         order, work
             Plain value of an item, and the function of it.
         prepared
-            Name of what a worker prepares for an item and keeps; by default nothing.
+            Names of what a worker prepares for an item: a whole, of which it keeps the last, and a part of it; by
+            default nothing.
 
         Raises
         ------
@@ -138,14 +139,14 @@ class Pool:
     def __init__(self, processes: int) -> None:
         self.processes = processes
         self._workers: dict[int, ProcessPoolExecutor] = {}
-        self._prepared: dict[int, set[Hashable]] = {}
+        self._prepared: dict[int, set[tuple[Hashable, Hashable]]] = {}
 
     def distribute(
         self,
         items: Sequence[Item],
         order: Callable[[Item], Plain],
         work: Callable[[Plain], Result],
-        prepared: Callable[[Item], Hashable] | None = None,
+        prepared: Callable[[Item], tuple[Hashable, Hashable]] | None = None,
     ) -> Iterator[tuple[Item, Result]]:
         """Yield items with their results, as they are finished; dead processes are replaced.
 
@@ -154,7 +155,7 @@ class Pool:
         items, order, work, prepared
             As of :meth:`Executor.distribute`.
         """
-        name_of, deaths = prepared or (lambda _: None), 0
+        name_of, deaths = prepared or (lambda _: (None, None)), 0
         waiting: deque[Item] = deque(items)
         running: dict[Future[Result], Item] = {}
         worker_of: dict[Future[Result], int] = {}
@@ -167,7 +168,8 @@ class Pool:
 
         def submit(item: Item) -> Future[Result]:
             future = self._ready(chosen).submit(work, order(item))
-            self._prepared[chosen].add(name_of(item))
+            name = name_of(item)
+            self._prepared[chosen] = {one for one in self._prepared[chosen] if one[0] == name[0]} | {name}
             worker_of[future] = chosen
             return future
 
@@ -199,7 +201,7 @@ class Pool:
             one.shutdown()
 
     def _next(
-        self, waiting: deque[Item], name_of: Callable[[Item], Hashable], orders: Counter[int]
+        self, waiting: deque[Item], name_of: Callable[[Item], tuple[Hashable, Hashable]], orders: Counter[int]
     ) -> tuple[int | None, int]:
         """Return the place of the next of the waiting items, and its worker; None without room.
 

@@ -31,9 +31,9 @@ class Clock:
         self.last = time.monotonic()
 
     def lap(self, step: str) -> None:
-        """End a step."""
+        """End a step, or a part of one."""
         now = time.monotonic()
-        self.steps[step], self.last = round(now - self.last, 2), now
+        self.steps[step], self.last = round(self.steps.get(step, 0.0) + now - self.last, 2), now
 
 
 class Answers:

@@ -39,8 +39,9 @@ from mitsim.running.time_limit import TimeLimit, stopped_by_user
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import Study
 from mitsim.study.early_answers import Answers, Clock
-from mitsim.study.remedies.change import Shortfall, missed_by
-from mitsim.study.remedies.confirm import Remedies, all_changes, find_remedies, of_missed, remedies_document
+from mitsim.study.remedies.change import Shortfall
+from mitsim.study.remedies.confirm import remedies_document
+from mitsim.study.remedies.in_turn import seeks_remedies, state_and_mend
 from mitsim.study.run_record import draw_clouds, write_record
 from mitsim.study.scoring import score_study, write_raced
 from mitsim.study.session import Session
@@ -122,7 +123,7 @@ def run_within(
         Writes the report of the folder. Called for the first answer after :data:`FIRST_ANSWER_S`, and as it improves.
     """
     whole = None if limit.end is None else limit.end - limit.began
-    plan = time_plan(whole or 0.0, len(study.views), _seeks_remedies(study))
+    plan = time_plan(whole or 0.0, len(study.views), seeks_remedies(study))
     if whole is not None:
         say(plan.in_words())
     session, clock = Session(study, folder, workers), Clock()
@@ -143,7 +144,7 @@ def run_within(
     scores = write_raced(session, scores, raced)
     clock.lap("race")
     leaders = list(dict.fromkeys(raced.leaders().values()))
-    stated = None
+    stated, rest = None, plan.rest_limit(limit)
     if leaders:
         statement_limit = plan.statement_limit(limit)
         stated = session.state(
@@ -156,18 +157,9 @@ def run_within(
     remedies = None
     if stated is not None and not limit.over():
         twin = None  # its memory is for the changed studies
-        own = study.file.remedies.minutes
-        allowed = TimeLimit(60 * own) if limit.end is None else plan.rest_limit(limit)
-        remedies = _remedies(session, stated, scores, raced, search, allowed)
+        now = Shortfall(session, stated, scores, raced, search)
+        stated, remedies = state_and_mend(session, now, rest, clock)
         twin = session.renderer
-    clock.lap("remedies")
-    if stated is not None and limit.end is not None and not limit.over():
-        # in the time that the remedies left
-        stated = session.state(stated.view, None, plan.rest_limit(limit))
-        write_json(folder / "statement.json", statement_document(session, stated))
-        if _seeks_remedies(study):
-            remedies = of_missed(remedies, missed_by(stated))
-    clock.lap("state further")
     tried = [] if limit.over() else _confirm(session, chosen, search)
     chosen = tried[-1].chosen if tried else chosen
     clock.lap("confirm")
@@ -263,23 +255,6 @@ def _confirm(session: Session, chosen: ViewSet | None, search: Search) -> list[T
         f"{set_table(table, best)}"
     )
     return tried
-
-
-def _seeks_remedies(study: Study) -> bool:
-    """Return whether a run looks for changes that make measurements fit: the study allows it, and has tolerances."""
-    tolerances = (one.tolerance for one in study.task.measurements.values())
-    return study.file.remedies.minutes > 0 and any(one is not None for one in tolerances)
-
-
-def _remedies(
-    session: Session, stated: StatedView, scores: xr.Dataset, raced: Raced, search: Search, limit: TimeLimit
-) -> Remedies | None:
-    """Return the changes with which the measurements fit that do not; None if all fit."""
-    now = Shortfall(session, stated, scores, raced, search, session.folder / "remedies")
-    if not now.missed or not _seeks_remedies(session.study):
-        return None
-    trials = session.study.file.remedies.trials
-    return find_remedies(now.missed, all_changes(now, limit), trials, limit)
 
 
 def _best(scores: xr.Dataset) -> list[int]:

@@ -218,7 +218,7 @@ class Session:
         view: View,
         table: StatementTable | None = None,
         limit: TimeLimit | None = None,
-        after_batch: Callable[[StatedView], None] | None = None,
+        after_batch: Callable[[StatedView], bool | None] | None = None,
     ) -> StatedView:
         """State every measurement from one view at its exposures.
 

@@ -23,6 +23,9 @@ _REPORT_SHARE, _REPORT_S = 0.15, (5.0, 40.0)
 #: processor time of clouds and page without pictures [s]; largest factor of a busy machine, and share of what is left
 _PAGE_S, _BUSIEST, _PAGE_SHARE = 6.0, 6.0, 0.4
 
+#: largest share of the time after the race that is kept for pictures and report, on a machine slower than planned
+_LARGEST_REPORT_SHARE = 0.4
+
 #: share of the rest for the race; the statement gets what the race leaves
 _RACE_SHARE = 0.45
 
@@ -75,7 +78,7 @@ class TimePlan:
 
     def _pictures(self, limit: TimeLimit) -> float:
         """Return the time [s] that is kept for pictures and report."""
-        return max(self.page(limit), min(self.report, 0.2 * limit.left))
+        return max(self.page(limit), min(self.report, _LARGEST_REPORT_SHARE * limit.left))
 
     def page(self, limit: TimeLimit) -> float:
         """Return the time [s] that clouds and page will take, on a machine as busy as it has been so far."""

@@ -41,7 +41,7 @@ Stating = Callable[[int, TimeLimit], list[Statement]]
 class Shortfall:
     """A stated view whose measurements do not all fit, and what is known of the other views.
 
-    ``folder`` keeps the trials of changed studies. ``search`` finds sets of views by the map.
+    ``search`` finds sets of views by the map.
     """
 
     session: Session
@@ -49,7 +49,11 @@ class Shortfall:
     scores: xr.Dataset
     raced: Raced
     search: Search
-    folder: Path
+
+    @property
+    def folder(self) -> Path:
+        """Return the folder of the trials of changed studies."""
+        return self.session.folder / "remedies"
 
     @property
     def study(self) -> Study:

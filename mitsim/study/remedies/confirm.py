@@ -78,7 +78,11 @@ class Remedies:
 
 
 def find_remedies(
-    missed: dict[str, Statement], proposed: Iterable[Change], trials: int, limit: TimeLimit | None = None
+    missed: dict[str, Statement],
+    proposed: Iterable[Change],
+    trials: int,
+    limit: TimeLimit | None = None,
+    before: Remedies | None = None,
 ) -> Remedies:
     """Try changes until every missed measurement fits with one, no change is left, or time is over.
 
@@ -92,12 +96,17 @@ def find_remedies(
         Virtual measurements of a change; a quarter of them can exclude it, and four times as many may decide it.
     limit
         Time; none by default.
+    before
+        What was tried before. It is not tried again, and is part of the result.
     """
-    found, limit, kinds = Remedies(missed), limit or TimeLimit(), set[str]()
+    known = Remedies(missed) if before is None else before
+    found, limit = Remedies(missed, list(known.tried), list(known.failed)), limit or TimeLimit()
+    done = {change.words for change in (*(one.change for one in known.tried), *(one for one, _ in known.failed))}
+    kinds = set[str]()
     for change in proposed:
         kinds.add(change.kind)
         wanted = [name for name in change.expected if name in found.open]
-        if not wanted:
+        if not wanted or change.words in done:
             continue
         if limit.over():
             found.untried.append(change.words)
@@ -124,22 +133,27 @@ def find_remedies(
         say(f"remedies: {change.words}: {fits} of {len(wanted)} fits, by {tried.trials} trials in {seconds:.0f} s")
         if not found.open:
             break
-    if limit.over() and found.open and "sensor" not in kinds:
-        found.untried.append("with another sensor")
-    return found
+    return _without_sensors(found) if limit.over() and "sensor" not in kinds else found
 
 
-def of_missed(found: Remedies | None, missed: dict[str, Statement]) -> Remedies | None:
+def of_missed(found: Remedies | None, missed: dict[str, Statement], proposed_all: bool = True) -> Remedies | None:
     """Return remedies for the measurements that a longer statement misses; None if it misses none.
 
-    Changes were chosen for the measurements that were missed before; they may help others too.
+    Changes were chosen for the measurements that were missed before; they may help others too. Unless all kinds were
+    proposed, other sensors are among what was not tried.
     """
     if not missed:
         return None
     now = Remedies(missed) if found is None else replace(found, missed=missed)
     known = () if found is None else found.missed
-    untried = [f"changes for {name}" for name in now.open if name not in known]
-    return replace(now, untried=[*now.untried, *untried])
+    now = replace(now, untried=[*now.untried, *(f"changes for {name}" for name in now.open if name not in known)])
+    return now if proposed_all else _without_sensors(now)
+
+
+def _without_sensors(found: Remedies) -> Remedies:
+    """Return remedies that name other sensors among what was not tried, if a measurement is open."""
+    words = "with another sensor"
+    return replace(found, untried=[*found.untried, words]) if found.open and words not in found.untried else found
 
 
 def all_changes(now: Shortfall, limit: TimeLimit) -> Iterator[Change]:

@@ -88,9 +88,9 @@ class SpreadMeasurements:
                 yield row[first : first + _IN_A_ROW]
 
 
-def _light_of(order: TrialOrder) -> tuple[str, Rendering, int]:
-    """Return the name of the light that the trials of an order share."""
-    return order.digest, order.rendering, order.jobs[0].view.number
+def _light_of(order: TrialOrder) -> tuple[tuple[str, Rendering], int]:
+    """Return the names of the measurements of an order, and of the light that its trials share."""
+    return (order.digest, order.rendering), order.jobs[0].view.number
 
 
 #: digest of a study, and its measurements with the light paths of the last order

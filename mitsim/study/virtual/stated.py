@@ -92,7 +92,7 @@ def state_view(
     view: View,
     table: StatementTable | None = None,
     limit: TimeLimit | None = None,
-    after_batch: Callable[[StatedView], None] | None = None,
+    after_batch: Callable[[StatedView], bool | None] | None = None,
 ) -> StatedView:
     """State every measurement from one view at its exposures, and reuse finished trials.
 
@@ -111,7 +111,7 @@ def state_view(
         Time of the statement. A study that names no number of trials may make :data:`MOST_WITHIN_A_LIMIT` within it,
         and does not end at a known uncertainty; without a limit, :data:`MOST`.
     after_batch
-        Receives the statement, without a budget, after every :data:`BATCH` trials but the last.
+        Receives the statement, without a budget, after every :data:`BATCH` trials but the last; ends it by True.
     """
     runner, trials, planned = source.runner, source.folder, source.planned
     limit = TimeLimit() if limit is None else limit
@@ -134,8 +134,8 @@ def state_view(
             break
         if by_known and count >= least and decided and _known_to(so_far.statements, rules.known_to):
             break
-        if after_batch is not None:
-            after_batch(so_far)
+        if after_batch is not None and after_batch(so_far):
+            break
     groups = budget_groups(unknowns, runner.source, study.sensor)
     numbers = drawn_numbers(study, unknowns, runner.source, made, groups)
     named = named_numbers(study, unknowns, made, groups) if runner.source == "render" else []

@@ -92,8 +92,9 @@ class Here:
         future.set_result(result)
 
 
-def test_orders_go_to_the_worker_that_prepared_for_them_unless_one_is_idle(monkeypatch):
-    """Two views of a race: each is prepared by one worker, until a worker has nothing of its own left."""
+@pytest.fixture
+def pool_of_two(monkeypatch):
+    """Two workers in this process, the first of which finishes all that it has before the second finishes anything."""
     pool, workers = Pool(2), [Here(), Here()]
 
     def ready(number):
@@ -106,12 +107,29 @@ def test_orders_go_to_the_worker_that_prepared_for_them_unless_one_is_idle(monke
 
     monkeypatch.setattr(pool, "_ready", ready)
     monkeypatch.setattr(executor, "wait", wait)
+    return pool, workers
+
+
+def in_upper_case(pool, whole, orders):
+    return dict(pool.distribute(orders, lambda one: one, str.upper, lambda one: (whole, one[0])))
+
+
+def test_orders_go_to_the_worker_that_prepared_for_them_unless_one_is_idle(pool_of_two):
+    """Two views of a race: each is prepared by one worker, until a worker has nothing of its own left."""
+    pool, workers = pool_of_two
     orders = ["a1", "a2", "a3", "b1", "b2", "b3", "b4", "b5", "b6", "b7", "b8"]
-    found = dict(pool.distribute(orders, lambda one: one, str.upper, lambda one: one[0]))
-    assert found == {one: one.upper() for one in orders}
+    assert in_upper_case(pool, "study", orders) == {one: one.upper() for one in orders}
     first, second = (one.made for one in workers)
     assert first[:3] == ["a1", "a2", "a3"] and second[:2] == ["b1", "b2"]  # the first finishes all that it has
     assert set(first[3:]) | set(second) == {one for one in orders if one[0] == "b"} and first[3:]
+
+
+def test_no_order_waits_for_a_worker_that_has_gone_to_another_study(pool_of_two):
+    pool, workers = pool_of_two
+    for whole in ("study", "changed study"):
+        in_upper_case(pool, whole, ["a1"])
+    in_upper_case(pool, "study", ["b1", "c1", "b2", "a2", "d1"])
+    assert workers[1].made[:2] == ["c1", "a2"]  # nobody has a any more, so the sequence is kept
 
 
 def test_a_process_that_dies_loses_no_work(pool, tmp_path, capsys):

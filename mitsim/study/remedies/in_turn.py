@@ -1,0 +1,105 @@
+"""Share the time after the race between the statement and the changes with which its measurements would fit.
+
+Signal chain: statement of the best view from its share of the time -> while a verdict is open, changes of the same
+sensor within half of the time, then the statement until every verdict is decided -> the changes that are left, other
+sensors the last -> the statement until it is settled, with the time that is left.
+
+Verdicts come before other sensors, because those need the most time: each is prepared, screened and compiled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from characterisation.files.atomic_io import write_json
+from mitsim.running.time_limit import TimeLimit
+from mitsim.study import Study
+from mitsim.study.early_answers import Clock
+from mitsim.study.remedies.change import Shortfall, missed_by
+from mitsim.study.remedies.changes import changes
+from mitsim.study.remedies.confirm import Remedies, all_changes, find_remedies, of_missed
+from mitsim.study.session import Session
+from mitsim.study.statement_document import statement_document
+from mitsim.study.virtual.stated import StatedView
+
+#: share of the time that is left which changes may take while a verdict is open
+_SHARE_WHILE_OPEN = 0.5
+
+#: goes on with a statement within a limit, until a function of the statement so far returns that it is enough
+Stating = Callable[[TimeLimit, Callable[[StatedView], bool]], StatedView]
+
+#: tries changes, with or without other sensors, for what a statement misses, and adds them to those tried before
+Mending = Callable[[StatedView, Remedies | None, TimeLimit, bool], Remedies | None]
+
+
+def seeks_remedies(study: Study) -> bool:
+    """Return whether a run looks for changes that make measurements fit: the study allows it, and has tolerances."""
+    tolerances = (one.tolerance for one in study.task.measurements.values())
+    return study.file.remedies.minutes > 0 and any(one is not None for one in tolerances)
+
+
+def state_and_mend(
+    session: Session, now: Shortfall, rest: TimeLimit, clock: Clock
+) -> tuple[StatedView, Remedies | None]:
+    """Try changes for what a statement misses, and go on with the statement in turn with them, within a limit.
+
+    Parameters
+    ----------
+    session
+        The study, being measured.
+    now
+        The statement of its best view so far.
+    rest
+        Time of all of it; without a limit the statement is finished, and changes have a time of their own.
+    clock
+        Times of the steps of the run.
+    """
+
+    def state(within: TimeLimit, enough: Callable[[StatedView], bool]) -> StatedView:
+        longer = session.state(now.stated.view, None, within, enough)
+        write_json(session.folder / "statement.json", statement_document(session, longer))
+        clock.lap("state")
+        return longer
+
+    def mend(stated: StatedView, before: Remedies | None, within: TimeLimit, sensors: bool) -> Remedies | None:
+        shortfall = replace(now, stated=stated)
+        if not shortfall.missed or not seeks_remedies(session.study):
+            return before
+        proposed = all_changes(shortfall, within) if sensors else changes(shortfall)
+        found = find_remedies(shortfall.missed, proposed, table.trials, within, before)
+        clock.lap("remedies")
+        return found
+
+    table = session.study.file.remedies
+    if rest.end is None:
+        return now.stated, mend(now.stated, None, TimeLimit(60 * table.minutes), True)
+    stated, remedies = in_turn(now.stated, state, mend, rest)
+    return stated, remedies if seeks_remedies(session.study) else None
+
+
+def in_turn(stated: StatedView, state: Stating, mend: Mending, rest: TimeLimit) -> tuple[StatedView, Remedies | None]:
+    """Go on with the statement of a view and try changes, in turn, until time is over.
+
+    Parameters
+    ----------
+    stated
+        The statement so far.
+    state, mend
+        Make more virtual measurements of the view, and of changes.
+    rest
+        Time of all of it.
+    """
+    remedies, all_tried = None, False
+    if not _decided(stated):
+        remedies = mend(stated, None, rest.part(_SHARE_WHILE_OPEN), False)
+        stated = state(rest, _decided)
+    if missed_by(stated) and not rest.over():
+        remedies, all_tried = mend(stated, remedies, rest, True), True
+    if not rest.over():
+        stated = state(rest, lambda _: False)
+    return stated, of_missed(remedies, missed_by(stated), all_tried)
+
+
+def _decided(stated: StatedView) -> bool:
+    return all(one.verdict != "not decided" for one in stated.statements)

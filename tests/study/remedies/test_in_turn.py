@@ -1,0 +1,58 @@
+"""How the statement and the changes of a study share the time after the race."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any, cast
+
+from mitsim.running.time_limit import TimeLimit
+from mitsim.study.remedies.confirm import Remedies
+from mitsim.study.remedies.in_turn import in_turn
+from mitsim.study.virtual.stated import StatedView
+
+#: verdicts of two measurements after each part of a statement
+OPEN, MISSED, GOOD = ("fits", "not decided"), ("fits", "does not fit"), ("fits", "fits")
+
+
+def stated(*verdicts: str) -> StatedView:
+    rows = [SimpleNamespace(measurement=f"m{n}", verdict=verdict) for n, verdict in enumerate(verdicts)]
+    return cast(StatedView, SimpleNamespace(statements=rows))
+
+
+def played(verdicts: list[tuple[str, ...]], seconds: float = 100.0) -> tuple[list[str], Remedies | None]:
+    """Return what was done, in order, where the statement has these verdicts one after the other."""
+    done, left = list[str](), iter(verdicts[1:])
+
+    def state(limit: TimeLimit, enough: Callable[[StatedView], bool]) -> StatedView:
+        decisive = enough(stated(*GOOD)) and not enough(stated(*OPEN))
+        done.append(f"state {'until decided' if decisive else 'on'}, {limit.left:.0f} s")
+        return stated(*next(left))
+
+    def mend(now: Any, before: Remedies | None, limit: TimeLimit, sensors: bool) -> Remedies | None:
+        done.append(f"changes{' and sensors' * sensors}, {limit.left:.0f} s")
+        return before or Remedies({one.measurement: one for one in now.statements if one.verdict == "does not fit"})
+
+    return done, in_turn(stated(*verdicts[0]), state, mend, TimeLimit(seconds))[1]
+
+
+def test_a_verdict_comes_before_other_sensors_and_after_changes_in_half_of_the_time() -> None:
+    done, remedies = played([("does not fit", "not decided"), ("does not fit", "fits"), ("does not fit", "fits")])
+    assert done == ["changes, 50 s", "state until decided, 100 s", "changes and sensors, 100 s", "state on, 100 s"]
+    assert remedies is not None and list(remedies.missed) == ["m0"]
+
+
+def test_decided_verdicts_leave_their_time_to_changes_of_all_kinds() -> None:
+    assert played([MISSED, MISSED])[0] == ["changes and sensors, 100 s", "state on, 100 s"]
+
+
+def test_a_measurement_that_fits_after_all_needs_no_change() -> None:
+    done, remedies = played([OPEN, GOOD, GOOD])
+    assert [one.split(",")[0] for one in done] == ["changes", "state until decided", "state on"]
+    assert remedies is None
+
+
+def test_what_was_not_tried_for_lack_of_time_is_named() -> None:
+    done, remedies = played([OPEN, MISSED], seconds=0.0)
+    assert [one.split(",")[0] for one in done] == ["changes", "state until decided"]
+    assert remedies is not None and remedies.untried == ["changes for m1", "with another sensor"]
