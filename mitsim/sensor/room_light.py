@@ -1,7 +1,7 @@
-"""Compute the irradiance of a room's lamps and windows on the part, within the sensor's optical filter.
+"""Compute the irradiance of a room on the part within the sensor's optical filter, and the exposures that suit it.
 
 Signal chain: illuminance [lx] -> shares of white LED lamps and of daylight -> spectral irradiance -> integral over the
-band of the sensor's optical filter.
+band of the sensor's optical filter -> exposures, shorter than those of the sensor's rule where the room is bright.
 
 Both spectra are models:
 
@@ -16,6 +16,15 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mitsim.sensor.sensor import Sensor
+
+#: share of full scale that a matt white plate reaches at most by light of the room. It is chosen: what is left is for
+#: slopes toward the light, interreflections and fixed pattern
+FULLEST = 0.9
+
+#: reflectance of a matt white plate, as in the exposure rules of the presets
+_WHITE = 0.85
 
 #: spectral range of silicon without a filter [nm]
 SILICON_NM = (400.0, 1000.0)
@@ -55,6 +64,33 @@ def room_irradiance(illuminance: float, daylight: float, wavelength_nm: float, f
     band = np.linspace(low, high, 200)
     windows = daylight * illuminance * np.trapezoid(_black_body(band), band) / luminous
     return float(lamps + windows) * 1e-6
+
+
+def exposures_in_room(
+    sensor: Sensor, exposures_s: tuple[float, ...], distance_mm: float, irradiance: float
+) -> tuple[float, ...]:
+    """Return the exposures [s] that a user sets in a room, for a part at a distance.
+
+    They are those of the sensor's rule, which knows no room, times the largest factor up to 1 with which a matt white
+    plate at normal incidence shows the bright pattern and the room at :data:`FULLEST` of full scale. A plate that is
+    brighter in the dark stays as bright.
+
+    Parameters
+    ----------
+    sensor, exposures_s
+        A sensor with known light, and the exposures of its rule, the shortest first.
+    distance_mm
+        Of the plate from the projector [mm].
+    irradiance
+        Of the room within the sensor's band [W/mm^2], as of :func:`room_irradiance`.
+    """
+    by_radiance = sensor.electrons() * exposures_s[0] / sensor.imager.full_well
+    control = sensor.exposure.control
+    dark = _WHITE / np.pi * sensor.projector.plane_irradiance / distance_mm**2 * by_radiance
+    dark = control.level if control is not None else dark
+    both = dark + _WHITE / np.pi * irradiance * by_radiance
+    factor = min(1.0, max(FULLEST, dark) / both)
+    return tuple(factor * seconds for seconds in exposures_s)
 
 
 def _black_body(wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:

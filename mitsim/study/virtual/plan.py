@@ -31,7 +31,7 @@ from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.world import BEYOND, Unknowns
 
 #: part of the digest of a trial; increased if the same draw gives a different measurement
-TRIAL_VERSION = 6
+TRIAL_VERSION = 7
 
 #: keys of a task that concern the verdict, not the measurement
 _NO_PART_OF_A_TRIAL: Any = {"decision": True, "measurements": {"__all__": {"decision"}}}

@@ -44,6 +44,7 @@ from mitsim.scene.ray_casting.raycast import Surfaces
 from mitsim.scene.ray_casting.triangles import hull_corners
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.pattern import DotPattern, another_mask
+from mitsim.sensor.room_light import exposures_in_room
 from mitsim.sensor.transforms import Transform
 from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.study.virtual.coat import coated, coated_shapes
@@ -197,6 +198,9 @@ class RenderedMeasurements:
             image = moved_images(one.room_radiance(albedos)[None], motions.get(name))[0]
             room[name] = sensor.apply_lens(image, name, shared.rois[name])
         light = sensor.light(scene, true, seed=drawn.seed, rendering=replace(self.rendering, indirect=indirect))
+        if self.study.sensor.room is None:
+            exposures = exposures_in_room(self.study.sensor, light.exposures, view.standoff, drawn.room)
+            light = replace(light, exposures=exposures)
         return TracedLight(sensor, light, room, drawn, assumed)
 
     def _mask(self, unit: int) -> DotPattern | None:

@@ -30,6 +30,7 @@ from mitsim.scene.surface.scatter import LARGEST_DEVIATION, Deviation
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.projector_images import described
+from mitsim.sensor.room_light import exposures_in_room
 from mitsim.sensor.transforms import Transform
 from mitsim.study import MINIMUM_POINTS
 from mitsim.study.virtual.displacement import displaced
@@ -175,7 +176,8 @@ class Laboratory:
         sensor, light = self.sensor, self.light(number, world, true)
         base = sensor.exposure.base_s
         assert base is not None
-        seconds, images = base * world.exposure, {}
+        (set_here,) = exposures_in_room(sensor, (base,), self.view.standoff, world.room)
+        seconds, images = set_here * world.exposure, {}
         for index, (name, camera) in enumerate(sensor.rig.cameras.items()):
             how = Exposed(camera, light.rois[name], seconds, world.unit + index, world.seed + index)
             projected = light.projected[name] * np.float32(world.power)

@@ -130,6 +130,16 @@ def test_light_of_the_room_reaches_the_images_by_photon_transfer(fringes):
     assert (after - before)[inside].mean() == pytest.approx(expected, rel=0.03)
 
 
+def test_a_bright_room_saturates_no_white_part_because_the_exposure_suits_the_room(fringes):
+    study, maker, view, world = fringes
+    own = study.sensor.exposure.base_s
+    captured = maker._captured(view, replace(world, room=3e-5))
+    seen = captured.labels == study.scene.names.index("plane")
+    brightest = np.max(captured.capture.images["camera"], axis=0)
+    assert captured.capture.decoding.exposure_s < own / 2
+    assert np.mean(brightest.reshape(seen.shape)[seen] == 255) < 0.02
+
+
 def test_the_albedo_of_white_is_its_reflectance():
     scene = load_scene(SCENES / "matt_white.xml", 850.0)
     for albedo in directional_albedos(scene):
