@@ -94,6 +94,23 @@ def expanded_interval(errors: Floats, related: NDArray[np.int64] | None = None) 
     return min(low, half), high
 
 
+def errors_of_ends(errors: Floats) -> tuple[float, float]:
+    """Return standard errors of the ends of the coverage interval, from the errors (n,) of independent trials.
+
+    The number of errors beyond an end is binomial, so the share beyond it has the standard deviation
+    sqrt(p (1 - p) / n), p = 0.025. Half the distance between the quantiles that far to either side is right for any
+    distribution. The jackknife of :func:`standard_errors` alone is too small too often for a statement that stops as
+    soon as it is settled.
+    """
+    tail = (1 - COVERAGE) / 2
+    around = tail + math.sqrt(tail * (1 - tail) / len(errors)) * np.array([-1.0, 1.0])
+    outer, inner = np.clip(around, 0.0, 1.0)
+    low, high = (
+        np.diff(np.quantile(errors, pair, method="weibull")) for pair in ((outer, inner), (1 - inner, 1 - outer))
+    )
+    return float(low[0]) / 2, float(high[0]) / 2
+
+
 def standard_errors(
     errors: Floats, numbers: Callable[[Floats], Floats], related: NDArray[np.int64] | None = None
 ) -> Floats:

@@ -30,6 +30,7 @@ from characterisation.files.errors import InputError
 from characterisation.statements.budget import BudgetLine
 from characterisation.statements.coverage import (
     coverage_interval,
+    errors_of_ends,
     expanded_interval,
     expanded_uncertainty,
     standard_errors,
@@ -77,7 +78,8 @@ class Statement:
     interval_corrected
         The same after subtraction of the bias.
     moved
-        Standard errors of bias, standard uncertainty, low and high end from the finite number of trials.
+        Standard errors of bias, standard uncertainty, low and high end from the finite number of trials. Those of the
+        ends are the larger of the jackknife's and the order statistics'.
     numerical_tolerance
         delta of JCGM 101, 7.9.2 for one significant digit of the standard uncertainty.
     settled
@@ -281,6 +283,7 @@ def statement(
         moved = standard_errors(
             known, lambda part: np.array([part.mean(), part.std(ddof=1), *coverage_interval(part)]), common
         )
+        moved[2:] = np.maximum(moved[2:], errors_of_ends(known))
         if tolerance is not None:
             taken = known - bias if tolerance.rule.subtract_bias else known
             share = expanded_uncertainty(taken) / tolerance.size

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, expon, norm
 
-from characterisation.statements.coverage import coverage_interval, expanded_interval
+from characterisation.statements.coverage import coverage_interval, errors_of_ends, expanded_interval
 from characterisation.statements.selection import (
     EXCESS,
     EXCESS_OF_VIEWS,
@@ -23,6 +23,31 @@ from characterisation.tasks.decision_table import BIAS_SUBTRACTED, Decision
 def standing(errors, prior_risk, prior_chance) -> Standing:
     """Return the standing of a race of views from their trials and what the map predicts."""
     return judge(sampled(*posterior(errors, prior_risk, prior_chance)))
+
+
+def test_ends_of_intervals_scatter_as_much_as_stated():
+    """Normal errors: the end at the 97.5th percentile scatters by sqrt(p (1 - p) / n) / density."""
+    rng, truth = np.random.default_rng(5), np.sqrt(0.025 * 0.975 / 400) / norm.pdf(norm.ppf(0.975))
+    stated = np.mean([errors_of_ends(rng.standard_normal(400)) for _ in range(200)], axis=0)
+    assert stated == pytest.approx([truth, truth], rel=0.1)
+
+
+def test_few_statements_that_stop_when_they_are_settled_are_not():
+    """One error in ten is four times as large: the ends need the most trials."""
+    rng = np.random.default_rng(3)
+
+    def drawn(count):
+        return 1.2 * rng.standard_normal(count) * np.where(rng.random(count) < 0.1, 3.0, 0.75)
+
+    ends = np.quantile(drawn(1_000_000), [0.025, 0.975])
+    wrong = 0
+    for _ in range(100):
+        errors = drawn(800)
+        stated = (statement("size", "mm", errors[:count]) for count in range(80, 801, 40))
+        first = next((one for one in stated if one.settled), None)
+        if first is not None:
+            wrong += bool((np.abs(np.subtract(first.interval, ends)) > first.numerical_tolerance).any())
+    assert wrong <= 8  # 5 are expected of a limit that holds in 95 % of the cases
 
 
 @pytest.mark.parametrize("draw", ["normal", "lognormal", "uniform"])
