@@ -156,7 +156,7 @@ def local_fit(
         tiles, found = _tiles(at[which, :2], TILE * radius.min()), []
         for chosen in tiles:
             place = at[which[chosen]]
-            part = _Part(coarse, by_abscissa, place, radius[chosen], slopes, link)
+            part = _Tile(coarse, by_abscissa, place, radius[chosen], slopes, link)
             found.append(part.fit(radius[chosen], None if own is None else own[which[chosen]], keep))
         order = np.concatenate(tiles)
         estimate[which[order], rung[order]] = np.concatenate([one.estimate for one in found])
@@ -186,7 +186,7 @@ def _polynomial(place: Floats) -> Floats:
     return out
 
 
-class _Part:
+class _Tile:
     """The places of one tile and the rows about them, arranged for matrix products."""
 
     def __init__(

@@ -49,7 +49,7 @@ class MeasuringFrame:
         return frame.from_sensor, f"places in the frame {frame.name}"
 
     def _of_board(self, given: InputCloud, columns: int, rows: int, pitch: float) -> tuple[NDArray[np.float64], str]:
-        from mitsim.decoding.board_frame import Board, board_frame
+        from mitsim.decoding.board_frame import BoardCorners, board_frame
         from mitsim.decoding.plate import image_on_grid
 
         if given.capture is None or not given.capture.images:
@@ -57,7 +57,7 @@ class MeasuringFrame:
             raise InputError(given.path, "--points-in", "a cloud without images", "images that show the board", hint)
         image = image_on_grid(given.capture, given.cloud.grid)
         try:
-            frame, scale, rms = board_frame(Board(columns, rows, pitch), given.cloud, image)
+            frame, scale, rms = board_frame(BoardCorners(columns, rows, pitch), given.cloud, image)
         except FitError as error:
             raise InputError(given.path, "--points-in", str(error), "a capture that shows the whole board") from None
         return frame, f"places in the frame of the board: scale {scale:.5f}, corners {rms:.3g} mm from the print (rms)"

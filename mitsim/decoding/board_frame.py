@@ -30,7 +30,7 @@ _LARGEST_SHARE = 0.2
 
 
 @dataclass(frozen=True)
-class Board:
+class BoardCorners:
     """A chequerboard of ``columns`` x ``rows`` inner corners, ``pitch`` [mm] apart."""
 
     columns: int
@@ -38,7 +38,9 @@ class Board:
     pitch: float
 
 
-def board_frame(board: Board, cloud: PointCloud, image: NDArray[np.uint8]) -> tuple[NDArray[np.float64], float, float]:
+def board_frame(
+    board: BoardCorners, cloud: PointCloud, image: NDArray[np.uint8]
+) -> tuple[NDArray[np.float64], float, float]:
     """Return the frame of a board (4, 4) from the sensor frame, the scale of the corners, and their rms residual [mm].
 
     Parameters

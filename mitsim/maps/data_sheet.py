@@ -154,7 +154,7 @@ class DataSheet:
 
 
 @dataclass(frozen=True)
-class Piece:
+class SheetPiece:
     """One capture of a data sheet as plain values: ``method`` of the simulated targets, and its ``arguments``."""
 
     sensor: Sensor
@@ -174,13 +174,13 @@ def measure_sensor(sensor: Sensor, seed: int = 1, workers: Executor | None = Non
     asked += [("recovery", ("matt white", distance, NOISE_TILT_DEG)) for distance in distances]
     asked += [("recovery", (metal, mid, tilt)) for metal in METALS for tilt in TILTS_DEG]
     asked += [("residuals", (mid,))]
-    pieces = [Piece(sensor, seed + number, *one) for number, one in enumerate(asked)]
+    pieces = [SheetPiece(sensor, seed + number, *one) for number, one in enumerate(asked)]
     done = results_of(pieces, measure_piece, workers, sensor.name)
     planes, noise, metal = done[:2], done[3 : 3 + DISTANCES], done[3 + DISTANCES : -1]
     return DataSheet(sensor, mid, planes, radius, done[2], noise, metal, done[-1])
 
 
-def measure_piece(piece: Piece) -> Any:
+def measure_piece(piece: SheetPiece) -> Any:
     """Take and measure one capture of a data sheet; workers call this function."""
     targets = _SimulatedTargets(piece.sensor, piece.seed)
     return getattr(targets, piece.method)(*piece.arguments)

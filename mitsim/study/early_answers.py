@@ -23,7 +23,7 @@ from mitsim.study.virtual.stated import StatedView
 FIRST_ANSWER_S = 50.0
 
 
-class Clock:
+class StepTimes:
     """Wall time of each step [s]."""
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class Answers:
         performance_map: PerformanceMap,
         scores: xr.Dataset,
         limit: TimeLimit,
-        clock: Clock,
+        clock: StepTimes,
         report: Callable[[], object] | None,
     ) -> None:
         self.session, self.map, self.scores = session, performance_map, scores

@@ -38,7 +38,7 @@ from mitsim.running.progress import say, track
 from mitsim.running.time_limit import TimeLimit, stopped_by_user
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import Study
-from mitsim.study.early_answers import Answers, Clock
+from mitsim.study.early_answers import Answers, StepTimes
 from mitsim.study.remedies.change import Shortfall
 from mitsim.study.remedies.confirm import remedies_document
 from mitsim.study.remedies.in_turn import seeks_remedies, state_and_mend
@@ -126,7 +126,7 @@ def run_within(
     plan = time_plan(whole or 0.0, len(study.views), seeks_remedies(study))
     if whole is not None:
         say(plan.in_words())
-    session, clock = Session(study, folder, workers), Clock()
+    session, clock = Session(study, folder, workers), StepTimes()
     folder, twin = session.folder, session.renderer
     session.claim("run")
     (folder / "clouds").mkdir(parents=True, exist_ok=True)

@@ -13,7 +13,7 @@ from characterisation.tasks.task_reading import read_task
 from mitsim.running.numbers import listed, two_digits, unit_symbol
 from mitsim.study import MINIMUM_POINTS
 from mitsim.talk import view_figures as figures
-from mitsim.talk.judged_views import QUANTITIES, SCORES, Judged, true_error
+from mitsim.talk.judged_views import QUANTITIES, SCORES, JudgedViews, true_error
 from mitsim.talk.make import trials_name
 from mitsim.talk.results import Results
 from mitsim.talk.slides import Claim, Slide, collected, largest_of, mean_of, verdict
@@ -29,7 +29,7 @@ _HIDDEN, _BIASED = 0.1, 0.25
 _END = 3
 
 
-def judged_of(talk: Talk, results: Results, measured: dict[str, xr.Dataset], slide: Slide) -> Judged:
+def judged_of(talk: Talk, results: Results, measured: dict[str, xr.Dataset], slide: Slide) -> JudgedViews:
     """Return scores and errors of all samples that have them.
 
     Parameters
@@ -48,10 +48,10 @@ def judged_of(talk: Talk, results: Results, measured: dict[str, xr.Dataset], sli
     errors |= {name: measured[key] for name, key in names.items() if key in measured}
     both = [name for name in names if name in scores and name in errors]
     task = read_task(talk.folder / talk.file.task)
-    return Judged(task, scores, {name: errors[name] for name in both})
+    return JudgedViews(task, scores, {name: errors[name] for name in both})
 
 
-def scoring(talk: Talk, judged: Judged) -> Slide:
+def scoring(talk: Talk, judged: JudgedViews) -> Slide:
     """Return slide *Viewpoint Scoring*."""
     slide = Slide("Viewpoint Scoring")
     name = talk.file.sphere.sample
@@ -84,7 +84,7 @@ def _reason(words: str) -> str:
     return f"need a {rest.split()[0]} beyond its limits" if kind == "stage" and " beyond " in rest else words
 
 
-def view_score(talk: Talk, judged: Judged) -> Slide:
+def view_score(talk: Talk, judged: JudgedViews) -> Slide:
     """Return slide *The View Score*."""
     slide, shown = Slide("The View Score"), talk.file.sphere
     if shown.sample not in judged.scores:
@@ -123,7 +123,7 @@ def view_score(talk: Talk, judged: Judged) -> Slide:
     return slide
 
 
-def examples(talk: Talk, judged: Judged) -> Slide:
+def examples(talk: Talk, judged: JudgedViews) -> Slide:
     """Return slides *Example Result*."""
     slide = Slide("Example Results")
     for one in talk.file.examples:
@@ -153,7 +153,7 @@ _SURVIVORS = (
 )
 
 
-def _example(judged: Judged, one: ExampleEntry) -> Claim:
+def _example(judged: JudgedViews, one: ExampleEntry) -> Claim:
     cell, errors = judged.cell(one.sample, one.measurement, "V_m"), judged.errors[one.sample]
     values, views, share = cell["error"].values, cell["views"].values, cell["share"].values
     unit = unit_symbol(str(judged.scores[one.sample]["unit"].sel(measurement=one.measurement).item()))
@@ -189,7 +189,7 @@ def _example(judged: Judged, one: ExampleEntry) -> Claim:
     )
 
 
-def _nothing_possible(judged: Judged, one: ExampleEntry, measurable: int, share: float) -> Claim:
+def _nothing_possible(judged: JudgedViews, one: ExampleEntry, measurable: int, share: float) -> Claim:
     """Return the claim of an example without views that are possible by V_m."""
     points, shapes = judged.scores[one.sample]["n"], list(judged.task.shapes_for(one.measurement))
     most = listed([f"{float(points.sel(feature=name).max()):.0f} points of {name}" for name in shapes])
@@ -227,7 +227,7 @@ def _ratio(value: float) -> str:
     return "unknown" if math.isnan(value) else f"{value:.1f}"
 
 
-def accuracy(judged: Judged) -> Slide:
+def accuracy(judged: JudgedViews) -> Slide:
     """Return slide *View Score Accuracy*."""
     slide = Slide("View Score Accuracy")
     if not judged.errors:
@@ -279,7 +279,7 @@ def accuracy(judged: Judged) -> Slide:
     return slide
 
 
-def _by_sample(judged: Judged) -> list[str]:
+def _by_sample(judged: JudgedViews) -> list[str]:
     """Return, for each sample, the mean rank correlation of the bins of V_m, and the share of trials with a value."""
     out = []
     for sample, errors in judged.errors.items():

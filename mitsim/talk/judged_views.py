@@ -27,7 +27,7 @@ _LEAST_POINTS = 100
 
 
 @dataclass(frozen=True)
-class Judged:
+class JudgedViews:
     """Scores of a sample's views, and errors (measurement, view, trial) of their measurements, by sample."""
 
     task: Task

@@ -25,7 +25,7 @@ from mitsim.study.virtual.spread_out import TrialOrder, make_trials
 from mitsim.study.virtual.world import Trial
 from mitsim.talk.plan import Piece, make_piece, pieces_of
 from mitsim.talk.results import Results
-from mitsim.talk.talk_file import SampleEntry, Talk
+from mitsim.talk.talk_file import ArtefactEntry, Talk
 from mitsim.talk.view_pieces import errors_of
 
 #: time of a piece and of a virtual measurement on one quiet core [s], for the announcement; measured
@@ -36,7 +36,7 @@ _PIECE_S, _TRIAL_S = 8.0, 0.7
 class _Unfinished:
     """The virtual measurements of a sample: its session, and the views that lack some."""
 
-    sample: SampleEntry
+    sample: ArtefactEntry
     session: Session
     missing: dict[int, tuple[Job, ...]]
 
@@ -50,7 +50,7 @@ def work(order: _Order) -> Any:
     return make_trials(order) if isinstance(order, TrialOrder) else make_piece(*order)
 
 
-def trials_name(sample: SampleEntry) -> str:
+def trials_name(sample: ArtefactEntry) -> str:
     """Return the name of the result with the errors of a sample's virtual measurements."""
     return f"trials_{sample.key}"
 
@@ -123,7 +123,7 @@ def make(
     return results_known(talk, results, measured)
 
 
-def _unfinished(talk: Talk, results: Results, sample: SampleEntry, folder: Path) -> _Unfinished | None:
+def _unfinished(talk: Talk, results: Results, sample: ArtefactEntry, folder: Path) -> _Unfinished | None:
     """Return the virtual measurements that a sample lacks; None if all of them are kept."""
     session = Session(talk.study(sample), folder / "views" / sample.key)
     name = trials_name(sample)

@@ -23,7 +23,7 @@ from mitsim.decoding.input_clouds import margin_of
 from mitsim.running.progress import track
 from mitsim.sensor.transforms import Transform
 from mitsim.study.task_measurement import measure_task
-from mitsim.talk.talk_file import SampleEntry, Talk
+from mitsim.talk.talk_file import ArtefactEntry, Talk
 from mitsim.views import View
 
 #: largest angle between the axis of a capture and its view, and difference of their rolls [deg]
@@ -51,7 +51,7 @@ def measured_errors(talk: Talk, folder: Path) -> dict[str, xr.Dataset]:
     return {key: _as_trials(talk, views) for key, views in found.items()}
 
 
-def _shown(talk: Talk, place: Path, folder: Path) -> tuple[SampleEntry, View]:
+def _shown(talk: Talk, place: Path, folder: Path) -> tuple[ArtefactEntry, View]:
     """Return the sample and the candidate view that a capture shows."""
     sensor, settings, pose = read_settings_and_pose(place)
     if sensor != talk.sensor.name:
@@ -84,7 +84,7 @@ def _nearest(talk: Talk, pose: Transform, place: Path) -> View:
     return view
 
 
-def _errors(talk: Talk, sample: SampleEntry, place: Path) -> dict[str, float]:
+def _errors(talk: Talk, sample: ArtefactEntry, place: Path) -> dict[str, float]:
     study, capture = talk.study(sample), read_capture(place)
     settings, imager = decoder_settings(capture, talk.sensor)
     cloud = capture_cloud(capture, settings, imager=imager)

@@ -16,7 +16,7 @@ import xarray as xr
 from scipy import stats
 
 from characterisation.files.arrays import Floats
-from mitsim.maps.data_sheet import Piece, Residuals, measure_piece
+from mitsim.maps.data_sheet import Residuals, SheetPiece, measure_piece
 from mitsim.talk.talk_file import sensor_in
 
 #: bins of the histogram, over this many standard deviations
@@ -81,7 +81,7 @@ def noise_of(folder: str, sensor: str, seed: int) -> xr.Dataset:
     """
     chosen = sensor_in(folder, sensor)
     near, far = chosen.working_range_mm
-    found: Residuals = measure_piece(Piece(chosen, seed, "residuals", (math.sqrt(near * far),)))
+    found: Residuals = measure_piece(SheetPiece(chosen, seed, "residuals", (math.sqrt(near * far),)))
     return described(found)
 
 

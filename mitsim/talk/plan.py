@@ -27,7 +27,7 @@ from mitsim.scene.xml_check import named_digests
 from mitsim.talk import coupon_pieces, noise_pieces, opening_pieces, pictured, view_pieces
 from mitsim.talk.coupon_pieces import CouponPlace
 from mitsim.talk.results import VERSION
-from mitsim.talk.talk_file import SampleEntry, Talk, sensor_in, sensor_key
+from mitsim.talk.talk_file import ArtefactEntry, Talk, sensor_in, sensor_key
 
 #: functions of pieces: each takes the talk's folder and its arguments
 FUNCTIONS: dict[str, Callable[..., xr.Dataset]] = {
@@ -154,11 +154,11 @@ def _as_plain(argument: Any) -> Any:
     return asdict(argument) if is_dataclass(argument) and not isinstance(argument, type) else argument
 
 
-def _scene(one: SampleEntry) -> tuple[str, tuple[tuple[str, str], ...]]:
+def _scene(one: ArtefactEntry) -> tuple[str, tuple[tuple[str, str], ...]]:
     return one.scene, _plain(one)
 
 
-def _plain(one: SampleEntry) -> tuple[tuple[str, str], ...]:
+def _plain(one: ArtefactEntry) -> tuple[tuple[str, str], ...]:
     return tuple((name, str(value)) for name, value in sorted(one.parameters.items()))
 
 

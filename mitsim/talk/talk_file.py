@@ -23,7 +23,7 @@ Number = Annotated[float, Field(gt=0, le=1e5)]
 Tilt = Annotated[float, Field(ge=0, le=80)]
 
 
-class SampleEntry(Document):
+class ArtefactEntry(Document):
     """The artefact in one finish: a scene, and values for its parameters."""
 
     name: str
@@ -31,7 +31,7 @@ class SampleEntry(Document):
     parameters: dict[str, str | float] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _named(self) -> SampleEntry:
+    def _named(self) -> ArtefactEntry:
         checked_name(self.key)
         return self
 
@@ -78,8 +78,8 @@ class TalkFile(Document):
     kept: str = "kept"
     trials: int = Field(default=10, ge=2, le=1000)
     seed: int = Field(default=1, ge=0)
-    samples: Annotated[list[SampleEntry], Field(min_length=1)]
-    finishes: list[SampleEntry] = Field(default_factory=list)
+    samples: Annotated[list[ArtefactEntry], Field(min_length=1)]
+    finishes: list[ArtefactEntry] = Field(default_factory=list)
     opening_sensors: list[str] = Field(default_factory=list)
     noise_sensors: list[str] = Field(default_factory=list)
     coupons: CouponsTable = CouponsTable()
@@ -113,7 +113,7 @@ class Talk:
         """Return the name of the map: that of the file, or the shipped one of the sensor."""
         return self.file.map or self.sensor.name
 
-    def study_file(self, sample: SampleEntry, depth: int | None = None) -> StudyFile:
+    def study_file(self, sample: ArtefactEntry, depth: int | None = None) -> StudyFile:
         """Return the study of the artefact in one finish; ``depth`` is that of light paths, by default the talk's."""
         depth = self.file.light_path_depth if depth is None else depth
         return StudyFile(
@@ -128,7 +128,7 @@ class Talk:
             measure=MeasureTable(by="render", light_path_depth=depth, samples_per_pixel=self.file.samples_per_pixel),
         )
 
-    def study(self, sample: SampleEntry) -> Study:
+    def study(self, sample: ArtefactEntry) -> Study:
         """Return the opened study of the artefact in one finish."""
         return open_study(self.path, self.study_file(sample))
 
@@ -137,7 +137,7 @@ class Talk:
         """Return the candidate views, which the stage reaches and the body of the sensor is free in."""
         return open_study(self.path, self.study_file(self.file.samples[0]), mapped=False).views
 
-    def sample(self, name: str) -> SampleEntry:
+    def sample(self, name: str) -> ArtefactEntry:
         """Return the sample of a name."""
         return next(one for one in self.file.samples if one.name == name)
 

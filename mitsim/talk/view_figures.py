@@ -17,7 +17,7 @@ from characterisation.plots.style import BLUE, INK, MUTED, SEQUENTIAL, VERMILION
 from mitsim.report.style import colour_scale, plain_log
 from mitsim.report.view_figures import sphere_of_views, view_places
 from mitsim.running.numbers import unit_symbol
-from mitsim.talk.judged_views import QUANTITIES, SCORES, Judged, true_error
+from mitsim.talk.judged_views import QUANTITIES, SCORES, JudgedViews, true_error
 
 
 def sphere(axes: Axes, scores: xr.Dataset, values: Floats, title: str, label: str, error: bool = False) -> None:
@@ -96,7 +96,7 @@ def scores_figure(scores: xr.Dataset, measurement: str, shapes: Sequence[str]) -
     return figure
 
 
-def example_figure(judged: Judged, sample: str, measurement: str) -> Figure:
+def example_figure(judged: JudgedViews, sample: str, measurement: str) -> Figure:
     """Draw deciles of V_m against mean error and standard deviation, and spheres of V_m and of the true error."""
     cell, errors = judged.cell(sample, measurement, "V_m"), judged.errors[sample]
     unit = unit_symbol(str(judged.scores[sample]["unit"].sel(measurement=measurement).item()))
@@ -142,7 +142,7 @@ def bars(axes: Axes, cell: xr.Dataset, name: str) -> None:
 def ranks_figure(ranks: Mapping[str, Mapping[str, xr.Dataset]]) -> Figure:
     """Draw the mean rank of the bins by error, standard deviation and share of trials with a value, for each score.
 
-    ``ranks`` are those of :meth:`~mitsim.talk.judged_views.Judged.ranks`, by the score.
+    ``ranks`` are those of :meth:`~mitsim.talk.judged_views.JudgedViews.ranks`, by the score.
     """
     with drawing():
         figure = Figure((11.2, 3.9), layout="constrained")

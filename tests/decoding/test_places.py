@@ -13,7 +13,7 @@ from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from characterisation.tasks.windows import WindowPlan, measure_windows
 from mitsim.cli.measure_frame import read_frame
-from mitsim.decoding.board_frame import Board, board_frame
+from mitsim.decoding.board_frame import BoardCorners, board_frame
 from mitsim.decoding.input_clouds import InputCloud
 from tests.seen_shapes import GRID, cloud_of, cylinder, plane, sphere
 from tests.shell import mitsim_here
@@ -69,7 +69,7 @@ def test_uncertainties_of_places_are_the_scatter_of_independent_noise(rng):
                 assert abs(values.std(ddof=1) / stated - 1) < 4 / np.sqrt(2 * 59), name
 
 
-BOARD = Board(8, 5, 14.0)
+BOARD = BoardCorners(8, 5, 14.0)
 
 
 def board_in_view(frame, pixels_each=4):
@@ -113,9 +113,9 @@ def test_a_wrong_board_is_refused():
     straight[:3, 3] = [50, 30, -500]
     cloud, image = board_in_view(straight)
     with pytest.raises(FitError, match="no chequerboard of 9 x 6"):
-        board_frame(Board(9, 6, 14.0), cloud, image)
+        board_frame(BoardCorners(9, 6, 14.0), cloud, image)
     with pytest.raises(FitError, match="is its pitch 40 mm"):
-        board_frame(Board(8, 5, 40.0), cloud, image)
+        board_frame(BoardCorners(8, 5, 40.0), cloud, image)
     cloud = replace(cloud, status=np.zeros_like(cloud.status), points=np.full_like(cloud.points, np.nan))
     with pytest.raises(FitError, match="0 points of the cloud on the board"):
         board_frame(BOARD, cloud, image)

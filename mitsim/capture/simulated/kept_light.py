@@ -22,7 +22,7 @@ from mitsim.capture.simulated.indirect_light import Smoothing
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.scene.light_transport.ambient import has_emitters
-from mitsim.scene.light_transport.kept_paths import Candidates, KeptPaths, broad, mattering
+from mitsim.scene.light_transport.kept_paths import CandidatePaths, KeptPaths, broad, mattering
 from mitsim.scene.light_transport.kept_tracing import camera_paths, photon_paths
 from mitsim.scene.light_transport.kept_walks import Tracing
 from mitsim.scene.light_transport.plain_scene import distinct_bsdfs
@@ -114,7 +114,7 @@ def keep_light(
         own = int(np.random.SeedSequence([seed, index]).generate_state(1)[0])
         tracing = Tracing(settings.samples, photons, rendering.depth, own, drawn, sampled, turned)
         rays, projector = simulated.rays[camera], simulated.patterns.projector
-        candidates: list[Candidates] = []
+        candidates: list[CandidatePaths] = []
         if len(pixels):
             candidates += camera_paths(scene, rays, projector, world_from_sensor, roi, pixels, tracing)
             candidates += photon_paths(scene, rays, projector, world_from_sensor, roi, tracing)

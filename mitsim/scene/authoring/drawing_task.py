@@ -22,7 +22,7 @@ from characterisation.tasks.definitions import (
     plane_distance,
     point_plane_distance,
 )
-from mitsim.scene.authoring.drawn_characteristics import Dimension, GeometricTolerance, ProductInformation, Target
+from mitsim.scene.authoring.drawn_characteristics import Dimension, DrawnTarget, GeometricTolerance, ProductInformation
 from mitsim.scene.authoring.drawn_zones import Side, zones
 from mitsim.scene.authoring.face import Face
 
@@ -104,7 +104,7 @@ def drawn_task(information: ProductInformation, faces: Sequence[Face]) -> DrawnT
     return builder.task
 
 
-def _what(target: Target) -> str:
+def _what(target: DrawnTarget) -> str:
     return f"on {', '.join(target.others)}, no face" if target.others else "on no face of the part"
 
 
@@ -119,7 +119,7 @@ class _TaskBuilder:
             for number in face.entities:
                 self.by_entity[number].append(face)
 
-    def faces(self, target: Target) -> list[Face]:
+    def faces(self, target: DrawnTarget) -> list[Face]:
         """Return the faces of a target, each once: halves of a bore are one face."""
         return list({face.name: face for number in target.faces for face in self.by_entity.get(number, ())}.values())
 
@@ -143,7 +143,7 @@ class _TaskBuilder:
         if one.nominal is None:
             return left_out("it has no value in the file")
         if not first or (one.second is not None and not second):
-            return left_out(f"it is {_what(one.first if not first else one.second or Target())}")
+            return left_out(f"it is {_what(one.first if not first else one.second or DrawnTarget())}")
         remarks = list(one.notes)
         tolerance = _deviations(one)
         if one.limits is not None and tolerance is None:

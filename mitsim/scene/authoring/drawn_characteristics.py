@@ -9,7 +9,7 @@ UNEQUAL = "its zone lies unequally about the surface"
 
 
 @dataclass(frozen=True)
-class Target:
+class DrawnTarget:
     """The object of a dimension, tolerance or datum: faces by number, and anything else by its type."""
 
     faces: tuple[int, ...] = ()
@@ -26,8 +26,8 @@ class Dimension:
 
     number: int
     kind: str
-    first: Target
-    second: Target | None
+    first: DrawnTarget
+    second: DrawnTarget | None
     nominal: float | None
     limits: tuple[float, float] | None
     angular: bool
@@ -42,7 +42,7 @@ class GeometricTolerance:
     name: str
     kind: str
     zone: float | None
-    target: Target
+    target: DrawnTarget
     datums: tuple[str, ...]
     notes: tuple[str, ...] = ()
 
@@ -53,7 +53,7 @@ class ProductInformation:
 
     dimensions: list[Dimension] = field(default_factory=list)
     tolerances: list[GeometricTolerance] = field(default_factory=list)
-    datums: dict[str, Target] = field(default_factory=dict)
+    datums: dict[str, DrawnTarget] = field(default_factory=dict)
     unread: list[str] = field(default_factory=list)
 
     @property

@@ -15,9 +15,9 @@ from typing import Any
 from mitsim.scene.authoring.drawn_characteristics import (
     UNEQUAL,
     Dimension,
+    DrawnTarget,
     GeometricTolerance,
     ProductInformation,
-    Target,
 )
 from mitsim.scene.authoring.part21 import Entity, Enumeration, Reference, StepText, Typed
 from mitsim.scene.authoring.units import unit_size
@@ -103,7 +103,7 @@ class _Reader:
                 if isinstance(one, Reference) and zone_form and isinstance(zone_form[0], str):
                     self.zones[one.number] = zone_form[0]
 
-    def target(self, reference: Any) -> Target:
+    def target(self, reference: Any) -> DrawnTarget:
         """Return the object of a shape aspect, through its members and the aspects it was derived from."""
         faces: dict[int, None] = {}
         others: dict[str, None] = {}
@@ -136,7 +136,7 @@ class _Reader:
 
         if isinstance(reference, Reference):
             aspect(reference.number, 0)
-        return Target(tuple(faces), tuple(others))
+        return DrawnTarget(tuple(faces), tuple(others))
 
     def dimension(self, entity: Entity) -> Dimension:
         """Read one size or location."""
@@ -257,9 +257,9 @@ class _Reader:
             return self.letters(bases[0], depth + 1) if bases else ()
         return ()
 
-    def datums(self) -> dict[str, Target]:
+    def datums(self) -> dict[str, DrawnTarget]:
         """Return the datums by letter, with the faces of the features that carry them."""
-        out: dict[str, Target] = {}
+        out: dict[str, DrawnTarget] = {}
         for datum in self.text.all("DATUM"):
             values = datum.of("DATUM") or ()
             if not values or not isinstance(values[-1], str):
@@ -267,7 +267,7 @@ class _Reader:
             targets = [self.target(Reference(owner)) for owner in self.owners.get(datum.number, ())]
             faces = tuple(dict.fromkeys(face for one in targets for face in one.faces))
             others = tuple(dict.fromkeys(other for one in targets for other in one.others))
-            out[values[-1]] = Target(faces, others)
+            out[values[-1]] = DrawnTarget(faces, others)
         return out
 
     def unread(self) -> list[str]:

@@ -191,7 +191,7 @@ def subshapes(shape: Any, kind: Any, avoid: Any = None) -> list[Any]:
     return out
 
 
-class Surfaces:
+class FaceSurfaces:
     """The surface of each face of some shapes, as :func:`surface_of` returns it, computed once."""
 
     def __init__(self, shapes: list[Any], tolerance: float) -> None:
@@ -266,7 +266,7 @@ def convert(  # noqa: PLR0913 - the arguments of the command
     there = bodies(document)
     others = chord_mm if others_mm is None else others_mm
     shapes = [shape for _, shape, _ in there]
-    surfaces = Surfaces(shapes, SAME_MM / unit_mm)
+    surfaces = FaceSurfaces(shapes, SAME_MM / unit_mm)
     kinds = [surfaces.of(face)["kind"] for face in surfaces.faces]
     fitted = fitted_mm2 / unit_mm**2
     largest = mesh(shapes, surfaces.faces, kinds, chord_mm / unit_mm, bend, others / unit_mm, int(most), fitted)

@@ -46,7 +46,7 @@ _AT_ONCE = 1 << 19
 
 
 @dataclass(frozen=True)
-class Candidates:
+class CandidatePaths:
     """Paths from projector to camera over two and more surfaces, on the host.
 
     ``pixel`` (n,) is the index in the region, ``weight`` (n,) is w. ``code`` (n, 3) is what the code depends on: u, v
@@ -65,13 +65,13 @@ class Candidates:
 
     def chosen(
         self, index: NDArray[np.integer] | NDArray[np.bool_] | slice, weight: Floats | None = None
-    ) -> Candidates:
+    ) -> CandidatePaths:
         """Return some of the paths, with other weights if given."""
         kept = self.weight[index] if weight is None else weight
-        return Candidates(self.pixel[index], kept, self.code[index], self.material[index], self.toward[index])
+        return CandidatePaths(self.pixel[index], kept, self.code[index], self.material[index], self.toward[index])
 
     @classmethod
-    def joined(cls, parts: Sequence[Candidates], surfaces: int) -> Candidates:
+    def joined(cls, parts: Sequence[CandidatePaths], surfaces: int) -> CandidatePaths:
         """Return the paths of several parts, as if all had the largest number of surfaces."""
 
         def wide(one: NDArray[Any], fill: int) -> NDArray[Any]:
@@ -132,7 +132,7 @@ class Vertices:
 class KeptPaths:
     """The paths of one camera's region, ready on the device for any finish."""
 
-    def __init__(self, paths: Candidates, roi: Roi) -> None:
+    def __init__(self, paths: CandidatePaths, roi: Roi) -> None:
         self.roi, self.count = roi, len(paths)
         self._vertices = Vertices(paths.material, paths.toward)
         pixels, first, counts = np.unique(paths.pixel, return_index=True, return_counts=True)
@@ -181,7 +181,7 @@ class KeptPaths:
         return out.reshape(light.codes, self.roi.height, self.roi.width)
 
 
-def light_of(paths: Candidates, finishes: Sequence[Sequence[Any]]) -> Iterator[NDArray[np.float64]]:
+def light_of(paths: CandidatePaths, finishes: Sequence[Sequence[Any]]) -> Iterator[NDArray[np.float64]]:
     """Yield the radiance (n,) of each path for a code of 1, for the BSDFs of each of some drawn finishes."""
     vertices = Vertices(paths.material, paths.toward)
     for bsdfs in finishes:
@@ -190,8 +190,8 @@ def light_of(paths: Candidates, finishes: Sequence[Sequence[Any]]) -> Iterator[N
 
 
 def mattering(
-    parts: Sequence[Candidates], finishes: Sequence[Sequence[Any]], roi: Roi, count: int, seed: int
-) -> Candidates:
+    parts: Sequence[CandidatePaths], finishes: Sequence[Sequence[Any]], roi: Roi, count: int, seed: int
+) -> CandidatePaths:
     """Return about ``count`` of the paths, chosen by their light in some finishes, in the order of their pixels.
 
     Parameters
@@ -210,7 +210,7 @@ def mattering(
     dr.flush_malloc_cache()  # Dr.Jit keeps what it needed to trace the paths, as much as all else together
     surfaces = max((part.material.shape[1] for part in parts), default=1)
     if not any(len(part) for part in parts):
-        return Candidates.joined(parts, surfaces)
+        return CandidatePaths.joined(parts, surfaces)
     size = np.concatenate([_sizes(part, finishes) for part in parts])
     pixel = np.concatenate([part.pixel for part in parts])
     order = np.argsort(z_positions(pixel % roi.width, pixel // roi.width), kind="stable")
@@ -219,19 +219,19 @@ def mattering(
     kept = np.flatnonzero(np.floor(reached) > np.floor(np.concatenate([[0.0], reached[:-1]])))
     index, probability = order[kept], probability[kept]
     del size, pixel, order, reached
-    places, chosen, first = list[NDArray[np.integer]](), list[Candidates](), 0
+    places, chosen, first = list[NDArray[np.integer]](), list[CandidatePaths](), 0
     for part in parts:  # never all candidates together, which are many times as large as what is kept
         of_part = np.flatnonzero((index >= first) & (index < first + len(part)))
         places.append(of_part)
         chosen.append(part.chosen(index[of_part] - first))
         first += len(part)
-    paths = Candidates.joined(chosen, surfaces)
+    paths = CandidatePaths.joined(chosen, surfaces)
     del chosen
     sequence = np.argsort(np.concatenate(places))
     return paths.chosen(sequence, (paths.weight[sequence] / probability).astype(np.float32))
 
 
-def _sizes(paths: Candidates, finishes: Sequence[Sequence[Any]]) -> NDArray[np.float64]:
+def _sizes(paths: CandidatePaths, finishes: Sequence[Sequence[Any]]) -> NDArray[np.float64]:
     """Return the root mean square light (n,) of paths over some finishes."""
     size = np.zeros(len(paths))
     for first in range(0, len(paths), _AT_ONCE):

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import opaque, opaque_index
-from mitsim.scene.light_transport.kept_paths import Candidates
+from mitsim.scene.light_transport.kept_paths import CandidatePaths
 from mitsim.scene.light_transport.kept_walks import (
     Tracer,
     Tracing,
@@ -55,7 +55,7 @@ def camera_paths(
     roi: Roi,
     pixels: NDArray[np.integer],
     tracing: Tracing,
-) -> Iterator[Candidates]:
+) -> Iterator[CandidatePaths]:
     """Yield the records of camera paths.
 
     Parameters
@@ -80,8 +80,8 @@ def camera_paths(
 
 
 def _records(
-    one: Tracer, walk: Walk | None, step: Callable[[Tracer, Walk, int], tuple[Walk | None, Candidates | None]]
-) -> Iterator[Candidates]:
+    one: Tracer, walk: Walk | None, step: Callable[[Tracer, Walk, int], tuple[Walk | None, CandidatePaths | None]]
+) -> Iterator[CandidatePaths]:
     """Yield the records of paths from surface to surface; none start where the projector emits nothing."""
     for number in range(1, one.tracing.depth + 1):
         if walk is None or not dr.width(walk.lane):
@@ -123,7 +123,7 @@ def _camera_start(one: Tracer, pixels: Any, first: int, count: int) -> Walk:
     )
 
 
-def _camera_step(one: Tracer, walk: Walk, number: int) -> tuple[Walk | None, Candidates | None]:
+def _camera_step(one: Tracer, walk: Walk, number: int) -> tuple[Walk | None, CandidatePaths | None]:
     """Meet surface ``number`` of each path: return the paths that go on, and the records of those that are lit."""
     tracing, context = one.tracing, mi.BSDFContext()
     surface = one.scene.mitsuba.ray_intersect(mi.Ray3f(walk.origin, walk.direction))
@@ -188,7 +188,7 @@ def _camera_step(one: Tracer, walk: Walk, number: int) -> tuple[Walk | None, Can
 
 def photon_paths(
     scene: Scene, rays: CameraRays, projector: Projector, pose: Transform, roi: Roi, tracing: Tracing
-) -> Iterator[Candidates]:
+) -> Iterator[CandidatePaths]:
     """Yield the records of photons.
 
     Parameters
@@ -229,7 +229,7 @@ def _photon_start(one: Tracer, first: int, count: int) -> Walk:
     return walk.at(dr.compress(flux > 0))
 
 
-def _photon_step(one: Tracer, walk: Walk, number: int) -> tuple[Walk | None, Candidates | None]:
+def _photon_step(one: Tracer, walk: Walk, number: int) -> tuple[Walk | None, CandidatePaths | None]:
     """Meet surface ``number`` of each photon: return the photons that go on, and records of those the camera sees."""
     tracing, context, camera, rays = one.tracing, mi.BSDFContext(), one.camera, one.rays
     chance = walk.lane + opaque_index(_PHOTONS_FROM)

@@ -14,7 +14,7 @@ import numpy as np
 from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import opaque, opaque_index, vectors_to_host
-from mitsim.scene.light_transport.kept_paths import Candidates
+from mitsim.scene.light_transport.kept_paths import CandidatePaths
 from mitsim.scene.light_transport.plain_scene import SceneBsdfs
 from mitsim.scene.light_transport.projector_light import ProjectorLight
 from mitsim.scene.load import Scene
@@ -133,7 +133,7 @@ class Tracer:
 
 def split_walk(
     walk: Walk, lit: Any, record: Any, goes_on: Any, follower: Walk | None
-) -> tuple[Walk | None, Candidates | None]:
+) -> tuple[Walk | None, CandidatePaths | None]:
     """Return the lanes that go on, and the records of those that are lit; None for none.
 
     Parameters
@@ -164,7 +164,7 @@ def _arrays(walk: Walk) -> list[Any]:
     return [walk.lane, walk.pixel, walk.origin, walk.direction, walk.weight, walk.ratio, walk.length, walk.surfaces]
 
 
-def _candidates(walk: Walk, record: Any, index: Any) -> Candidates:
+def _candidates(walk: Walk, record: Any, index: Any) -> CandidatePaths:
     weight, uv, length, *last = record
 
     def some(value: Any) -> Any:
@@ -177,7 +177,7 @@ def _candidates(walk: Walk, record: Any, index: Any) -> Candidates:
         [np.concatenate([vectors_to_host(some(one[1])), vectors_to_host(some(one[2]))], axis=1) for one in surfaces],
         axis=1,
     )
-    return Candidates(
+    return CandidatePaths(
         np.asarray(some(walk.pixel)).astype(np.int32), np.asarray(some(weight), np.float32), code, material, toward
     )
 

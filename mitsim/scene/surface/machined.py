@@ -102,7 +102,7 @@ class MachinedFace:
 
 
 @dataclass(frozen=True)
-class _Lobe:
+class _LobeWidths:
     """Alpha across and along the lay, its source, and its one-sigma factor."""
 
     across: float
@@ -264,32 +264,32 @@ def _feed_slope(face: MachinedFace) -> float:
     return feed_slope(feed(face.roughness, radius), radius)
 
 
-def _lobe(face: MachinedFace, process: Process, sigma: float, wavelength_nm: float, where: str) -> _Lobe:
+def _lobe(face: MachinedFace, process: Process, sigma: float, wavelength_nm: float, where: str) -> _LobeWidths:
     ratio = process.lay_ratio
     if face.alpha is not None:
-        return _Lobe(face.alpha, face.alpha, f"alpha {face.alpha:g} as given", FACTORS["alpha"])
+        return _LobeWidths(face.alpha, face.alpha, f"alpha {face.alpha:g} as given", FACTORS["alpha"])
     if face.alpha_u is not None and face.alpha_v is not None:
         given = f"alpha {face.alpha_u:g} and {face.alpha_v:g} along u and v as given"
-        return _Lobe(face.alpha_v, face.alpha_u, given, FACTORS["alpha"])
+        return _LobeWidths(face.alpha_v, face.alpha_u, given, FACTORS["alpha"])
     if face.height_map is not None:
         areal = face.height_map
         across = _from_heights(areal.across, areal.Sq, wavelength_nm, where, "height_map")
         along = _from_heights(areal.along, areal.Sq, wavelength_nm, where, "height_map")
         if ratio == 1 and face.lay not in ("u", "v"):
             across = along = float(np.sqrt((across**2 + along**2) / 2))
-        return _Lobe(across, along, f"height map {areal.name}", FACTORS["height map"])
+        return _LobeWidths(across, along, f"height map {areal.name}", FACTORS["height map"])
     if face.profile is not None:
         across = _from_heights(face.profile.autocorrelation, face.profile.Rq, wavelength_nm, where, "profile")
         along = across * ratio
         if face.profile_along is not None:
             second = face.profile_along
             along = _from_heights(second.autocorrelation, second.Rq, wavelength_nm, where, "profile_along")
-        return _Lobe(across, along, f"profile trace {face.profile.name}", FACTORS["profile"])
+        return _LobeWidths(across, along, f"profile trace {face.profile.name}", FACTORS["profile"])
     if process.feed_marks and (face.Rdq is not None or face.RSm is not None):
         # the slope of a periodic profile is geometric: RSm is the feed, and Rdq = 9 Ra / f
         slope = face.Rdq if face.Rdq is not None else 9 * face.roughness / (face.RSm or 1.0)
         words = f"Rdq {face.Rdq:g}" if face.Rdq is not None else f"Ra {face.roughness:g} um and feed {face.RSm:g} um"
-        return _Lobe(float(np.sqrt(2) * slope), float(np.sqrt(2) * slope) * ratio, words, FACTORS["slope"])
+        return _LobeWidths(float(np.sqrt(2) * slope), float(np.sqrt(2) * slope) * ratio, words, FACTORS["slope"])
     if face.gloss is not None:
         return _of_gloss(face, process, sigma, wavelength_nm, where)
     ra = micro_roughness(face.roughness) if process.feed_marks else face.roughness
@@ -303,7 +303,7 @@ def _lobe(face: MachinedFace, process: Process, sigma: float, wavelength_nm: flo
     nu = (process.exponent - 1) / 2
     length = correlation_length(sigma, min(slope, ALPHA_LARGEST), nu)
     across = lobe_alpha(_matern_of(length, nu), sigma, wavelength_nm)
-    return _Lobe(across, across * ratio, words, factor)
+    return _LobeWidths(across, across * ratio, words, factor)
 
 
 def _matern_of(length_um: float, nu: float) -> Autocorrelation:
@@ -317,7 +317,7 @@ def _from_heights(rho: Autocorrelation, sigma: float, wavelength_nm: float, wher
         raise InputError(where, key, str(error), "a trace or map of roughness, without form and noise") from None
 
 
-def _of_gloss(face: MachinedFace, process: Process, sigma: float, wavelength_nm: float, where: str) -> _Lobe:
+def _of_gloss(face: MachinedFace, process: Process, sigma: float, wavelength_nm: float, where: str) -> _LobeWidths:
     """Compute alpha at 555 nm from a gloss reading, then the lateral scale, then alpha at the sensor's wavelength."""
     index = refractive_index(face.metal, GLOSS_WAVELENGTH_NM)
     bright = normal_reflectance(face.metal, GLOSS_WAVELENGTH_NM)
@@ -342,9 +342,9 @@ def _of_gloss(face: MachinedFace, process: Process, sigma: float, wavelength_nm:
     nu = (process.exponent - 1) / 2
     length = None if process.feed_marks else _length_of_alpha(alpha, sigma, nu)
     if length is None:  # geometric: the slope is the same at every wavelength
-        return _Lobe(alpha, alpha * process.lay_ratio, words, FACTORS["gloss"])
+        return _LobeWidths(alpha, alpha * process.lay_ratio, words, FACTORS["gloss"])
     across = lobe_alpha(_matern_of(length, nu), sigma, wavelength_nm)
-    return _Lobe(across, across * process.lay_ratio, words, FACTORS["gloss"])
+    return _LobeWidths(across, across * process.lay_ratio, words, FACTORS["gloss"])
 
 
 def _length_of_alpha(alpha: float, sigma: float, nu: float) -> float | None:

@@ -15,7 +15,7 @@ from dataclasses import replace
 from characterisation.files.atomic_io import write_json
 from mitsim.running.time_limit import TimeLimit
 from mitsim.study import Study
-from mitsim.study.early_answers import Clock
+from mitsim.study.early_answers import StepTimes
 from mitsim.study.remedies.change import Shortfall, missed_by
 from mitsim.study.remedies.changes import changes
 from mitsim.study.remedies.confirm import Remedies, all_changes, find_remedies, of_missed
@@ -40,7 +40,7 @@ def seeks_remedies(study: Study) -> bool:
 
 
 def state_and_mend(
-    session: Session, now: Shortfall, rest: TimeLimit, clock: Clock
+    session: Session, now: Shortfall, rest: TimeLimit, clock: StepTimes
 ) -> tuple[StatedView, Remedies | None]:
     """Try changes for what a statement misses, and go on with the statement in turn with them, within a limit.
 

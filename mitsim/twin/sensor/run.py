@@ -44,7 +44,7 @@ from mitsim.twin.sensor.parameters import (
 from mitsim.twin.sensor.room import RoomFit, fit_room
 from mitsim.twin.sensor.rows import row_turns
 from mitsim.twin.sensor.stripes import fit_stripes
-from mitsim.twin.sensor.verdict import Agreement, Verdict, verdict_of
+from mitsim.twin.sensor.verdict import DotAgreement, Verdict, verdict_of
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class SensorFit:
     input_captures: tuple[InputCapture, ...] = field(repr=False)
     estimates: tuple[FittedKey, ...]
     undetermined: tuple[Undetermined, ...]
-    agreements: tuple[Agreement, ...] = ()
+    agreements: tuple[DotAgreement, ...] = ()
 
     @property
     def verdict(self) -> Verdict:
@@ -132,7 +132,7 @@ def fit_sensor(
             turned.append(FittedKey(f"misalignment.{key}", *pair, "mrad", (source.name,), method))
     estimates += pooled(turned)
     agreements = tuple(
-        Agreement(name, found.moment_fit.chi_square, found.moment_fit.freedom, found.misfit, found.worst)
+        DotAgreement(name, found.moment_fit.chi_square, found.moment_fit.freedom, found.misfit, found.worst)
         for name, found in dots.items()
     )
     return SensorFit(base, tuple(input_captures), tuple(estimates), tuple(undetermined), agreements)

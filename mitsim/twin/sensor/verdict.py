@@ -34,7 +34,7 @@ FAIR = 3.0
 
 
 @dataclass(frozen=True)
-class Agreement:
+class DotAgreement:
     """The dots of a ``capture`` against the best simulation: chi-square and its degrees of freedom.
 
     ``misfit`` is the root mean square, over the field, of the logarithm of recorded over simulated, of the ``feature``
@@ -73,7 +73,7 @@ class Verdict:
     why: str
 
 
-def verdict_of(agreements: tuple[Agreement, ...]) -> Verdict:
+def verdict_of(agreements: tuple[DotAgreement, ...]) -> Verdict:
     """Return the verdict of a fit: that of the capture which agrees least."""
     if not agreements:
         return Verdict("not tested", "no capture shows dots, so nothing tests the fitted numbers against an image")

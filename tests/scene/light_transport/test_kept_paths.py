@@ -8,7 +8,7 @@ import pytest
 from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import mi
 from mitsim.scene.light_transport import kept_tracing
-from mitsim.scene.light_transport.kept_paths import Candidates, KeptPaths, broad, light_of, mattering
+from mitsim.scene.light_transport.kept_paths import CandidatePaths, KeptPaths, broad, light_of, mattering
 from mitsim.scene.light_transport.kept_tracing import camera_paths, photon_paths
 from mitsim.scene.light_transport.kept_walks import Tracing
 from mitsim.scene.light_transport.light_paths import LightPaths
@@ -100,7 +100,7 @@ def candidates(scene, rays, light, seed, depth=3, samples=36):
     tracing = Tracing(samples, 240**2, depth, seed, drawn, sampled, turned)
     arguments = scene, rays, light.projector, POSE, roi
     found = [*camera_paths(*arguments, np.arange(WIDTH * HEIGHT), tracing), *photon_paths(*arguments, tracing)]
-    return Candidates.joined(found, depth), roi
+    return CandidatePaths.joined(found, depth), roi
 
 
 def deviating(scene, deviation):

@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.twin.sensor.run import sensor_path
-from mitsim.twin.sensor.verdict import Agreement, verdict_of
+from mitsim.twin.sensor.verdict import DotAgreement, verdict_of
 from mitsim.twin.sensor.write import Entry, with_cameras, with_entries, with_exposure
 
 ENTRIES = {
@@ -32,14 +32,14 @@ ENTRIES = {
     ],
 )
 def test_the_verdict_follows_from_chance_and_ratio_or_the_margin_of_compare(chi_square, freedom, misfit, word):
-    found = verdict_of((Agreement("sheet", chi_square, freedom, misfit, "sharpness"),))
+    found = verdict_of((DotAgreement("sheet", chi_square, freedom, misfit, "sharpness"),))
     assert found.word == word
     assert ("sharpness by " in found.why) == (word != "good")
 
 
 def test_the_worst_capture_decides_and_is_named():
     rows = {"a": 10, "b": 83.7, "c": 40}
-    found = verdict_of(tuple(Agreement(name, square, 14, 0.3, "level") for name, square in rows.items()))
+    found = verdict_of(tuple(DotAgreement(name, square, 14, 0.3, "level") for name, square in rows.items()))
     assert found.word == "bad"
     assert "chi-square 83.7 of 14 for b" in found.why
     assert verdict_of(()).word == "not tested"
