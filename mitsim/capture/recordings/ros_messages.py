@@ -34,7 +34,7 @@ CLOUD = "sensor_msgs/msg/PointCloud2"
 #: type of the messages that hold the calibration of a camera
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 
-#: type of the messages in which librealsense states a setting, such as the unit of depths
+#: type of the messages in which RealSense's viewer states the unit of depths
 FLOAT = "std_msgs/msg/Float32"
 
 #: encodings of depths (librealsense writes ``mono16``), and their unit [mm]
