@@ -19,7 +19,7 @@ from mitsim.report.style import colour_scale, pixel_axes
 #: percentile of |difference| at the ends of the colours, against outliers; chosen
 _PERCENTILE = 98.0
 
-#: or this many robust deviations from the median, if that is less; chosen
+#: robust deviations from the median at the ends of the colours, if that is less; chosen
 _DEVIATIONS = 6.0
 
 

@@ -46,7 +46,7 @@ _COARSE = 160
 #: unexplained; chosen
 _FRACTION = 0.25
 
-#: or if it explains more of the lit pixels by this share; chosen
+#: an origin also fits better if it explains more of the lit pixels by this share; chosen
 _MANY = 0.5
 
 #: least share of pixels that counts, of a difference and of decoded pixels; chosen
@@ -55,8 +55,8 @@ _LEAST = 0.02
 #: an offset is measured if the median miss [projector px] is at least this; assumed
 _LEAST_MISS_PX = 0.7
 
-#: and if it is whole to this [px], and leaves no median unsigned miss that is larger by more than this than that of a
-#: uniform error over a stripe; assumed
+#: largest distance of a measured offset from a whole one [px], and largest excess of the median unsigned miss that it
+#: leaves over that of a uniform error over a stripe; assumed
 _WHOLE_PX = 0.2
 
 #: least share of the lit pixels that an origin explains to be believed

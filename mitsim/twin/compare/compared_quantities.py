@@ -94,10 +94,10 @@ def _correlation_length(patches: SpecimenPatches, picked: Picked) -> Floats:
     return lengths
 
 
-#: acceptable ratio of noise, contrast and lengths; chosen
+#: acceptable ratio of noise, contrast and lengths; *assumed*
 NOISE_FACTOR = 1.15
 
-#: acceptable difference of shares; chosen
+#: acceptable difference of shares; *assumed*
 _SHARE_MARGIN = 0.02
 
 QUANTITIES = (
