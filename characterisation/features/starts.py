@@ -201,8 +201,11 @@ def plane_start(points: Array) -> Plane:
     return squares
 
 
-#: points and triples of them that are tried: a triple without an outlier has a probability of 0.3 for a third of them
-_SOME, _TRIPLES = 1000, 60
+#: about the largest number of points that are tried; chosen
+_SOME = 1000
+
+#: triples of them that are tried: a triple without an outlier has a probability of 0.3 for a third of them
+_TRIPLES = 60
 
 #: choices of the fewest points of a circle, a sphere or an axis: of four points without one of 40 % outliers, 26 in 200
 _TRIES = 200

@@ -29,9 +29,11 @@ REASONS: dict[str, tuple[str, str]] = {
     "UNCALIBRATED": ("no unique ray by the calibration", "#0072b2"),
 }
 
-#: share of the points beyond each end of the colour scale [%], since false matches can lie at any distance; with a
-#: predicted cloud beside it, and for a cloud alone
-_BEYOND_PREDICTED, _BEYOND = 0.5, 2.0
+#: share of the points beyond each end of the colour scale with a predicted cloud beside it [%]; chosen
+_BEYOND_PREDICTED = 0.5
+
+#: the same for a cloud alone [%], since false matches can lie at any distance; chosen
+_BEYOND = 2.0
 
 #: distance of the legend from the picture: its ticks and label lie between [in]
 _UNDER_IN = 0.42

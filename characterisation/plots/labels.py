@@ -13,8 +13,11 @@ from characterisation.plots.style import INK, MUTED
 #: rows of labels in the height of a picture
 _ROWS = 7
 
-#: distance of the columns of labels from the picture, and the space for them, as a share of its longer side
-_ASIDE, _ROOM = 0.09, 0.34
+#: distance of the columns of labels from the picture, as a share of its longer side
+_ASIDE = 0.09
+
+#: space for the labels, as a share of the picture's longer side
+_ROOM = 0.34
 
 
 def label_columns(

@@ -37,8 +37,11 @@ GROUPS = {
 #: colour of a group that is not in :data:`GROUPS`
 _OTHER_GROUP = "#b9bdc4"
 
-#: height of a row, and of the labels and legends of a panel [in]
-ROW_IN, MARGIN_IN = 0.34, 1.25
+#: height of a row [in]
+ROW_IN = 0.34
+
+#: height of the labels and legends of a panel [in]
+MARGIN_IN = 1.25
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,20 @@ from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 
-#: colours that a page may replace: text, muted lines, areas without data, background, and points
-INK, MUTED, FIELD, PAPER, BLUE = "#1a1c20", "#6a7079", "#e3e5e9", "#fdfdfc", "#0072b2"
+#: colour of text; a page may replace it and the next four
+INK = "#1a1c20"
+
+#: colour of muted lines
+MUTED = "#6a7079"
+
+#: colour of areas without data
+FIELD = "#e3e5e9"
+
+#: colour of the background
+PAPER = "#fdfdfc"
+
+#: colour of points
+BLUE = "#0072b2"
 
 #: for highlights (Okabe and Ito's palette, as is BLUE)
 VERMILION = "#d55e00"
@@ -26,8 +38,14 @@ VERMILION = "#d55e00"
 SHAPES = ("#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00", "#cc79a7")
 OTHER_SHAPE = "#9a9fa8"
 
-#: colour maps whose order colour-blind readers can see; the last has a middle
-SEQUENTIAL, NOISE, DIVERGING = "viridis", "cividis", "RdBu_r"
+#: colour map whose order colour-blind readers can see
+SEQUENTIAL = "viridis"
+
+#: such a map for noise, other than the first
+NOISE = "cividis"
+
+#: such a map with a middle
+DIVERGING = "RdBu_r"
 
 #: ``text.parse_math`` is off, since names of features and measurements are text, not formulae
 STYLE: dict[Any, Any] = {

@@ -24,8 +24,11 @@ from characterisation.files.arrays import Floats
 from characterisation.statements.one_sided import OneSidedErrors, stated_errors
 from characterisation.statements.variance_components import RESIDUAL, Components, components
 
-#: lines that no group of unknowns explains: common to the captures of a day, and new in each capture
-INTERACTION, NOISE = "interaction", "noise"
+#: line that no group of unknowns explains and that is common to the captures of a day
+INTERACTION = "interaction"
+
+#: line that no group of unknowns explains and that is new in each capture
+NOISE = "noise"
 
 #: least number of trials with a value for a budget; chosen
 LEAST_TRIALS = 30

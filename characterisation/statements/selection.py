@@ -37,11 +37,16 @@ PRIOR_COMMON = 1.0
 #: cases each, too few to tell them apart. Command: python tests/benchmarks/race_probabilities.py prior
 PRIOR_OWN = 1.1
 
-#: median of k - 1 of the errors of a view, and standard deviations of its logarithm between measurements and between
-#: the views of one: of 97 series of at least 100 trials, one for each measurement of a stated view of the open parts of
-#: scenes/parts/measured. Halves of the parts give 3.9, 1.2, 0.8 and 2.5, 1.2, 0.9.
-#: Command: python tests/benchmarks/race_probabilities.py kurtosis
-EXCESS, EXCESS_OF_MEASUREMENTS, EXCESS_OF_VIEWS = 3.2, 1.2, 0.9
+#: median of k - 1 of the errors of a view: of 97 series of at least 100 trials, one for each measurement of a stated
+#: view of the open parts of scenes/parts/measured. For this and the two deviations below, halves of the parts give 3.9,
+#: 1.2, 0.8 and 2.5, 1.2, 0.9. Command: python tests/benchmarks/race_probabilities.py kurtosis
+EXCESS = 3.2
+
+#: standard deviation of its logarithm between measurements, from the same series
+EXCESS_OF_MEASUREMENTS = 1.2
+
+#: standard deviation of its logarithm between the views of a measurement, from the same series
+EXCESS_OF_VIEWS = 0.9
 
 #: number of trials at which half of the tails' share of the bias of a logarithm is in effect: of one trial the bias is
 #: -0.9, of 2, 4, 8 and 16 -0.5, -0.28, -0.17 and -0.11, over the same series

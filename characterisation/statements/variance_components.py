@@ -36,8 +36,11 @@ RESIDUAL = "residual"
 #: about the number of trials that are decomposed at once (up to 300), since time grows with its cube
 AT_ONCE = 200
 
-#: largest number of iterations, and the change of the likelihood that ends them
-_ITERATIONS, _CONVERGED = 60, 1e-6
+#: largest number of iterations; chosen
+_ITERATIONS = 60
+
+#: change of the likelihood that ends them; chosen
+_CONVERGED = 1e-6
 
 #: least share of the residual, which keeps the covariance invertible
 _LEAST = 1e-5

@@ -124,8 +124,19 @@ def pose_rotation(pose: Pose, *, sensor_from_part: ArrayLike, point: ArrayLike) 
     return float(np.arctan2(np.linalg.norm(skew), np.trace(turn) - 1.0))
 
 
-PLANE, AXIS, POINT = ("plane",), ("cylinder", "cone"), ("sphere", "circle", "edge_point", "intersection")
+#: kinds of features that are a plane
+PLANE = ("plane",)
+
+#: kinds of features that have an axis
+AXIS = ("cylinder", "cone")
+
+#: kinds of features that have a point
+POINT = ("sphere", "circle", "edge_point", "intersection")
+
+#: kinds of features that have a plane, also one between two others
 FLAT = ("plane", "mid_plane")
+
+#: kinds of features that are a surface
 SURFACE = ("plane", "cylinder", "sphere", "cone")
 
 MeasurementKind = Literal[

@@ -27,8 +27,11 @@ from characterisation.tasks.task_file import Feature, Measurement, Task
 
 Array = NDArray[np.float64]
 
-#: no place, and the origin of a frame
-NOWHERE, ORIGIN = np.empty((0, 3)), np.zeros(3)
+#: no place
+NOWHERE = np.empty((0, 3))
+
+#: origin of a frame [mm]
+ORIGIN = np.zeros(3)
 
 
 class Estimate(Protocol):

@@ -15,12 +15,20 @@ from characterisation.files.errors import InputError
 from characterisation.plots.clouds import depth_limits
 from characterisation.plots.style import SEQUENTIAL, VERMILION, axes_for, side_bar
 
-#: percentiles of the grey values shown as black and white, and the display exponent, since metal is dark but for its
-#: highlights
-STRETCH_PERCENTILES, STRETCH_EXPONENT = (5, 99.9), 0.7
+#: percentiles of the grey values shown as black and white; chosen: the few highlights of metal may be white
+STRETCH_PERCENTILES = (5, 99.9)
 
-#: width of the picture of a camera, width of the colour scale, and height of title and legend [in]
-_WIDTH_IN, _SCALE_IN, _LABELS_IN = 4.8, 0.8, 0.55
+#: exponent of the display, under 1, since metal is dark but for its highlights; chosen
+STRETCH_EXPONENT = 0.7
+
+#: width of the picture of a camera [in]
+_WIDTH_IN = 4.8
+
+#: width of the colour scale [in]
+_SCALE_IN = 0.8
+
+#: height of title and legend [in]
+_LABELS_IN = 0.55
 
 
 def grey_limits(frames: Sequence[NDArray[np.number[Any]]]) -> tuple[float, float]:

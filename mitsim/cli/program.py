@@ -157,8 +157,11 @@ _OF_THE_USER = frozenset(
 )
 
 
-#: exit codes of an interrupted command, and of a bug: EX_SOFTWARE of sysexits.h, since Python's own is that of a check
-_STOPPED, _BUG = 130, 70
+#: exit code of an interrupted command: 128 plus the number of SIGINT
+_STOPPED = 130
+
+#: exit code of a bug: EX_SOFTWARE of sysexits.h, since Python's own is that of a check
+_BUG = 70
 
 
 def main() -> None:

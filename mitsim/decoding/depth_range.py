@@ -45,9 +45,11 @@ MINIMUM_VALID = 0.01
 #: range and in range given above
 MINIMUM_AGREEMENT = 0.6
 
-#: least share of the pixels that must lie outside the range on a surface, and its least ratio to the share that agrees
-#: within the range
-MINIMUM_OUTSIDE, OUTSIDE_RATIO = 0.05, 3.0
+#: least share of the pixels that must lie outside the range on a surface; chosen
+MINIMUM_OUTSIDE = 0.05
+
+#: its least ratio to the share that agrees within the range; chosen
+OUTSIDE_RATIO = 3.0
 
 #: factor by which the coarse search extends the range at both ends
 RANGE_FACTOR = 8.0
@@ -55,9 +57,11 @@ RANGE_FACTOR = 8.0
 #: approximate number of columns of the coarse capture
 _COARSE_COLUMNS = 400
 
-#: largest difference of a depth on a surface from the median around it, as a share of the depth; side of the square for
-#: the median [px]
-_DEPTH_TOLERANCE, _NEIGHBOURHOOD_PX = 0.02, 7
+#: largest difference of a depth on a surface from the median around it, as a share of the depth; chosen
+_DEPTH_TOLERANCE = 0.02
+
+#: side of the square for this median [px]; chosen
+_NEIGHBOURHOOD_PX = 7
 
 #: largest number of points of a cloud that are compared with their neighbours
 _SAMPLED_POINTS = 2000

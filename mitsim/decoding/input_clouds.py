@@ -29,8 +29,11 @@ from mitsim.sensor.matcher import MatcherSettings
 #: suffixes of cloud files that are found in a folder
 _SUFFIXES = (".ply", ".pcd", ".zdf")
 
-#: text that identifies a cloud file of ``mitsim decode``, and the length of the header in which it stands [bytes]
-_MARK, _HEAD = b"\ncomment mitsim ", 1 << 20
+#: text that identifies a cloud file of ``mitsim decode``
+_MARK = b"\ncomment mitsim "
+
+#: number of bytes at the start of a file in which this text is searched; chosen
+_HEAD = 1 << 20
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,11 @@ _MOST_NUMBERS = 1_000_000_000
 #: rounding of coordinates [mm] that is worth a remark: clouds hold 24 bits
 _COARSE_MM = 1e-3
 
-#: suffixes of clouds in arrays and text
-ARRAYS, TEXTS = (".npy", ".npz", ".mat"), (".xyz", ".xyzn", ".xyzi", ".xyzrgb", ".txt", ".asc", ".pts", ".csv")
+#: suffixes of clouds in arrays
+ARRAYS = (".npy", ".npz", ".mat")
+
+#: suffixes of clouds in text
+TEXTS = (".xyz", ".xyzn", ".xyzi", ".xyzrgb", ".txt", ".asc", ".pts", ".csv")
 
 
 def is_array_or_text(path: Path) -> bool:

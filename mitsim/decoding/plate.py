@@ -49,9 +49,11 @@ LEAST_DOTS = 9
 #: largest distance of adjacent dots in the image, over the median distance of the nearest dots
 _ADJACENT = 1.35
 
-#: limits beyond which a point is a false match: difference from the median range, as a share of it; residual, in
-#: standard deviations
-_DEPTH_SHARE, _GATE = 0.2, 6.0
+#: difference from the median range, as a share of it, from which a point is a false match; chosen
+_DEPTH_SHARE = 0.2
+
+#: residual from the plate's plane [standard deviations] beyond which a point is a false match; chosen
+_GATE = 6.0
 
 #: least number of the cloud's points near a dot
 _LEAST_POINTS = 12

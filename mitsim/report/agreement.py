@@ -28,9 +28,16 @@ from characterisation.files.arrays import Floats
 from characterisation.scores.coverage import NORMAL_COVERAGE, coverage_interval
 from characterisation.scores.rank_agreement import spearman
 
-#: verdicts on the order that u gives the checked views
-CONFIRMED, REVERSED = "smaller u, smaller error", "smaller u, larger error: do not trust it"
-CHANCE, TOO_FEW = "could be chance", "too few views to tell"
+#: verdict on the order that u gives the checked views: it is right
+CONFIRMED = "smaller u, smaller error"
+
+#: verdict: the order is significantly reversed
+REVERSED = "smaller u, larger error: do not trust it"
+#: verdict: the rank correlation is not significant
+CHANCE = "could be chance"
+
+#: verdict: there is no rank correlation
+TOO_FEW = "too few views to tell"
 
 
 @dataclass(frozen=True)

@@ -25,14 +25,29 @@ from mitsim.scene.visible_surfaces import VisibleSurfaces
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 
-#: width of the figure and of a picture [in]
-_WIDTH_IN, _WIDE_IN = 9.4, 4.1
+#: width of the figure [in]
+_WIDTH_IN = 9.4
 
-#: pixels of the part, paths of each, and the seed of the paths
-_PIXELS, _SAMPLES, _SEED = 16_000, 256, 1
+#: width of each of its two pictures [in]
+_WIDE_IN = 4.1
 
-#: faces with a colour of their own; largest number of faces in the list, and of the faces one gets light from
-_COLOURED, _LISTED, _SOURCES = len(SHAPES), 12, 3
+#: about the number of pixels of the part, which bounds the time; chosen
+_PIXELS = 16_000
+
+#: paths of each pixel; chosen
+_SAMPLES = 256
+
+#: seed of the paths: a report made again shows the same picture
+_SEED = 1
+
+#: number of faces with a colour of their own
+_COLOURED = len(SHAPES)
+
+#: largest number of faces in the list; chosen
+_LISTED = 12
+
+#: largest number of faces that are named as sources of the light on a face; chosen
+_SOURCES = 3
 
 #: share below which a face is not named as a source
 _LEAST = 0.005

@@ -30,8 +30,11 @@ LARGEST_WIDTH_PX = 800
 #: meaning and colour of each status
 REASONS = {status: STATUS_WORDS[status.name] for status in Status}
 
-#: margin around the part in a camera image, relative to the part's size there, and its minimum in pixels
-_CROP_MARGIN, _CROP_LEAST_PX = 0.08, 12
+#: margin around the part in a camera image, relative to the part's size there; chosen
+_CROP_MARGIN = 0.08
+
+#: its minimum, for small parts [px]; chosen
+_CROP_LEAST_PX = 12
 
 
 def part_window(camera: Camera, points: NDArray[np.floating]) -> tuple[slice, slice]:

@@ -16,8 +16,11 @@ from characterisation.point_cloud import PointCloud
 from characterisation.region_of_interest import Roi
 from mitsim.report.style import colour_scale, pixel_axes
 
-#: ends of the colours: this percentile of |difference|, or this many robust deviations from the median if that is less
-_PERCENTILE, _DEVIATIONS = 98.0, 6.0
+#: percentile of |difference| at the ends of the colours, against outliers; chosen
+_PERCENTILE = 98.0
+
+#: robust deviations from the median at the ends of the colours, if that is less; chosen
+_DEVIATIONS = 6.0
 
 
 def distance_figure(cloud: PointCloud, windows: Mapping[str, Roi]) -> Figure:

@@ -47,14 +47,22 @@ _LEGEND = {"no tolerance": "measured, without tolerance"}
 _PIXELS = 900
 _LABEL_PIXELS = 240
 
-#: azimuth of the picture's viewpoint relative to the sensor, and its minimum elevation [deg]
-_ASIDE_DEG, _LOWEST_DEG = 62.0, 18.0
+#: azimuth of the picture's viewpoint relative to the sensor [deg]; chosen
+_ASIDE_DEG = 62.0
+
+#: minimum elevation of the viewpoint [deg]; chosen
+_LOWEST_DEG = 18.0
 
 #: largest number of times that a picture is widened for its texts: it shrinks, and they do not
 _WIDENINGS = 12
 
-#: size [in] of the figure, and with the part below the sensor; places of both pictures in it
-_SIZE_IN, _STACKED_IN = (7.4, 3.9), (3.9, 5.6)
+#: size of the figure [in]
+_SIZE_IN = (7.4, 3.9)
+
+#: size of the figure with the part below the sensor [in]
+_STACKED_IN = (3.9, 5.6)
+
+#: places of both pictures in each figure
 _BESIDE = (0.0, 0.09, 0.46, 0.91), (0.46, 0.09, 0.54, 0.91)
 _STACKED = (0.0, 0.54, 1.0, 0.46), (0.0, 0.1, 1.0, 0.42)
 

@@ -37,8 +37,14 @@ _BACK = "#2b2d33"
 #: share of the colour that remains where the sensor cannot measure
 _PALE = 0.35
 
-#: rays along the longer side of the top view; raster of the working volume's section; pixels of its outline
-_FINE, _COARSE, _STEP = 560, 280, 2
+#: rays along the longer side of each view
+_FINE = 560
+
+#: points along each side of the raster of the working volume's section
+_COARSE = 280
+
+#: step of the raster from which the outline of the working volume is drawn [px]
+_STEP = 2
 
 #: share of the height of the top view that its small map occupies
 _OVERVIEW = 0.36
@@ -48,7 +54,17 @@ _MARGIN = 0.06
 
 _SENSOR_MARK: dict[str, Any] = {"marker": "^", "ms": 6, "mfc": "white", "mec": INK, "mew": 1.1}
 
-_WIDTH_IN, _PANEL_IN, _TITLE_IN, _ROW_IN = 7.5, 2.65, 0.3, 0.176
+#: width of the figure [in]
+_WIDTH_IN = 7.5
+
+#: height of the two views [in]
+_PANEL_IN = 2.65
+
+#: height of the titles [in]
+_TITLE_IN = 0.3
+
+#: height of a row of the legend [in]
+_ROW_IN = 0.176
 
 
 def preview_figure(

@@ -26,8 +26,11 @@ from mitsim.study.scene_geometry import SceneGeometry, read_scene_geometry
 #: smallest and largest height of the picture [in]
 _PICTURE = (1.58, 3.4)
 
-#: height of the lines to sign, and of the last line of a page [in]
-_SIGNATURE, _FOOT = 0.95, 0.22
+#: height of the lines to sign [in]
+_SIGNATURE = 0.95
+
+#: height of the last line of a page [in]
+_FOOT = 0.22
 
 #: what only the user knows, to be written by hand
 _TO_FILL_IN = (
@@ -35,12 +38,20 @@ _TO_FILL_IN = (
     ("Place and date", "Name, organisation", "Signature"),
 )
 
-#: size of small text [pt], sizes of facts of which the largest gives one page [pt], and distance of their text from the
-#: margin [in]
-_SMALL, _FACTS, _FACT_LEFT = 6.5, (7.2, 6.6, 6.0), 1.15
+#: size of small text [pt]
+_SMALL = 6.5
 
-#: size of the result in words [pt], and its most lines
-_RESULT, _RESULT_LINES = 9.5, 4
+#: sizes of facts [pt], of which the largest that gives one page is used
+_FACTS = (7.2, 6.6, 6.0)
+
+#: distance of the text of facts from the margin [in]
+_FACT_LEFT = 1.15
+
+#: size of the result in words [pt]
+_RESULT = 9.5
+
+#: largest number of its lines
+_RESULT_LINES = 4
 
 #: colour of the result by its tone
 _COLOURS: dict[Tone, str] = {"good": "#00694e", "plain": INK, "warn": "#7a5600", "bad": "#a84a00"}

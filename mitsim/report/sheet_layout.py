@@ -17,8 +17,17 @@ from matplotlib.lines import Line2D
 
 from characterisation.plots.style import INK, STYLE
 
-#: an A4 page, its margins, and the distance between columns [in]
-WIDTH, HEIGHT, MARGIN, GAP = 8.27, 11.69, 0.6, 0.1
+#: width of an A4 page [in]
+WIDTH = 8.27
+
+#: height of an A4 page [in]
+HEIGHT = 11.69
+
+#: margin of a page on each side [in]
+MARGIN = 0.6
+
+#: distance between columns [in]
+GAP = 0.1
 
 #: width between the margins [in]
 ACROSS = WIDTH - 2 * MARGIN

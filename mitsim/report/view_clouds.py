@@ -24,8 +24,17 @@ from numpy.typing import NDArray
 from characterisation.files.arrays import Floats
 from characterisation.point_cloud import PointCloud
 
-#: limits of a page: clouds, points of one and of all of them (11 characters each), triangles of the part
-MOST_CLOUDS, MOST_POINTS, MOST_POINTS_IN_ALL, MOST_TRIANGLES = 60, 20_000, 120_000, 20_000
+#: largest number of clouds on a page; chosen, as the other limits are, for the size of the file
+MOST_CLOUDS = 60
+
+#: largest number of points of a cloud
+MOST_POINTS = 20_000
+
+#: largest number of points of all clouds: each takes 11 characters
+MOST_POINTS_IN_ALL = 120_000
+
+#: largest number of triangles of the part
+MOST_TRIANGLES = 20_000
 
 #: percentiles of the noise of all points at the ends of its colour scale
 NOISE_PERCENTILES = (2, 98)
@@ -33,8 +42,11 @@ NOISE_PERCENTILES = (2, 98)
 #: faces that meet at a smaller angle are shaded as one round surface [rad]
 CREASE = math.radians(30.0)
 
-#: code of an unknown noise or of a point outside all features; largest integer coordinate
-UNKNOWN, LAST_STEP = 255, 65535
+#: code of an unknown noise, or of a point outside all features: the largest in a byte
+UNKNOWN = 255
+
+#: largest integer coordinate: the largest in two bytes
+LAST_STEP = 65535
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,14 @@ from __future__ import annotations
 import math
 import re
 
-MINUS, NONE, SPACE = "\N{MINUS SIGN}", "\N{EN DASH}", "\N{NO-BREAK SPACE}"
+#: sign of negative numbers
+MINUS = "\N{MINUS SIGN}"
+
+#: stands for a number that is missing
+NONE = "\N{EN DASH}"
+
+#: space between a number and its unit
+SPACE = "\N{NO-BREAK SPACE}"
 
 
 def two_digits(value: float) -> str:

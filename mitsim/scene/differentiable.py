@@ -34,7 +34,11 @@ from mitsim.scene.surface.scatter import Scatter
 #: step of the central differences of the lobe's parameters (energy, coherence); the error is of the order of its square
 _STEP = 1e-3
 
-_INCOHERENT, _MIRROR = "lobe", "mirror"
+#: name of the incoherent lobe in the tree of BSDFs
+_INCOHERENT = "lobe"
+
+#: name of the coherent reflection in the tree of BSDFs
+_MIRROR = "mirror"
 
 
 def lambertian_coupon(width: float, height: float, wavelength_nm: float) -> Scene:

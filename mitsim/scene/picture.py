@@ -29,8 +29,11 @@ _RAYS = 520
 #: width of a new figure [in]
 _WIDTH_IN = 7.4
 
-#: viewpoint without a pose: azimuth and elevation [rad], from the front and above
-_AZIMUTH, _ELEVATION = np.radians(-60.0), np.radians(35.0)
+#: azimuth of the viewpoint without a pose [rad]: from the front; chosen
+_AZIMUTH = np.radians(-60.0)
+
+#: elevation of the viewpoint without a pose [rad]: from above; chosen
+_ELEVATION = np.radians(35.0)
 
 
 def draw_scene(scene: Any, names: tuple[str, ...], bounds: Floats, ax: Any, pose: Transform | None) -> Axes:

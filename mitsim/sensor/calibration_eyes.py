@@ -26,8 +26,12 @@ from scipy.spatial.transform import Rotation
 
 from mitsim.sensor.calibration_names import USUAL_NAMES
 
-#: deepest map and longest list of maps that are searched, and most maps
-_DEEPEST, _LONGEST, _MOST = 8, 16, 4096
+#: number of maps around the deepest one that is searched; chosen
+_DEEPEST = 8
+#: length of the longest list that is searched for maps: a rig has fewer eyes; chosen
+_LONGEST = 16
+#: largest number of maps that are searched, which bounds the time; chosen
+_MOST = 4096
 
 #: names of focal lengths and principal points, in small letters: of single numbers, and of lists of two
 _SINGLE = (("fx", "fl_x"), ("fy", "fl_y"), ("cx", "ppx"), ("cy", "ppy"))
@@ -45,8 +49,10 @@ _LENSES = frozenset(name.lower() for name in (*USUAL_NAMES["distortion"][0], "co
 _BENT = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "taux", "tauy")
 _FISHEYE = ("k1", "k2", "k3", "k4")
 
-#: names of Kalibr for the pose of a camera from the one before it, and from the IMU
-_STEP, _COMMON = "T_cn_cnm1", "T_cam_imu"
+#: Kalibr's name of the pose of a camera from the one before it
+_STEP = "T_cn_cnm1"
+#: Kalibr's name of the pose of a camera from the IMU
+_COMMON = "T_cam_imu"
 
 #: names under which maps state the model of a lens
 LENS_MODELS = ("camera_model", "distortion_model", "camera_type", "lens_model", "model_type", "model", "type")
@@ -68,8 +74,7 @@ class Composed:
 class Eye:
     """A camera or projector: the dotted ``name`` of its map, that of its matrix, and its ``values``.
 
-    ``values`` by ``matrix``, ``distortion``, ``size``, ``rotation`` and ``translation``; those that the file does not
-    state are missing.
+    ``values`` by ``matrix``, ``distortion``, ``size``, ``rotation`` and ``translation``, if the file states them.
     """
 
     name: str

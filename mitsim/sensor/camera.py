@@ -33,8 +33,11 @@ LOST_SHARE = 0.1
 #: largest distance [px] of a pixel from the projection of its ray
 _ROUND_TRIP_PX = 1e-6
 
-#: steps from the axis to a pixel in which the ray is found where OpenCV's iteration fails, and Newton steps of each
-_STEPS, _NEWTON_STEPS = 12, 5
+#: steps from the axis to a pixel in which the ray is found where OpenCV's iteration fails; chosen
+_STEPS = 12
+
+#: Newton steps at each of them, and four times as many at the last, which must be exact; chosen
+_NEWTON_STEPS = 5
 
 #: points projected at once, to stay in the processor's cache: OpenCV also computes derivatives, 400 bytes per point
 _TOGETHER = 1 << 14

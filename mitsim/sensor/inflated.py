@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import zlib
 
-#: ``wbits`` of :func:`zlib.decompressobj` for the two formats
-ZLIB, GZIP = 15, 31
+#: ``wbits`` of :func:`zlib.decompressobj` for zlib streams: the largest window, 2^15 bytes
+ZLIB = 15
+
+#: ``wbits`` for gzip streams: the same window, plus 16
+GZIP = 31
 
 
 def inflated(data: bytes | memoryview, most: int, wbits: int) -> bytes:

@@ -13,6 +13,7 @@ import math
 import struct
 import zlib
 from dataclasses import dataclass
+from enum import IntEnum
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
@@ -23,15 +24,60 @@ from scipy.io import loadmat, whosmat
 from characterisation.files.errors import InputError
 from mitsim.sensor.inflated import ZLIB, inflated
 
-#: type codes of data elements (table 1-1 of the format)
-_INT8, _UINT8, _INT32, _UINT32, _MATRIX, _COMPRESSED, _UTF8 = 1, 2, 5, 6, 14, 15, 16
-_BYTES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8}
-_TEXT_BYTES = {1: 1, 2: 1, 3: 2, 4: 2, 16: 1, 17: 2, 18: 4}
 
-#: classes of arrays (table 1-3); the numeric ones run from double to uint64
-_CELL, _STRUCT, _OBJECT, _CHAR, _SPARSE, _FUNCTION, _OPAQUE = 1, 2, 3, 4, 5, 16, 17
+class _Type(IntEnum):
+    """Types of data elements (table 1-1 of the format)."""
+
+    INT8 = 1
+    UINT8 = 2
+    INT16 = 3
+    UINT16 = 4
+    INT32 = 5
+    UINT32 = 6
+    SINGLE = 7
+    DOUBLE = 9
+    INT64 = 12
+    UINT64 = 13
+    MATRIX = 14
+    COMPRESSED = 15
+    UTF8 = 16
+    UTF16 = 17
+    UTF32 = 18
+
+
+class _Class(IntEnum):
+    """Classes of arrays (table 1-3) that are not numeric."""
+
+    CELL = 1
+    STRUCT = 2
+    OBJECT = 3
+    CHAR = 4
+    SPARSE = 5
+    FUNCTION = 16
+    OPAQUE = 17
+
+
+#: numeric classes of arrays, from double to uint64
 _NUMERIC = range(6, 16)
 
+#: bytes of a number, by the type of its element
+_BYTES: dict[int, int] = {
+    _Type.INT8: 1, _Type.UINT8: 1, _Type.INT16: 2, _Type.UINT16: 2, _Type.INT32: 4, _Type.UINT32: 4,
+    _Type.SINGLE: 4, _Type.DOUBLE: 8, _Type.INT64: 8, _Type.UINT64: 8,
+}  # fmt: skip
+
+#: bytes of a unit of text, by the type of its element
+_TEXT_BYTES: dict[int, int] = {
+    _Type.INT8: 1, _Type.UINT8: 1, _Type.INT16: 2, _Type.UINT16: 2, _Type.UTF8: 1, _Type.UTF16: 2, _Type.UTF32: 4,
+}  # fmt: skip
+
+#: types of the elements that hold names
+_NAMES = (_Type.INT8, _Type.UINT8, _Type.UTF8)
+
+#: types of the elements that hold sizes and indices
+_WHOLE = (_Type.INT32, _Type.UINT32)
+
+#: mark of complex numbers in the flags of an array
 _COMPLEX = 0x0800
 
 #: deepest nesting of cells and structures
@@ -121,7 +167,7 @@ class _Bytes:
                 raise self.fault(f"a small element of {size} bytes")
         else:
             start = 8
-            end = start + size if kind == _COMPRESSED else start + -(-size // 8) * 8
+            end = start + size if kind == _Type.COMPRESSED else start + -(-size // 8) * 8
             if start + size > len(data):
                 raise self.fault(f"an element of {size} bytes where {len(data) - start} are left")
         return kind, data[start : start + size], data[min(end, len(data)) :]
@@ -131,7 +177,7 @@ def _check_variables(read: _Bytes, data: bytes) -> None:
     rest, total = memoryview(data)[128:], 0
     while len(rest):
         kind, content, rest = read.element(rest)
-        if kind == _COMPRESSED:
+        if kind == _Type.COMPRESSED:
             try:
                 unpacked = inflated(content, 8 * read.most, ZLIB)
             except zlib.error as error:
@@ -139,7 +185,7 @@ def _check_variables(read: _Bytes, data: bytes) -> None:
             if len(unpacked) > 8 * read.most:
                 raise InputError(read.file, "size", f"over {8 * read.most:,} bytes unpacked", "fewer")
             kind, content, _ = read.element(memoryview(unpacked))
-        if kind != _MATRIX:
+        if kind != _Type.MATRIX:
             raise read.fault(f"an element of type {kind} in place of a variable")
         total += _check_matrix(read, content, 0)
         if total > read.most:
@@ -153,44 +199,44 @@ def _check_matrix(read: _Bytes, data: memoryview, depth: int) -> int:
     if not len(data):  # an empty cell
         return 0
     kind, flags, rest = read.element(data)
-    if kind != _UINT32 or len(flags) != 8:
+    if kind != _Type.UINT32 or len(flags) != 8:
         raise read.fault("a variable without its class")
     word = struct.unpack_from(f"{read.order}I", flags)[0]
     parts = 2 if word & _COMPLEX else 1
     array = word & 0xFF
-    if array == _OPAQUE:  # an object: three names, and the bytes that only MATLAB can read
+    if array == _Class.OPAQUE:  # an object: three names, and the bytes that only MATLAB can read
         inside = 0
         while len(rest):
             kind, content, rest = read.element(rest)
-            if kind == _MATRIX:
+            if kind == _Type.MATRIX:
                 inside += _check_matrix(read, content, depth + 1)
-            elif kind not in (_INT8, _UINT8, _UTF8):
+            elif kind not in _NAMES:
                 raise read.fault("an object without a class")
         return inside
     kind, sides, rest = read.element(rest)
-    if kind not in (_INT32, _UINT32) or len(sides) % 4 or not 8 <= len(sides) <= 128:
+    if kind not in _WHOLE or len(sides) % 4 or not 8 <= len(sides) <= 128:
         raise read.fault("a variable without its size")
     shape = struct.unpack(f"{read.order}{len(sides) // 4}i", sides)
     if min(shape) < 0 or math.prod(shape) > read.most:
         raise read.fault(f"a variable of {' x '.join(map(str, shape))}")
     kind, _, rest = read.element(rest)
-    if kind not in (_INT8, _UINT8, _UTF8):
+    if kind not in _NAMES:
         raise read.fault("a variable without a name")
     count = int(math.prod(shape))
     if array in _NUMERIC:
         for _ in range(parts):
             rest = _check_numbers(read, rest, count)
-    elif array == _CHAR:
+    elif array == _Class.CHAR:
         kind, text, rest = read.element(rest)
         if kind not in _TEXT_BYTES or len(text) % _TEXT_BYTES[kind] or len(text) // _TEXT_BYTES[kind] > 4 * count:
             raise read.fault("text of the wrong type or length")
-    elif array == _SPARSE:
+    elif array == _Class.SPARSE:
         _check_sparse(read, rest, shape, parts)
-    elif array in (_CELL, _STRUCT, _OBJECT, _FUNCTION):
+    elif array in (_Class.CELL, _Class.STRUCT, _Class.OBJECT, _Class.FUNCTION):
         rest = _check_fields(read, rest, array)
         while len(rest):
             kind, content, rest = read.element(rest)
-            if kind != _MATRIX:
+            if kind != _Type.MATRIX:
                 raise read.fault(f"an element of type {kind} in place of a value")
             count += _check_matrix(read, content, depth + 1)
     else:
@@ -209,15 +255,15 @@ def _check_numbers(read: _Bytes, data: memoryview, count: int) -> memoryview:
 
 def _check_fields(read: _Bytes, data: memoryview, array: int) -> memoryview:
     """Check the class name and the field names of a structure or object; a cell has none."""
-    if array == _OBJECT:
+    if array == _Class.OBJECT:
         kind, _, data = read.element(data)
-        if kind not in (_INT8, _UINT8, _UTF8):
+        if kind not in _NAMES:
             raise read.fault("an object without a class")
-    if array in (_STRUCT, _OBJECT):
+    if array in (_Class.STRUCT, _Class.OBJECT):
         kind, length, data = read.element(data)
-        longest = struct.unpack(f"{read.order}i", length)[0] if kind in (_INT32, _UINT32) and len(length) == 4 else 0
+        longest = struct.unpack(f"{read.order}i", length)[0] if kind in _WHOLE and len(length) == 4 else 0
         kind, names, data = read.element(data)
-        if longest < 1 or kind not in (_INT8, _UINT8, _UTF8) or len(names) % longest:
+        if longest < 1 or kind not in _NAMES or len(names) % longest:
             raise read.fault("a structure without names of its fields")
     return data
 
@@ -229,7 +275,7 @@ def _check_sparse(read: _Bytes, data: memoryview, shape: tuple[int, ...], parts:
     found = []
     for _ in range(2):
         kind, content, data = read.element(data)
-        if kind not in (_INT32, _UINT32) or len(content) % 4:
+        if kind not in _WHOLE or len(content) % 4:
             raise read.fault("a sparse matrix without its indices")
         found.append(struct.unpack(f"{read.order}{len(content) // 4}i", content))
     rows, starts = found

@@ -27,8 +27,11 @@ from mitsim.sensor.png import decode_png
 
 Pattern = TypeVar("Pattern")
 
-#: largest number of images, which take a kernel that grows with them (20 s for 128), and of their pixels, 2 GB
-MOST_IMAGES, MOST_VALUES = 256, 500_000_000
+#: largest number of images: they take a kernel that grows with them (20 s for 128)
+MOST_IMAGES = 256
+
+#: largest number of pixels of all images, which take 2 GB in single precision
+MOST_VALUES = 500_000_000
 
 
 class ImageFolder(Document):

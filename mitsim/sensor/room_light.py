@@ -29,8 +29,11 @@ _WHITE = 0.85
 #: spectral range of silicon without a filter [nm]
 SILICON_NM = (400.0, 1000.0)
 
-#: band of a white LED [nm], and its luminous efficacy of radiation [lm/W]
-LED_NM, LED_LM_PER_W = (430.0, 680.0), 320.0
+#: band over which the model of a white LED emits evenly [nm]
+LED_NM = (430.0, 680.0)
+
+#: luminous efficacy of radiation of a phosphor-converted white LED [lm/W]
+LED_LM_PER_W = 320.0
 
 #: colour temperature of daylight [K]
 DAYLIGHT_K = 6500.0

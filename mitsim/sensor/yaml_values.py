@@ -17,8 +17,11 @@ import yaml
 
 from characterisation.files.errors import InputError
 
-#: deepest nesting, and most values in all documents together
-DEEPEST, MOST_VALUES = 64, 2_000_000
+#: deepest nesting of values, far under the depth of Python's recursion; chosen
+DEEPEST = 64
+
+#: largest number of values in all documents together, which bounds memory and time; chosen
+MOST_VALUES = 2_000_000
 
 _FIRST_LINE = re.compile(r"^%.*$", re.MULTILINE)
 _WHOLE = re.compile(r"[-+]?[0-9]{1,18}")

@@ -29,7 +29,12 @@ from mitsim.study.statement_file import PartialDocument, StatementDocument, read
 
 _MADE_BY = "a folder made by mitsim run"
 
-_BY_VIEW, _BY_FEATURE, _VIEW = ("measurement", "view"), ("view", "feature"), ("view",)
+#: dimensions of the variables of each measurement and view
+_BY_VIEW = ("measurement", "view")
+#: dimensions of the variables of each view and feature
+_BY_FEATURE = ("view", "feature")
+#: dimension of the variables of each view
+_VIEW = ("view",)
 _ALL = {"measurement": Variable(("measurement",), "text"), "view": Variable(_VIEW, "whole", 0, 1e9)}
 
 _SCORES = Schema(

@@ -35,8 +35,11 @@ from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform, is_rotation
 from mitsim.study.statement_file import PartialDocument
 
-#: largest difference between the sensor's pose and that of a statement [mm], [deg]
-SAME_PLACE_MM, SAME_ANGLE_DEG = 10.0, 2.0
+#: largest distance between the sensor's place and that of a statement [mm]; chosen
+SAME_PLACE_MM = 10.0
+
+#: largest rotation between the two poses [deg]; chosen
+SAME_ANGLE_DEG = 2.0
 
 
 def label(cloud: PointCloud, scene: Scene, sensor: Sensor, pose: Transform | ArrayLike) -> PointCloud:

@@ -11,17 +11,29 @@ from dataclasses import dataclass
 
 from mitsim.running.time_limit import TimeLimit
 
-#: expected time of screening [s] for each view; largest share of the whole that is planned for it
-SCREENING_S, _SCREENING_SHARE = 0.2, 0.3
+#: expected time of screening for each view [s]; chosen
+SCREENING_S = 0.2
+
+#: largest share of the whole that is planned for it; chosen
+_SCREENING_SHARE = 0.3
 
 #: share of the time that is left after which screening ends with the views that it has scored
 _LONGEST_SCREENING = 0.4
 
-#: share of the whole for pictures and report, with its bounds [s]
-_REPORT_SHARE, _REPORT_S = 0.15, (5.0, 40.0)
+#: share of the whole for pictures and report; chosen
+_REPORT_SHARE = 0.15
 
-#: processor time of clouds and page without pictures [s]; largest factor of a busy machine, and share of what is left
-_PAGE_S, _BUSIEST, _PAGE_SHARE = 6.0, 6.0, 0.4
+#: bounds of this time [s]; chosen
+_REPORT_S = (5.0, 40.0)
+
+#: processor time of clouds and page without pictures [s]
+_PAGE_S = 6.0
+
+#: largest factor by which a busy machine prolongs it; chosen
+_BUSIEST = 6.0
+
+#: largest share of what is left that is kept for it; chosen
+_PAGE_SHARE = 0.4
 
 #: largest share of the time after the race that is kept for pictures and report, on a machine slower than planned
 _LARGEST_REPORT_SHARE = 0.4

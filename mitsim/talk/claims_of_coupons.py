@@ -22,8 +22,11 @@ from mitsim.talk.results import Results
 from mitsim.talk.slides import Claim, Slide, collected, largest_of, mean_of, verdict
 from mitsim.talk.talk_file import Talk
 
-#: normals of the region of self-blinding: within this angle of the mirror direction [deg]; ring beside it
-_BLIND_DEG, _RING_DEG = 8.0, (20.0, 35.0)
+#: angle around the mirror direction within which normals are in the region of self-blinding [deg]; chosen
+_BLIND_DEG = 8.0
+
+#: angles of the ring beside it [deg]; chosen
+_RING_DEG = (20.0, 35.0)
 
 #: angle around the mirror direction, and incidence from which F falls, where more detail is required [deg]
 _DETAIL_DEG = (20.0, 50.0)

@@ -19,11 +19,17 @@ from mitsim.talk.results import Results
 from mitsim.talk.slides import Claim, Slide, collected, largest_of, mean_of, verdict
 from mitsim.talk.talk_file import ExampleEntry, Talk
 
-#: mean rank correlation of bins from which agreement is very good, and good
-_VERY_GOOD, _GOOD = -0.8, -0.5
+#: mean rank correlation of bins down to which agreement is very good; chosen
+_VERY_GOOD = -0.8
 
-#: R_m below which a view lacks a feature, and S_m of such a view, over the largest, from which it misleads
-_HIDDEN, _BIASED = 0.1, 0.25
+#: mean rank correlation of bins down to which agreement is good; chosen
+_GOOD = -0.5
+
+#: R_m below which a view lacks a feature; chosen
+_HIDDEN = 0.1
+
+#: S_m of such a view, over the largest, above which it misleads; chosen
+_BIASED = 0.25
 
 #: number of bins at each end that are called bad and good views
 _END = 3

@@ -40,8 +40,14 @@ _DRAWN = ("row", "column", "semi_major", "semi_minor", "recovered_fraction", "in
 #: largest number of patches of a campaign that are kept for drawing
 _MOST_PATCHES = 4000
 
-#: steps of residuals that are kept [mm], the number that stands for no point, and the largest side of a picture [px]
-STEP_MM, NO_POINT, _SIDE_PX = 0.02, -32768, 300
+#: step of residuals that are kept [mm]; chosen
+STEP_MM = 0.02
+
+#: number of steps that stands for no point: the least of 16 bits, while residuals are clipped to 30,000 steps
+NO_POINT = -32768
+
+#: largest side of a picture of residuals [px]; chosen
+_SIDE_PX = 300
 
 #: largest incidence of poses of the validation [deg]
 _LARGEST_DEG = 70.0

@@ -19,14 +19,20 @@ from characterisation.files.arrays import Floats
 from mitsim.maps.data_sheet import Residuals, SheetPiece, measure_piece
 from mitsim.talk.talk_file import sensor_in
 
-#: bins of the histogram, over this many standard deviations
-_BINS, _REACH = 61, 4.5
+#: bins of the histogram: an odd number, so that one lies about 0; chosen
+_BINS = 61
+
+#: ends of the histogram, in standard deviations; chosen
+_REACH = 4.5
 
 #: largest side of the picture of residuals [px]
 _SIDE_PX = 150
 
-#: steps of the expectation maximisation, and points it uses at most
-_STEPS, _MOST_POINTS = 200, 40_000
+#: steps of the expectation maximisation; chosen
+_STEPS = 200
+
+#: about the largest number of points that it uses, which bounds its time; chosen
+_MOST_POINTS = 40_000
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,14 @@ from mitsim.scene.ray_casting.triangles import hull_corners
 from mitsim.sensor.poses import look_at
 from mitsim.talk.talk_file import sensor_in
 
-#: size of a frame [px], and the largest number of frames
-WIDTH_PX, HEIGHT_PX, MOST_FRAMES = 280, 210, 5
+#: width of a frame [px]
+WIDTH_PX = 280
+
+#: height of a frame [px]
+HEIGHT_PX = 210
+
+#: largest number of frames
+MOST_FRAMES = 5
 
 #: brightness of a frame that is shown, over that of the brightest
 _LIT = 0.1

@@ -37,8 +37,11 @@ COLOURS: dict[Verdict, str] = {
     "missing": "#6a7079",
 }
 
-#: resolution of the pictures, and their number of colours
-_DPI, _COLOURS = 120, 160
+#: resolution of the pictures [1/in]
+_DPI = 120
+
+#: number of colours of the pictures, which keeps their files small; chosen
+_COLOURS = 160
 
 #: resolution at which the page shows them [1/in]
 _SHOWN_DPI = 92

@@ -52,8 +52,11 @@ _PICTURED = (50.0, -70.0)
 #: views in which direct light alone is compared with all light
 _COMPARED_VIEWS = 6
 
-#: tilt of the coupon whose clouds are compared, and of the one whose sub-clouds are drawn [deg]
-_CLOUDS_TILT_DEG, _SUB_CLOUDS_TILT_DEG = 6.0, 50.0
+#: tilt of the coupon whose clouds are compared [deg]; chosen
+_CLOUDS_TILT_DEG = 6.0
+
+#: tilt of the coupon whose sub-clouds are drawn [deg]; chosen
+_SUB_CLOUDS_TILT_DEG = 50.0
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,10 @@
 """Public functions of four or more arguments document each argument, and sections See Also name what exists.
 
-griffe reads signatures and numpydoc sections from the source, as it does for the site.
+Constants of modules and classes stand on a line each, so that each has a comment of its own. griffe reads signatures
+and numpydoc sections from the source, as it does for the site.
 """
 
+import ast
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -110,3 +112,37 @@ def test_faults_are_found(signature, documented, expected):
     module = griffe.visit("example", Path("example.py"), f'def one({signature}):\n    """{docstring}"""\n')
     one = module["one"]
     assert fault(arguments(one), names_of(one).get("Parameters")) == expected
+
+
+def packed_constants(source: str) -> list[str]:
+    """Return the assignments of a module and its classes that give several names their values at once."""
+    bodies = [one.body for one in ast.walk(ast.parse(source)) if isinstance(one, ast.Module | ast.ClassDef)]
+    assignments = [one for body in bodies for one in body if isinstance(one, ast.Assign)]
+    return [
+        ast.unparse(one)
+        for one in assignments
+        if len(one.targets) > 1 or (isinstance(one.targets[0], ast.Tuple) and isinstance(one.value, ast.Tuple))
+    ]
+
+
+def test_each_constant_has_a_line_of_its_own():
+    files = [path for package in ("mitsim", "characterisation") for path in (ROOT / package).rglob("*.py")]
+    assert len(files) > 500
+    found = {str(path.relative_to(ROOT)): packed_constants(path.read_text(encoding="utf-8")) for path in files}
+    faults = [f"{path}: {line}" for path, lines in found.items() for line in lines]
+    assert not faults, "one constant a line, each below a comment:\n" + "\n".join(faults)
+
+
+@pytest.mark.parametrize(
+    ("source", "count"),
+    [
+        ("_STEPS, _MOST = 12, 5", 1),
+        ("class A:\n    low, high = 0, 1", 1),
+        ("low = high = 0", 1),
+        ("_ENDS = 0, 1", 0),
+        ("_NODES, _WEIGHTS = quadrature(96)", 0),
+        ("def f():\n    low, high = 0, 1", 0),
+    ],
+)
+def test_packed_constants_are_found(source, count):
+    assert len(packed_constants(source)) == count

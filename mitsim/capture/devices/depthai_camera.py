@@ -29,8 +29,8 @@ from mitsim.capture.devices.device_error import DeviceError, check_open
 
 Image = NDArray[np.unsignedinteger[Any]]
 
-#: outputs of the matcher's node that are used
-_IMAGES, _DISPARITY = {"left": "syncedLeft", "right": "syncedRight"}, "disparity"
+#: outputs of the matcher's node that hold the images, by camera
+_IMAGES = {"left": "syncedLeft", "right": "syncedRight"}
 
 
 @dataclass(frozen=True)

@@ -36,8 +36,11 @@ Images = NDArray[np.unsignedinteger[Any]]
 #: accepted relative difference of a number that is read back from the value set; assumed
 READ_BACK_SHARE = 0.02
 
-#: disparities are in sixteenths of a pixel; the second is a missing one (NxLib, node DisparityMap)
-DISPARITY_SCALE, NO_DISPARITY = 16.0, -32768
+#: disparities are in sixteenths of a pixel (NxLib, node DisparityMap)
+DISPARITY_SCALE = 16.0
+
+#: disparity of a pixel without one (NxLib, node DisparityMap)
+NO_DISPARITY = -32768
 
 _UNLINKED = {"Target": "", "Rotation": None, "Translation": None}
 

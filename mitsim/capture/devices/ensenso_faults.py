@@ -8,12 +8,19 @@ their names; none was observed on a device.
 from __future__ import annotations
 
 from contextlib import suppress
+from enum import IntEnum
 from typing import Any, NamedTuple
 
 from mitsim.capture.devices.device_error import DeviceError
 
-#: error codes of nxlib.constants
-_INEXISTENT, _TIMEOUT, _NOT_CONNECTED, _EXECUTION_FAILED = 3, 8, 9, 17
+
+class _Code(IntEnum):
+    """Error codes of nxlib.constants."""
+
+    INEXISTENT = 3
+    TIMEOUT = 8
+    NOT_CONNECTED = 9
+    EXECUTION_FAILED = 17
 
 
 class _Words(NamedTuple):
@@ -61,7 +68,7 @@ _SYMBOLS = {
     "DeviceCaptureFailed": _BROKEN,
 }
 
-_CODES = {_INEXISTENT: _GONE, _TIMEOUT: _LATE, _NOT_CONNECTED: _GONE}
+_CODES = {_Code.INEXISTENT: _GONE, _Code.TIMEOUT: _LATE, _Code.NOT_CONNECTED: _GONE}
 
 
 def no_library(where: str, error: Exception) -> DeviceError:
@@ -93,7 +100,7 @@ def fault_of(error: BaseException, nxlib: Any, where: str, what: str, known: lis
         Serial numbers of the cameras that NxLib lists.
     """
     if isinstance(error, nxlib.NxLibException):
-        words, detail = _command_words(error, what) if error.get_error_code() == _EXECUTION_FAILED else (None, "")
+        words, detail = _command_words(error, what) if error.get_error_code() == _Code.EXECUTION_FAILED else (None, "")
         words = words or _CODES.get(error.get_error_code())
         detail = detail or f"{error.get_error_text()} at {error.get_item_path()}"
         if words is None:

@@ -52,7 +52,14 @@ REPORTS_FOR_OFFSET = 32
 #: time for which a restarting board is silent [s]; assumed
 BOOT_S = 0.5
 
-_RESET, _JOG_CANCEL, _STATUS = b"\x18", b"\x85", b"?"
+#: real-time command of GRBL that stops all motion and restarts the controller
+_RESET = b"\x18"
+
+#: real-time command that cancels a jog; the position stays known
+_JOG_CANCEL = b"\x85"
+
+#: real-time command that asks for a status report
+_STATUS = b"?"
 _REFUSED = "Correct the setting with a terminal; the board stores it"
 
 

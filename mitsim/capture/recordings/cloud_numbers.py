@@ -28,8 +28,11 @@ NEITHER_ABOVE = 20_000.0
 #: coordinates beyond this are not measurements [mm]
 FARTHEST_MM = 1e6
 
-#: a point that is repeated this often, and in this share of the points, marks missing ones; noise repeats none
-_LEAST_REPEATS, _LEAST_SHARE = 10, 0.005
+#: least number of times that a point repeats if it marks missing ones: noise repeats none; chosen
+_LEAST_REPEATS = 10
+
+#: least share of the points that are this one; chosen
+_LEAST_SHARE = 0.005
 
 #: most points of which a repeated one is looked for
 _SAMPLE = 4000

@@ -28,8 +28,11 @@ from mitsim.sensor.png import LONGEST_SIDE_PX
 
 Depth = NDArray[np.float32]
 
-#: share of the pixels with one largest depth, and its ratio to the median of the others, from which it means no depth
-_MARKED, _FAR_BEYOND = 0.01, 10.0
+#: share of the pixels with one largest depth from which it may mean no depth; chosen
+_MARKED = 0.01
+
+#: ratio of this depth to the median of the others from which it does; chosen
+_FAR_BEYOND = 10.0
 
 
 def read_depth_image(

@@ -30,8 +30,11 @@ from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.png import LONGEST_SIDE_PX
 from mitsim.sensor.transforms import Transform
 
-#: values of DepthAI's cameraType
-_FISHEYE, _PERSPECTIVE = 1, 0
+#: value of DepthAI's cameraType for a fisheye lens
+_FISHEYE = 1
+
+#: value of DepthAI's cameraType for a perspective lens
+_PERSPECTIVE = 0
 
 _CM = 10.0
 

@@ -20,8 +20,11 @@ from characterisation.files.errors import InputError
 #: first and last bytes of an MCAP file (mcap.dev/spec)
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 
-#: first bytes of a ROS 1 bag and of an SQLite file, such as a ROS 2 bag
-BAG_MAGIC, SQLITE_MAGIC = b"#ROSBAG V", b"SQLite format 3\0"
+#: first bytes of a ROS 1 bag
+BAG_MAGIC = b"#ROSBAG V"
+
+#: first bytes of an SQLite file, such as a ROS 2 bag
+SQLITE_MAGIC = b"SQLite format 3\0"
 
 #: largest number of files in one recording
 MOST_FILES = 10_000

@@ -34,8 +34,11 @@ from mitsim.sensor.transforms import Transform
 #: required keys of a camera file
 _CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
 
-#: percentiles of the device's depth, and the relative margin of the search range beyond them
-_PERCENTILES, _WIDER = (1.0, 99.0), 0.15
+#: percentiles of the device's depth that bound the search range, against false matches; chosen
+_PERCENTILES = (1.0, 99.0)
+
+#: margin of the search range beyond them, as a share of each; chosen
+_WIDER = 0.15
 
 #: tolerance on the orthogonality of a rotation stored with few digits
 _RIGID = 1e-3

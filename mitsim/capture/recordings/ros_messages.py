@@ -23,8 +23,19 @@ from mitsim.capture.grey_image import decode_grey
 from mitsim.capture.recordings.ros_bag import RosBag, Topic
 from mitsim.sensor.png import LONGEST_SIDE_PX
 
-IMAGE, PACKED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-CLOUD, CAMERA_INFO, FLOAT = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/CameraInfo", "std_msgs/msg/Float32"
+#: type of the messages that hold an image without compression
+IMAGE = "sensor_msgs/msg/Image"
+
+#: type of the messages that hold a PNG or JPEG image
+PACKED_IMAGE = "sensor_msgs/msg/CompressedImage"
+#: type of the messages that hold a point cloud
+CLOUD = "sensor_msgs/msg/PointCloud2"
+
+#: type of the messages that hold the calibration of a camera
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+
+#: type of the messages in which RealSense's viewer states the unit of depths
+FLOAT = "std_msgs/msg/Float32"
 
 #: encodings of depths (librealsense writes ``mono16``), and their unit [mm]
 DEPTHS = {"16UC1": 1.0, "mono16": 1.0, "32FC1": 1000.0}

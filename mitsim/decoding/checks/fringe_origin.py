@@ -25,25 +25,35 @@ from mitsim.sensor.image_role import Axis, Origin, Role, Wave, offset_in_pixels,
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, LightCode
 
-#: least number of edges, and least share of the changes of a stripe's number that are by one: along a surface one bit
-#: changes at a time, and of bits in another order or exchanged with complements at most two thirds of the changes are
-_ENOUGH, _BY_ONE = 30, 0.75
+#: least number of edges; chosen
+_ENOUGH = 30
 
-#: largest deviation of a phase at the edges [cycles]: half of the quarter turn between sine and cosine; and least
-#: length of the mean of unit vectors of the deviations, below which the period itself is doubtful
-_EIGHTH, _CONCENTRATED = 0.125, 0.6
+#: least share of the changes of a stripe's number that are by one: along a surface one bit changes at a time, and of
+#: bits in another order or exchanged with complements at most two thirds of the changes are
+_BY_ONE = 0.75
 
-#: an origin is half a pixel off if it is so within this margin, with this standard error or a smaller one [px]: the
-#: error separates half a pixel from none by five standard deviations
-_HALF_PIXEL_MARGIN, _HALF_PIXEL_ERROR = 0.2, 0.1
+#: largest deviation of a phase at the edges [cycles]: half of the quarter turn between sine and cosine
+_EIGHTH = 0.125
+
+#: least length of the mean of unit vectors of the deviations, below which the period itself is doubtful; chosen
+_CONCENTRATED = 0.6
+
+#: an origin is half a pixel off if it is so within this margin [px]; chosen
+_HALF_PIXEL_MARGIN = 0.2
+
+#: largest standard error of such an origin [px]: it separates half a pixel from none by five standard deviations
+_HALF_PIXEL_ERROR = 0.1
 
 #: deviation from every usual origin that is reported [px], in addition to five standard errors and the effect of gamma:
 #: half a pixel, which the description of the fringes may be off, and half of that
 _UNUSUAL = 0.75
 
 #: deviation of a period from the one that the Gray code measures, relative to it, that is reported, in addition to five
-#: standard errors; and the ratio of the two above which the phases do not follow the Gray code at all
-_OTHER_PERIOD, _FOLLOWED = 0.02, 5.0
+#: standard errors; chosen
+_OTHER_PERIOD = 0.02
+
+#: ratio of the two periods above which the phases do not follow the Gray code at all; chosen
+_FOLLOWED = 5.0
 
 #: largest gamma of a projector, that of the recording kamino_phaseshift rounded up
 _GAMMA = 2.6

@@ -28,8 +28,11 @@ _CONTRADICTION = 0.04
 #: least number of pixels
 _ENOUGH = 200
 
-#: divisions of the circle of phases, and the least number of pixels in each, over the mean
-_PHASES, _LEAST_OF_PHASE = 24, 0.25
+#: divisions of the circle of phases; chosen
+_PHASES = 24
+
+#: least number of pixels in each, over the mean: harmonics are told from the model over all phases only; chosen
+_LEAST_OF_PHASE = 0.25
 
 
 def copies_in_words(lines: CodeLines, axis: Axis) -> str:

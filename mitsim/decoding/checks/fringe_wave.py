@@ -31,11 +31,17 @@ from mitsim.sensor.light_code import GrayCode, LightCode, roles
 #: pixels on either side of a jump that have to be smooth
 _SIDE = 3
 
-#: a jump by this share of the projector is one; and the share of the lines with a jump above which the wave is doubtful
-_WHOLE, _MANY = 0.7, 0.2
+#: least jump of a coordinate that counts, as a share of the projector's extent; chosen
+_WHOLE = 0.7
 
-#: largest share of contradictions with a wave that fits, and the least improvement by it
-_CONTRADICTED, _BETTER = 0.1, 0.3
+#: share of the lines with a jump above which the wave is doubtful; chosen
+_MANY = 0.2
+
+#: largest share of contradictions with a wave that fits; chosen
+_CONTRADICTED = 0.1
+
+#: least improvement of this share by another wave; chosen
+_BETTER = 0.3
 
 #: division of the allowed contradiction of phases, to choose between waves that fit
 _STRICTER = 3.0

@@ -42,13 +42,22 @@ Origins = dict[Axis, Offset]
 #: approximate number of pixels evaluated along either side of the image
 _COARSE = 160
 
-#: An origin fits better than the stated one if it leaves at most this share of the pixels that the latter leaves
-#: unexplained, or explains many more; the least difference of the shares that counts.
-_FRACTION, _MANY, _LEAST = 0.25, 0.5, 0.02
+#: an origin fits better than the stated one if it leaves at most this share of the pixels that the latter leaves
+#: unexplained; chosen
+_FRACTION = 0.25
 
-#: An offset is measured if the median miss [projector px] is at least this, and if the offset is whole to this [px]
-#: and leaves no larger median of the unsigned miss, beside that of a uniform error over a stripe; assumed.
-_LEAST_MISS_PX, _WHOLE_PX = 0.7, 0.2
+#: an origin also fits better if it explains more of the lit pixels by this share; chosen
+_MANY = 0.5
+
+#: least share of pixels that counts, of a difference and of decoded pixels; chosen
+_LEAST = 0.02
+
+#: an offset is measured if the median miss [projector px] is at least this; assumed
+_LEAST_MISS_PX = 0.7
+
+#: largest distance of a measured offset from a whole one [px], and largest excess of the median unsigned miss that it
+#: leaves over that of a uniform error over a stripe; assumed
+_WHOLE_PX = 0.2
 
 #: least share of the lit pixels that an origin explains to be believed
 _EXPLAINED = 0.3

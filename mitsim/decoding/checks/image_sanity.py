@@ -35,20 +35,26 @@ Floats = NDArray[np.float32]
 #: number of successive changes of a coordinate in one sum
 _CHANGES = 12
 
-#: Evenness (ratio of sums, median) below which coordinates are not smooth, and above which another order of the images
-#: is accepted, after subtracting its share of contradictions. It is 0.99 and more for the recordings kamino_procam,
-#: kamino_phaseshift and binocular_gray, and 0.16 to 0.52 with their images in a wrong order.
-SMOOTH, BELIEVED = 0.5, 0.5
+#: Evenness (ratio of sums, median) below which coordinates are not smooth; less its share of contradictions, that of
+#: another order of the images must exceed it. It is 0.99 and more for the recordings kamino_procam, kamino_phaseshift
+#: and binocular_gray, and 0.16 to 0.52 with their images in a wrong order.
+SMOOTH = 0.5
 
-#: Evenness below which other orders are tried, and the improvement required to report one. Bits exchanged with their
-#: complements leave a coordinate that rises and falls over long stretches, with an evenness of 0.2 to 0.6.
-_ASKED, _BETTER = 0.85, 0.25
+#: Evenness below which other orders are tried. Bits exchanged with their complements leave a coordinate that rises and
+#: falls over long stretches, with an evenness of 0.2 to 0.6.
+_ASKED = 0.85
+
+#: improvement of the evenness that another order must bring to be reported; chosen
+_BETTER = 0.25
 
 #: share of the lit pixels with contradictory bits or phases above which the order is doubtful
 CONTRADICTED = 0.5
 
-#: excess of an image over white, or below black, relative to the step from black to white; and the share of such pixels
-_BEYOND, _MANY = 0.2, 0.1
+#: least excess of an image over white, or below black, relative to the step from black to white; chosen
+_BEYOND = 0.2
+
+#: share of the lit pixels with this excess above which it is reported; chosen
+_MANY = 0.1
 
 #: share of the lit pixels with white darker than black above which the two are exchanged
 _EXCHANGED = 0.85
@@ -98,7 +104,7 @@ def image_warnings(images: CodedImages, camera: str, decoded: Mapping[Axis, Proj
         if warning and camera not in warning:
             warning = f"{camera}: {warning}"
         if not warning and (own.doubtful or own.evenness < _ASKED):
-            least = BELIEVED if own.doubtful else own.evenness - own.contradicted + _BETTER
+            least = SMOOTH if own.doubtful else own.evenness - own.contradicted + _BETTER
             orders: Iterable[tuple[str, list[int]]] = _other_orders(image_roles, axis)
             if edges is not None and edges.bits_fit:
                 orders = _with_bits_in_place(orders, image_roles, axis)

@@ -39,8 +39,11 @@ _MOVED = 6.0
 #: half the distances [px] over which the slope of the projector rows is measured, until they span two stripes
 _SLOPE_ROWS = (2.0, 4.0, 8.0, 16.0, 32.0)
 
-#: parts of an image along either side for averaging rows, and least number of pixels of a mean
-_PARTS, _ENOUGH = 6, 30
+#: parts of an image along either side, over each of which rows are averaged; chosen
+_PARTS = 6
+
+#: least number of pixels of a mean; chosen
+_ENOUGH = 30
 
 
 @dataclass(frozen=True)

@@ -34,15 +34,20 @@ _PATCH = 40
 #: least share of the pixels of a patch that have a disparity
 _MATCHED = 0.5
 
-#: least number of patches, and largest number for a decoded cloud
-_LEAST, _MOST = 8, 80
+#: least number of patches for a row error; chosen
+_LEAST = 8
+
+#: about the largest number of patches of an image that are measured, which bounds the time; chosen
+_MOST = 80
 
 #: allowed variation of the row error over the image [px]
 LARGEST_SPREAD = 0.5
 
-#: largest standard error of the median of patches [px], and the share of the median that is added to it: a rotated
-#: camera has an uneven row error
-_OF_ALL, _UNEVEN = 0.06, 0.05
+#: largest standard error of the median of patches [px]; chosen
+_OF_ALL = 0.06
+
+#: share of the median that is added to it: a rotated camera has an uneven row error; chosen
+_UNEVEN = 0.05
 
 
 def uniform_light_mean(stack: Levels, image_roles: Sequence[Role], full_scale: float) -> Floats:

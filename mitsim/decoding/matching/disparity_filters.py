@@ -14,8 +14,11 @@ from mitsim.decoding.matching.evidence import nearest_value
 
 Disparities = NDArray[np.float32]
 
-#: steps of a disparity in which regions are compared, and the integer of a pixel without one
-_STEPS_PER_PX, _NONE = 16, np.iinfo(np.int16).min
+#: steps of a disparity in which regions are compared [1/px]: those of OpenCV's matchers
+_STEPS_PER_PX = 16
+
+#: integer of a pixel without a disparity: known ones are clipped to stay above it
+_NONE = np.iinfo(np.int16).min
 
 
 def without_speckles(disparity: Disparities, most_px: int, range_px: float) -> Disparities:

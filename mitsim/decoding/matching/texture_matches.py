@@ -30,8 +30,14 @@ _RATIO = 0.8
 #: largest difference of the columns of one point, as a share of all columns that are seen
 _SAME_COLUMN = 0.02
 
-#: largest deviation of an offset from a plane over the image, as a share of the rows; least share and number of pairs
-_SMOOTH, _LEAST_SHARE, LEAST_PAIRS = 0.03, 0.6, 12
+#: largest deviation of an offset from a plane over the image, as a share of the rows; chosen
+_SMOOTH = 0.03
+
+#: least share of the pairs that follow this plane; chosen
+_LEAST_SHARE = 0.6
+
+#: least number of pairs; chosen
+LEAST_PAIRS = 12
 
 
 def texture_matches(textures: tuple[Floats, Floats], columns: tuple[Floats, Floats]) -> tuple[Floats, Floats]:

@@ -41,8 +41,11 @@ TARGET_ERROR_PX = 1e-5
 #: largest permitted error of an iterated depth [projector px]: a tenth of the noise of a good phase
 MAXIMUM_ERROR_PX = 1e-3
 
-#: numbers of points of the polynomial, in the order of trial; number if the polynomial is only a start
-_POINT_COUNTS, _START_COUNT = (6, 8, 10, 13, 16), 10
+#: numbers of points of the polynomial, in the order of trial, until one reaches the intended error; chosen
+_POINT_COUNTS = (6, 8, 10, 13, 16)
+
+#: number of points of a polynomial that is only the start of an iteration; chosen
+_START_COUNT = 10
 
 #: largest number of iterations of an exact depth
 _ITERATIONS = 12

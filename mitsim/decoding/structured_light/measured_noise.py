@@ -33,8 +33,11 @@ from mitsim.sensor.image_role import Axis, Role
 #: harmonic has thousands of pixels for each of its coefficients
 _SAMPLED_PIXELS = 50_000
 
-#: least number of pixels for a result, and of pixels of one level
-_MINIMUM_PIXELS, _PIXELS_PER_LEVEL = 2000, 500
+#: least number of pixels for a result; chosen
+_MINIMUM_PIXELS = 2000
+
+#: least number of pixels of one level; chosen
+_PIXELS_PER_LEVEL = 500
 
 #: highest harmonic of a fringe that is subtracted
 _HARMONICS = 8
@@ -45,9 +48,12 @@ _MAD_TO_STD = 1.4826
 #: least modulation of the pixels that are used [1/255 of full scale]
 _MINIMUM_MODULATION = 8.0
 
-#: share of the squares, the smallest ones, whose mean is used; and this mean for a normal distribution of variance 1. A
-#: median would depend on single grey levels where the noise is below one
-_KEPT_SHARE, _KEPT_VARIANCE = 0.9, 0.6230
+#: share of the squares, the smallest ones, whose mean is used; chosen. A median would depend on single grey levels
+#: where the noise is below one
+_KEPT_SHARE = 0.9
+
+#: mean of this share of the squares of a normal distribution of variance 1
+_KEPT_VARIANCE = 0.6230
 
 
 def measured_noise(

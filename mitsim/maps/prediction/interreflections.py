@@ -73,8 +73,11 @@ PHOTONS = 130_000
 TOGETHER = 16
 
 #: points along an edge of the box around a scene whose images limit the region that is rendered, since a distortion
-#: bends the edges; and pixels of the coarse camera that are rendered around it
-_BOX_POINTS, _AROUND_PX = 5, 2
+#: bends the edges; chosen
+_BOX_POINTS = 5
+
+#: pixels of the coarse camera that are rendered around this region; chosen
+_AROUND_PX = 2
 
 #: standard deviation of the window that averages rho, in pixels of the sensor
 SMOOTHED_PX = 3.0

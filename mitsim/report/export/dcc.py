@@ -23,7 +23,11 @@ from mitsim.report.declaration import Declaration
 from mitsim.report.export.results import ExpectedResult, RunResults
 from mitsim.running.version import __version__
 
-DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"
+#: XML namespace of digital calibration certificates
+DCC = "https://ptb.de/dcc"
+
+#: XML namespace of D-SI, for numbers with units
+SI = "https://ptb.de/si"
 
 _SCHEMA = f"{DCC} https://ptb.de/dcc/v3.2.1/dcc.xsd"
 _XSI = "http://www.w3.org/2001/XMLSchema-instance"

@@ -25,7 +25,11 @@ from mitsim.report.export.run_scene import quaternion
 from mitsim.running.version import __version__
 from mitsim.sensor.transforms import Transform
 
-PREFIX, NAMESPACE = "mitsim", "https://mitsim.invalid/e57/1.0"
+#: prefix of the fields that E57 does not define
+PREFIX = "mitsim"
+
+#: XML namespace of these fields: a name, not an address (RFC 2606 reserves .invalid)
+NAMESPACE = "https://mitsim.invalid/e57/1.0"
 
 
 def write_e57(scans: Sequence[tuple[str, CloudPoints, Transform | None]], path: str | Path) -> None:

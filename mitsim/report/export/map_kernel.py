@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 
 _MARGIN = 0.5 / 113  # keeps the probits of F = 0 and 1 finite
-_AT_KNOT, _ROUNDED = 1e-7, 3e-6
+_AT_KNOT = 1e-7  # place between two knots that counts as the knot, which needs no value of the other
+_ROUNDED = 3e-6  # F this near 0 or 1 is rounded to it; chosen
 _Z = np.arange(-4.0, 4.0005, 0.001)  # probits of the map lie within -2.7 and 2.7
 _PHI = np.array([0.5 * math.erfc(-z / math.sqrt(2)) for z in _Z])  # the normal distribution function
 

@@ -38,8 +38,11 @@ _HOLE = 0.5
 #: share of slivers without area above which they are reported; a fine mesh of a curved face has a few
 _SLIVERS = 0.01
 
-#: edges closer than this share of the part's size close one another; number of neighbours searched
-_CLOSED, _NEIGHBOURS = 1e-4, 16
+#: edges closer than this share of the part's size close one another; chosen
+_CLOSED = 1e-4
+
+#: number of neighbours of an edge among which the closing one is searched; chosen
+_NEIGHBOURS = 16
 
 #: spacing of single-precision lengths at the part above which it is reported [mm]; noise of sensors is 10 um and more
 _ROUNDED_MM = 1e-3

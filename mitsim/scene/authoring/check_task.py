@@ -25,14 +25,20 @@ from mitsim.scene.authoring.finding import SceneFinding, Severity
 from mitsim.scene.inspect import SceneFacts, ShapeFacts, shape_facts
 from mitsim.scene.load import Scene
 
-#: largest distance of nominal geometry from the shape's surface [mm]; beyond the second it is an error
-NOMINAL_MM, MISTAKE_MM = 0.05, 1.0
+#: distance of nominal geometry from the shape's surface above which it is reported [mm]; chosen
+NOMINAL_MM = 0.05
+
+#: distance above which it is an error [mm]; chosen
+MISTAKE_MM = 1.0
 
 #: share of a circle that lies on the edge of its face; the end of a slot is half a circle
 _ON_EDGE = 0.25
 
-#: an outline is this much shorter or longer than its feature at most; that of a disc has corners on its rim
-_SHORTER, _LONGER = 0.5, 1.1
+#: least width of an outline over that of its feature; chosen
+_SHORTER = 0.5
+
+#: largest width of an outline over that of its feature: the corners of a disc's lie on its rim; chosen
+_LONGER = 1.1
 
 
 class TaskFeatures(Document):

@@ -47,8 +47,11 @@ _NO_NAME = re.compile(r"(none|null|unnamed|advanced_?face|face|surface|shape|bod
 #: ids of finishes in a scene (:func:`~mitsim.scene.authoring.part_folder.finish_names`)
 _FINISH = re.compile(r"finish(_[0-9a-f]{6}|_none)?", re.IGNORECASE)
 
-#: longest name from a CAD file [bytes], and longest name of an assembly's part before it
-_LONGEST, _LONGEST_PART = 60, 30
+#: longest name from a CAD file [bytes]: it becomes part of a file's name; chosen
+_LONGEST = 60
+
+#: longest name of an assembly's part before it [bytes]; chosen
+_LONGEST_PART = 30
 
 #: lengths and angles are rounded after noise below this many decimal places is removed: 9.525 mm is written in inches,
 #: too

@@ -36,9 +36,10 @@ from mitsim.scene.authoring.segment_mesh import components
 from mitsim.scene.authoring.units import step_units, unit_assumed, unit_words
 from mitsim.sensor.calibration_qualifiers import LENGTHS_MM
 
-#: default mesh of STEP without a sensor: distance from the true surface [mm], and angle between facets [rad]. The angle
-#: only keeps small round faces round, since the normals are exact
-CHORD_MM, BEND = 0.01, 0.2
+#: distance of the default mesh from the true surface, without a sensor [mm]; chosen
+CHORD_MM = 0.01
+#: angle between its facets [rad]; it only keeps small round faces round, since the normals are exact
+BEND = 0.2
 
 #: seconds between lines of progress
 _LINE_EVERY_S = 5.0

@@ -22,8 +22,11 @@ MEASURED = ("plane", "cylinder", "cone", "sphere")
 #: triangles that are made between two lines of progress
 _STEP = 50_000
 
-#: the first mesh, which counts triangles, is coarser by this factor, and its facets bend by up to this angle [rad]
-_COARSER, _FLAT = 16.0, 1.0
+#: factor by which the first mesh, which counts triangles, is coarser; chosen
+_COARSER = 16.0
+
+#: largest angle between its facets [rad]: only the chord limits them; chosen
+_FLAT = 1.0
 
 
 def mesh_together(faces: list[Any], chord: float, bend: float, delabella: bool = True) -> None:

@@ -22,9 +22,12 @@ from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN, Distribution, fres
 #: incidence at which the compensation is exact [rad]
 NOMINAL_INCIDENCE = float(np.radians(30))
 
-#: facets of the quadrature: radii and azimuths of their slopes, and azimuths of the light for an elongated lobe. The
-#: error of the coarser one is 1e-4
-_COUNTS, _ELONGATED_COUNTS = (300, 96, 1), (150, 48, 4)
+#: facets of the quadrature: radii and azimuths of their slopes, and one azimuth of the light, since a round lobe has
+#: the same albedo at all
+_COUNTS = (300, 96, 1)
+
+#: the same for an elongated lobe, whose albedo is averaged over azimuths of the light. Its error is 1e-4
+_ELONGATED_COUNTS = (150, 48, 4)
 
 
 @lru_cache(maxsize=4096)

@@ -27,6 +27,7 @@ BLACK_GLASS = 1.567
 #: wavelength at which the eye, and so a gloss meter, is most sensitive [nm]
 GLOSS_WAVELENGTH_NM = 555.0
 
+#: nodes (96,) of a Gauss-Legendre quadrature over -1..1, and their weights (96,); the number is chosen
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(96)
 
 

@@ -27,8 +27,11 @@ from mitsim.scene.surface.diffraction import Autocorrelation, sampled
 #: fewest points of a trace
 _FEWEST_POINTS = 200
 
-#: least and most heights of a map along each side
-_SMALLEST_MAP, _LARGEST_MAP = 64, 4096
+#: least number of heights of a map along each side; chosen
+_SMALLEST_MAP = 64
+
+#: largest number of heights of a map along each side, which bounds the memory; chosen
+_LARGEST_MAP = 4096
 
 #: largest text table [bytes]
 _LARGEST_TABLE = 128 * 1024**2

@@ -121,9 +121,12 @@ PROCESSES: dict[str, Process] = {
     "edm": Process(1.2, 3.0, 1.0, (0.13, 6.0), WideAngle(0.08, 0.25), lobe=0.5, tail=UNKNOWN_TAIL),
 }
 
-#: Ra between and on the feed marks, as a share of Ra, and its range [um]. Assumed: it gives the lobes of alpha 0.05 to
-#: 0.1 of the literature for milled and turned faces with resolved marks
-MICRO_SHARE, MICRO_RANGE_UM = 0.25, (0.02, 0.3)
+#: Ra between and on the feed marks, as a share of Ra. Assumed, with its range: they give the lobes of alpha 0.05 to 0.1
+#: of the literature for milled and turned faces with resolved marks
+MICRO_SHARE = 0.25
+
+#: range of Ra between and on the feed marks [um]
+MICRO_RANGE_UM = (0.02, 0.3)
 
 
 def micro_roughness(roughness_um: float) -> float:

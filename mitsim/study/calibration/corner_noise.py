@@ -33,8 +33,11 @@ from mitsim.sensor.projector_images import ProjectorImages
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.sensor_file import AutomaticExposure
 
-#: reflectance of the board's white and black; *assumed* for print on matt paper or ceramic
-WHITE, BLACK = 0.85, 0.05
+#: reflectance of the board's white; *assumed* for print on matt paper or ceramic
+WHITE = 0.85
+
+#: reflectance of its black; *assumed*, as that of its white
+BLACK = 0.05
 #: largest half side of the detector's window [px]; OpenCV's tutorials use 5 to 11
 WINDOW_PX = 5
 #: samples per pixel side of the average over a pixel

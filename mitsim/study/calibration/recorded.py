@@ -35,17 +35,21 @@ from mitsim.sensor.transforms import Transform
 from mitsim.study.calibration import bundle
 from mitsim.study.calibration.board import Board
 
-#: One sigma of the prior of a lens, all *assumed*. Principal point relative to the size, along columns and rows;
-#: projectors shift their image.
-_CAMERA_MIDDLE, _PROJECTOR_MIDDLE = (0.05, 0.05), (0.05, 0.5)
+#: One sigma of the prior of a camera's principal point relative to the size, along columns and rows; *assumed*, as all
+#: numbers of the prior of a lens
+_CAMERA_MIDDLE = (0.05, 0.05)
+#: the same of a projector, which shifts its image along rows
+_PROJECTOR_MIDDLE = (0.05, 0.5)
 #: ratio of the focal lengths fx / fy
 _ASPECT = 0.005
 _DISTORTION: Mapping[str, float] = {"k1": 0.2, "k2": 0.2, "p1": 0.002, "p2": 0.002, "k3": 1e-3}
 _ROUNDS = 4
 #: largest number of steps of the adjustment
 _MOST_STEPS = 300
-#: last step, in squared standard uncertainties, and its relative gain
-_SMALL_STEP, _SMALL_GAIN = 1e-4, 1e-9
+#: last step, in squared standard uncertainties; chosen
+_SMALL_STEP = 1e-4
+#: relative gain of the last step; chosen
+_SMALL_GAIN = 1e-9
 #: damping with which the adjustment cannot go on
 _STUCK = 1e9
 #: residuals of corners [px], median of the poses, above which the model of the lens is wrong; *assumed*: corners of

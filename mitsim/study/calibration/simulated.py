@@ -25,8 +25,10 @@ from mitsim.study.calibration.board import Board
 
 #: termination of OpenCV's estimate of one eye, which is only a start; that of its tutorials
 _COARSE = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 30, 1e-6)
-#: largest number of steps of the joint adjustment, and its final step: norm over all observations [px]
-_MOST_STEPS, _SMALL_STEP_PX = 30, 1e-5
+#: largest number of steps of the joint adjustment; chosen
+_MOST_STEPS = 30
+#: its final step: norm over all observations [px]; chosen
+_SMALL_STEP_PX = 1e-5
 #: factor on the focal lengths of OpenCV's initial guess: a data sheet's accuracy
 _START_OFF = 1.01
 

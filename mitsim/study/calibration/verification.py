@@ -32,8 +32,11 @@ from mitsim.study.calibration.accuracy import measured_points
 from mitsim.study.calibration.board import Board
 from mitsim.study.calibration.corner_files import found_corners, turned_alike
 
-#: number of rigs drawn, and the seed of the draws
-_DRAWS, _SEED = 200, 1
+#: number of rigs drawn: a standard deviation follows to 5 %; chosen
+_DRAWS = 200
+
+#: seed of the draws: the same sensor gives the same figures
+_SEED = 1
 
 #: a normal error lies within this many standard uncertainties with 95 %
 _INSIDE = 1.959964

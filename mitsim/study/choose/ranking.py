@@ -20,8 +20,14 @@ from characterisation.files.arrays import Floats
 #: demand by screening, relative to the limit of the decision rule, above which a sensor is not measured
 LARGEST_DEMAND = 3.0
 
-#: reasons why a sensor is not measured
-NONE_POSSIBLE, FEWER_POSSIBLE, OUT_BY_FAR = "no measurement possible", "fewer measurements possible", "out by far"
+#: reason why a sensor is not measured: no view can make any measurement
+NONE_POSSIBLE = "no measurement possible"
+
+#: reason: the best sensor can make more of the measurements
+FEWER_POSSIBLE = "fewer measurements possible"
+
+#: reason: its demand is over :data:`LARGEST_DEMAND`
+OUT_BY_FAR = "out by far"
 
 #: number of impossible measurements, and the demands of the others, largest first
 RankKey = tuple[int, tuple[float, ...]]

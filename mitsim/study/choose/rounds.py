@@ -22,8 +22,11 @@ from mitsim.study.choose.sensor_result import SensorResult, ordered, stated_dema
 from mitsim.study.statement_document import statement_document
 from mitsim.study.virtual.race import ALL, Raced, RaceRules, shortlist, standings
 
-#: number of views raced for each measurement, and of trials of each of them
-SHORTLIST, RACE_TRIALS = 3, 8
+#: largest number of views raced for each measurement; chosen
+SHORTLIST = 3
+
+#: largest number of trials of each of them; chosen
+RACE_TRIALS = 8
 
 #: a sensor can still win if its demand divided by this many standard errors of a factor is below the least
 _STANDARD_ERRORS = 2.0

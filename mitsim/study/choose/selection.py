@@ -39,14 +39,20 @@ from mitsim.study.run_record import complete_winner
 from mitsim.study.session import Session
 from mitsim.study.virtual.race import ALL
 
-#: trials of a statement in the first round, and their factor from round to round
-FIRST_TRIALS, GROWTH = 24, 2
+#: trials of a statement in the first round; chosen
+FIRST_TRIALS = 24
+
+#: factor of the trials from round to round; chosen
+GROWTH = 2
 
 #: largest share of the time for screening
 _SCREENING_SHARE = 0.5
 
-#: share of the time that is left for a round of several sensors, and largest number of rounds
-_ROUND_SHARE, _ROUNDS = 0.5, 7
+#: share of the time that is left for a round of several sensors; chosen
+_ROUND_SHARE = 0.5
+
+#: largest number of rounds; chosen
+_ROUNDS = 7
 
 
 def choose_sensor(

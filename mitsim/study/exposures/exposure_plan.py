@@ -35,14 +35,26 @@ LARGEST_RATIO = 64.0
 #: least power of a projector in a plan [1]; *assumed*, since no maker of the presets states one
 LEAST_POWER = 0.1
 
-#: a sweep ends after this number of exposures with, on every feature, at most this share of its best number of points
-STOP_STEPS, STOP_SHARE = 3, 0.3
+#: a sweep ends after this number of useless exposures; chosen
+STOP_STEPS = 3
 
-#: number of sets of one size that are decoded, and how many of them take part in the decision
-TRIED, FINALISTS = 8, 5
+#: an exposure is useless with, on every feature, at most this share of its best number of points; chosen
+STOP_SHARE = 0.3
 
-#: numbers of the independent noise of the search, of the decision, and of the reported results
-SEARCH, DECISION, REPORT = 0, 1, 2
+#: number of sets of one size that are decoded; chosen
+TRIED = 8
+
+#: how many of them take part in the decision; chosen
+FINALISTS = 5
+
+#: number of the independent noise of the search
+SEARCH = 0
+
+#: number of the noise of the decision
+DECISION = 1
+
+#: number of the noise of the reported results
+REPORT = 2
 
 #: number of noise samples of each
 DRAWS = {SEARCH: 2, DECISION: 6, REPORT: 6}

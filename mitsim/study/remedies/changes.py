@@ -43,8 +43,11 @@ from mitsim.study.session import Session
 from mitsim.study.view_sets.confirmed_set import state_set
 from mitsim.views.view_scores import MATT_WHITE, screening_risk
 
-#: numbers of captures whose mean is proposed, and shares of the errors of calibration and temperature
-_CAPTURES, _SHARES = (4, 16), (1 / 2, 1 / 4, 1 / 8)
+#: numbers of captures whose mean is proposed: they divide repeatability by 2 and 4; chosen
+_CAPTURES = (4, 16)
+
+#: shares of the errors of calibration and temperature that are proposed; chosen
+_SHARES = (1 / 2, 1 / 4, 1 / 8)
 
 #: number of other views that are tried
 _MOST_OTHER_VIEWS = 2
@@ -52,8 +55,11 @@ _MOST_OTHER_VIEWS = 2
 #: largest ratio of standoffs at which a nearer one is worth a try
 _NEARER = 0.9
 
-#: views that may measure together, and time to search for them [s]
-_MOST_VIEWS, _SEARCH_S = 3, 5.0
+#: largest number of views that may measure together; chosen
+_MOST_VIEWS = 3
+
+#: time to search for them [s]; chosen
+_SEARCH_S = 5.0
 
 
 def changes(now: Shortfall) -> Iterator[Change]:

@@ -27,8 +27,11 @@ from mitsim.study.session import Session
 from mitsim.views import View
 from mitsim.views.view_scores import screening_risk
 
-#: directions in which another sensor is screened, and sensors that are proposed
-_DIRECTIONS, _MOST = 6, 2
+#: number of directions in which another sensor is screened; chosen
+_DIRECTIONS = 6
+
+#: largest number of sensors that are proposed; chosen
+_MOST = 2
 
 #: share of the time that is left, for the screening of a sensor
 _SCREENING_SHARE = 0.5

@@ -25,8 +25,14 @@ from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.sensor import Sensor
 
-#: kinds of sensors: matching, coded light, time of flight
-MATCHED, CODED, FLIGHT = "matched", "coded", "time_of_flight"
+#: kind of a sensor that matches images
+MATCHED = "matched"
+
+#: kind of a sensor that decodes coded light
+CODED = "coded"
+
+#: kind of a sensor that measures time of flight
+FLIGHT = "time_of_flight"
 
 
 class Sizes(Document):

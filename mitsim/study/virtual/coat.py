@@ -27,8 +27,11 @@ from mitsim.study.virtual.form import along_rays
 #: finish of the faces that are sprayed: no part is made of it
 SPRAY = "matt_white"
 
-#: number of waves, and the seed of their directions and wavelengths
-_WAVES, _WAVES_SEED = 6, 77
+#: number of waves of a coat's thickness; chosen
+_WAVES = 6
+
+#: seed of their directions and wavelengths, which all trials share: only the amplitudes are drawn
+_WAVES_SEED = 77
 
 
 @dataclass(frozen=True)

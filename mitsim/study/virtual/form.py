@@ -29,8 +29,11 @@ from mitsim.scene.load import Scene, bounds_of
 from mitsim.scene.ray_casting.raycast import Surfaces
 from mitsim.sensor.transforms import Transform
 
-#: number of plane waves of a field, and the smallest cosine between normal and view ray; it bounds the displacement
-_WAVES, _GRAZING = 24, 0.1
+#: number of plane waves of a field; chosen
+_WAVES = 24
+
+#: smallest cosine between normal and view ray, which bounds the displacement along the ray; chosen
+_GRAZING = 0.1
 
 #: width of the zone of a form tolerance, in standard deviations of the form. Assumed
 _ZONE_SIGMAS = 4.0

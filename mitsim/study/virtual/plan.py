@@ -36,18 +36,23 @@ TRIAL_VERSION = 7
 #: keys of a task that concern the verdict, not the measurement
 _NO_PART_OF_A_TRIAL: Any = {"decision": True, "measurements": {"__all__": {"decision"}}}
 
-#: standard deviation of the smoothing of interreflections [px], see simulation/indirect_light.py
+#: standard deviation of the smoothing of interreflections [px], see mitsim/capture/simulated/indirect_light.py
 _SMOOTHING_PX = 1.5
 
-#: paths of interreflections that all trials of a view share: for matchers, whose images are few and coarse, and for
-#: fringes and time of flight. Render noise 0.14 to 0.21 (N10), 0.24 to 0.35 (David) of the sensor's on the two pillars:
-#: tests/benchmarks/kept_paths.py
-_KEPT_MATCHER, _KEPT = KeptSettings(49, 4.0, 40, 1.5), KeptSettings(16, 4.0, 8, 2.5)
+#: paths of interreflections that all trials of a view share, for matchers, whose images are few and coarse. Render
+#: noise 0.14 to 0.21 of the sensor's (N10) on the two pillars: tests/benchmarks/kept_paths.py
+_KEPT_MATCHER = KeptSettings(49, 4.0, 40, 1.5)
 
-#: rays per pixel of direct light: for fringes, and for others, whose patterns and pixels are coarse. Root mean square
-#: error 0.03 (PhoXi), 0.09 (David), 0.08 (Zivid) of the sensor's noise with 4, 0.04 (N10) with 16 and 0.15 with 4, but
-#: for the hundredth of the pixels at edges: tests/benchmarks/direct_samples.py
-_FRINGE_SAMPLES, _SAMPLES = 4, 16
+#: the same for fringes and time of flight. Render noise 0.24 to 0.35 of the sensor's (David), by the same benchmark
+_KEPT = KeptSettings(16, 4.0, 8, 2.5)
+
+#: rays per pixel of direct light for fringes. Root mean square error 0.03 (PhoXi), 0.09 (David) and 0.08 (Zivid) of the
+#: sensor's noise, but for the hundredth of the pixels at edges: tests/benchmarks/direct_samples.py
+_FRINGE_SAMPLES = 4
+
+#: rays per pixel for others, whose patterns and pixels are coarse. Error 0.04 (N10), and 0.15 with 4, by the same
+#: benchmark
+_SAMPLES = 16
 
 
 #: factor by which the race has fewer paths of interreflections: most of its views get one or two trials, and tracing

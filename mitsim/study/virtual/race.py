@@ -28,9 +28,11 @@ from mitsim.study.virtual.world import Trial
 from mitsim.views import View
 from mitsim.views.view_scores import screening_risk
 
-#: first trials of every view on the shortlist, and trials per later batch. Few trials of many views find a better view
-#: than many trials of few (tests/benchmarks/race_starts.py, on the open cases of scenes/parts)
-FIRST, BATCH = 1, 2
+#: first trials of every view on the shortlist. Few trials of many views find a better view than many trials of few
+#: (tests/benchmarks/race_starts.py, on the open cases of scenes/parts)
+FIRST = 1
+#: trials of a view per later batch, by the same benchmark
+BATCH = 2
 
 #: expected gain on the leader, of the logarithm of the risk, below which a view gets no more trials
 _LEAST_GAIN = 0.001

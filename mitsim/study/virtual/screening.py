@@ -29,9 +29,11 @@ from mitsim.study.virtual.study_unknowns import study_unknowns
 from mitsim.study.virtual.world import Unknowns, scaled_baseline, scaled_focal
 from mitsim.views.view_scores import score_candidates, scoring_order
 
-#: number of places along each axis of the box around a part, and in all views together, for which displacements are
-#: computed
-_RASTER, _PLACES = 4, 4000
+#: number of places along each axis of the box around a part for which displacements are computed; chosen
+_RASTER = 4
+
+#: about the largest number of places in all views together, which bounds the time; chosen
+_PLACES = 4000
 
 #: largest distance [mm] between a place and its reconstruction by the nominal rig
 _FOUND_AGAIN_MM = 1e-3

@@ -23,8 +23,11 @@ from mitsim.sensor.transforms import Transform
 #: pixels traced around the part, for the blur of the lens and the blocks of the matcher
 _MARGIN_PX = 12
 
-#: memory of the paths of views that are kept for later trials [bytes]: at least, and at most
-_LEAST_KEPT, _MOST_KEPT = 1 << 29, 1 << 32
+#: least memory of the paths of views that are kept for later trials [bytes], however little is available; chosen
+_LEAST_KEPT = 1 << 29
+
+#: largest such memory [bytes], however much is available; chosen
+_MOST_KEPT = 1 << 32
 
 #: share of the available memory that they may take beyond the least
 _KEPT_SHARE = 0.25

@@ -94,8 +94,11 @@ def _correlation_length(patches: SpecimenPatches, picked: Picked) -> Floats:
     return lengths
 
 
-#: acceptable ratio of noise, contrast and lengths; acceptable difference of shares
-NOISE_FACTOR, _SHARE_MARGIN = 1.15, 0.02
+#: acceptable ratio of noise, contrast and lengths; *assumed*
+NOISE_FACTOR = 1.15
+
+#: acceptable difference of shares; *assumed*
+_SHARE_MARGIN = 0.02
 
 QUANTITIES = (
     Quantity("median grey level", "DN", "image", _level, factor=1.05, needs_pattern=False),

@@ -19,8 +19,11 @@ from scipy.fft import dct
 from characterisation.files.arrays import Floats
 from mitsim.twin.finish.fine_detail import noise_of_levels
 
-#: side of a window [px]; standard deviations of the noise under which a coefficient is noise
-_SIDE_PX, _THRESHOLD = 8, 3.0
+#: side of a window [px]; chosen
+_SIDE_PX = 8
+
+#: standard deviations of the noise under which a coefficient is noise; chosen
+_THRESHOLD = 3.0
 
 #: the cosine transform of a column: a row for each coefficient
 _COSINES = dct(np.eye(_SIDE_PX), axis=0, norm="ortho")

@@ -33,8 +33,11 @@ REFLECTANCE = 0.85
 #: number of squares of a bent sheet's mesh along each side
 _MESH = 96
 
-#: texels per pixel footprint along an axis, and largest number of texels along a side
-_TEXELS_PER_PX, _LARGEST_TEXTURE = 2.0, 4096
+#: texels per pixel footprint along an axis; chosen
+_TEXELS_PER_PX = 2.0
+
+#: largest number of texels along a side, which bounds the memory; chosen
+_LARGEST_TEXTURE = 4096
 #: variance [px^2] of the aperture of a rendered texture: a pixel, which the recorded image already contains, and the
 #: interpolation between texels
 _APERTURE_PX2 = 1 / 12 + 1 / (6 * _TEXELS_PER_PX**2)

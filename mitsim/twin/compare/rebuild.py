@@ -51,8 +51,11 @@ from mitsim.twin.finish.specimen import MARGIN_PX, image_mask
 #: rays per pixel
 SAMPLES = 16
 
-#: range of the scale of the light, and number of bisections: accurate to a few parts in 10^5
-_SCALES, _BISECTIONS = (1e-4, 1e4), 18
+#: range in which the scale of the light is searched; chosen
+_SCALES = (1e-4, 1e4)
+
+#: number of bisections of this range: accurate to a few parts in 10^5
+_BISECTIONS = 18
 
 
 def check_technology(real: Capture, sensor: Sensor, where: str) -> None:

@@ -37,14 +37,20 @@ from mitsim.twin.finish.specimen import MARGIN_PX, image_mask, on_specimen
 
 PATCH_PX = 40
 
-#: smallest fraction of a patch on the specimen, and smallest fraction of its pixels with points for its noise
-LEAST_ON, LEAST_POINTS = 0.5, 0.5
+#: smallest fraction of a patch on the specimen; chosen
+LEAST_ON = 0.5
+
+#: smallest fraction of a patch's pixels with points for its noise; chosen
+LEAST_POINTS = 0.5
 
 #: smallest fraction of a patch's pixels with points for its row error, which is one number for the whole patch
 _LEAST_FOR_ROWS = 0.15
 
-#: limits of the window of local means [px], and its width in run lengths of the pattern
-_WINDOWS, _RUNS = (7, 31), 2.5
+#: limits of the window of local means [px]; chosen
+_WINDOWS = (7, 31)
+
+#: width of this window in run lengths of the pattern, so that several dots lie in it; chosen
+_RUNS = 2.5
 
 _MAD_TO_SIGMA = 1.482602218505602
 

@@ -23,8 +23,11 @@ FINEST = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70.0)
 #: median of chi-square with one degree of freedom
 MEDIAN_SQUARE = 0.45493642311957283
 
-#: largest number of bins of equal count by local mean, and least number of pixels for each
-_BINS, _PIXELS_PER_BIN = 8, 400
+#: largest number of bins of equal count by local mean; chosen
+_BINS = 8
+
+#: least number of pixels for each of several bins; chosen
+_PIXELS_PER_BIN = 400
 
 #: side of the window of the local mean [px]
 _MEAN_PX = 5

@@ -37,8 +37,12 @@ _ROUNDS = 3
 _DENSE = 0.3
 #: least number of points of a plane
 _FEWEST = 500
-#: total degrees; number of cells along the longer side, and least number of points in a cell
-DEGREES, _BEND_CELLS, _BEND_POINTS = (1, 2, 3, 4, 5, 6), 28, 20
+#: total degrees of the bends that are tried
+DEGREES = (1, 2, 3, 4, 5, 6)
+#: number of cells along the longer side for the fit of a bend; chosen
+_BEND_CELLS = 28
+#: least number of points in such a cell, for their median height; chosen
+_BEND_POINTS = 20
 
 #: least number of cells for each coefficient of a degree
 _CELLS_PER_TERM = 5

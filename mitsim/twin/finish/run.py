@@ -38,9 +38,11 @@ from mitsim.twin.finish.problem import Residual
 from mitsim.twin.finish.specimen import place_of
 from mitsim.twin.finish.white_coupon import WhiteCouponRenderer, pattern_is_known, with_rig
 
-#: side of a block [px] with a known pattern, and with an unknown one, whose dots count as grain. It is several times
-#: the length of the grain, which is under 1 px and about 2 px, respectively
-KNOWN_BLOCK_PX, UNKNOWN_BLOCK_PX = 8, 32
+#: side of a block with a known pattern [px]: several times the length of the grain, which is under 1 px
+KNOWN_BLOCK_PX = 8
+
+#: side of a block with an unknown pattern [px]: its dots count as grain, whose length is about 2 px
+UNKNOWN_BLOCK_PX = 32
 
 DIFFUSE = "matt_white"
 

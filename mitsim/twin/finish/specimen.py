@@ -28,8 +28,11 @@ from mitsim.twin.finish.place import Bend, Place, fit_bend, found_place, known_p
 #: margin inside the specimen's outline that is not used [px]: its edge is blurred, and matched with the background
 MARGIN_PX = 15.0
 
-#: least number of points of a plane in the user's region, and largest number of points for its fit
-_FEWEST_POINTS, _PLANE_POINTS = 500, 20000
+#: least number of points of a plane in the user's region; chosen
+_FEWEST_POINTS = 500
+
+#: about the largest number of points for its fit, which bounds the time; chosen
+_PLANE_POINTS = 20000
 
 #: least cosine between a ray and the normal with which the ray meets the plane
 GRAZING = 1e-6

@@ -25,17 +25,29 @@ from mitsim.twin.sensor.input_captures import InputCapture
 #: terms of the series
 _HARMONICS = np.arange(1, 40, 2)
 
-#: side of a block [px], and least share of its pixels that are decoded
-_BLOCK_PX, _LEAST_SHARE = 32, 0.15
+#: side of a block [px]; chosen
+_BLOCK_PX = 32
 
-#: largest relative spread of depths and of white levels in a block [1]
-_DEEP, _EVEN = 0.025, 0.12
+#: least share of a block's pixels that are decoded; chosen
+_LEAST_SHARE = 0.15
+
+#: largest relative spread of depths in a block, whose blur is one number; chosen
+_DEEP = 0.025
+
+#: largest relative standard deviation of white levels in a block; chosen
+_EVEN = 0.12
 
 #: least white minus black [DN of 8 bit]; below, rounding raises the modulation of fine stripes
 _LEAST_DN = 50.0
 
-#: widest stripes used [projector px]; least number of blocks; parts of the jackknife
-_WIDEST_PX, _FEWEST, _PARTS = 40.0, 60, 20
+#: widest stripes used [projector px]: wider ones hardly tell the blur; chosen
+_WIDEST_PX = 40.0
+
+#: least number of blocks; chosen
+_FEWEST = 60
+
+#: parts of the jackknife; chosen
+_PARTS = 20
 
 #: blur residual [px] beyond which a block loses weight as an outlier
 _SOFT_PX = 0.1

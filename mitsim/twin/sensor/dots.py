@@ -33,16 +33,22 @@ from mitsim.twin.sensor.parameters import CORNER_BLUR, FLUX, SMOOTHING, Paramete
 from mitsim.twin.sensor.specimen_simulator import SpecimenSimulator
 from mitsim.twin.sensor.verdict import CHANCE
 
-#: side of a patch [px], and the least number of patches of a capture
-PATCH_PX, FEWEST_PATCHES = 40, 8
+#: side of a patch [px]; chosen
+PATCH_PX = 40
+
+#: least number of patches of a capture; chosen
+FEWEST_PATCHES = 8
 
 _ALONE = ("crossings", "sharpness", "noise in the dark half", "noise in the bright half", "grain")
 
-#: initial room light as a share of the projector's; significance level of a misfit
+#: initial room light as a share of the projector's; chosen
 _FIRST_ROOM = 0.2
 
-#: step of the derivatives of the file's numbers, and least significance of a smoothing, in standard uncertainties
-_DIFFERENCE, _SURE = 0.3, 2.0
+#: step of the derivatives of the file's numbers, in standard uncertainties; chosen
+_DIFFERENCE = 0.3
+
+#: least significance of a smoothing, in standard uncertainties; chosen
+_SURE = 2.0
 
 
 @dataclass(frozen=True)

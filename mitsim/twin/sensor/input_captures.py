@@ -23,8 +23,14 @@ from mitsim.twin.finish.fine_detail import finest_detail
 
 Kind = Literal["on", "off", "dark"]
 
-#: side of the mean, factor over the noise that remains in it, and allowance for rounding [DN]
-_MEAN_PX, _FACTOR, _ROUNDING_DN = 5, 3.0, 0.1
+#: side of the window of the mean [px]; chosen
+_MEAN_PX = 5
+
+#: factor over the noise that remains in the mean, up to which a difference is noise; chosen
+_FACTOR = 3.0
+
+#: allowance for rounding [DN]; chosen
+_ROUNDING_DN = 0.1
 
 
 @dataclass(frozen=True)

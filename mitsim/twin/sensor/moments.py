@@ -25,7 +25,14 @@ from mitsim.running.progress import say_progress
 #: features (n,) and their covariance (n, n) of simulation number i at parameters (k,)
 Simulate = Callable[[Floats, int], tuple[Floats, Floats]]
 
-_ROUNDS, _HALVINGS, _ENOUGH = 8, 4, 0.02
+#: largest number of rounds of the fit; chosen
+_ROUNDS = 8
+
+#: lengths of a step that are tried, each half of the one before, until it improves the fit; chosen
+_HALVINGS = 4
+
+#: change of each parameter in standard uncertainties, or of chi-square, below which the fit ends; chosen
+_ENOUGH = 0.02
 
 #: largest uncertainty of a determined parameter, as a share of the prior's standard deviation
 DETERMINED_SHARE = 0.35

@@ -39,8 +39,11 @@ from mitsim.twin.sensor.response import first_knee, quiet_pixels
 #: largest number of pixels used in a group
 _PIXELS = 200_000
 
-#: range of the smoothing estimate [px], and its least significance in standard uncertainties
-_SMOOTHINGS, _SURE = (0.05, 3.0), 3.0
+#: range of the smoothing estimate [px]; chosen
+_SMOOTHINGS = (0.05, 3.0)
+
+#: its least significance, in standard uncertainties; chosen
+_SURE = 3.0
 
 #: variance of rounding to whole grey levels [DN^2]
 _ROUNDING = 1 / 12

@@ -30,14 +30,21 @@ from mitsim.sensor.imager import Imager
 from mitsim.twin.finish.electrons import linearised
 from mitsim.twin.finish.fine_detail import FINEST, level_variances
 
-#: number of bins; least distance of a bin from either end of the grey levels, in standard deviations
-_BINS, _CLEAR = 24, 4.0
+#: number of bins by local mean; chosen
+_BINS = 24
+
+#: least distance from either end of the grey levels: of a pixel of repeated images in standard deviations of its noise,
+#: of a bin of one image in DN; chosen
+_CLEAR = 4.0
 
 #: side [px] of the local mean around a pixel
 _AROUND_PX = 3
 
-#: least number of bins for a line, and least ratio of their largest and smallest means
-_FEWEST, _SPAN = 3, 1.3
+#: least number of bins for a line; chosen
+_FEWEST = 3
+
+#: least ratio of their largest and smallest means, which tells the slope from the offset; chosen
+_SPAN = 1.3
 
 #: standard uncertainties under 0 that an offset may lie by chance
 _BY_CHANCE = 3.0

@@ -41,20 +41,35 @@ from mitsim.twin.sensor.photon_transfer import independent_share
 
 Mask = NDArray[np.bool_]
 
-#: side of a tile and its rim, which the weights reach [px]
-_TILE_PX, _RIM_PX = 32, 2
+#: side of a tile [px]; chosen
+_TILE_PX = 32
 
-#: largest number of tiles, and least number with quiet pixels
-_TILES, _FEWEST = 120, 8
+#: rim of a tile, which the five weights of finest detail reach [px]
+_RIM_PX = 2
+
+#: largest number of tiles, which bounds the time; chosen
+_TILES = 120
+
+#: least number of tiles with quiet pixels; chosen
+_FEWEST = 8
 
 #: slope beyond a knee; chips compand by steps of two
 _SLOPE = 0.5
 
-#: steps of a knee's level, coarse and fine [DN]
-_COARSE_DN, _STEP_DN = 3.0, 0.5
+#: coarse step of a knee's level [DN]; chosen
+_COARSE_DN = 3.0
 
-#: fine steps to either side of a coarse level, of a level that is known, and as many at most
-_AROUND, _BESIDE_IT, _FARTHEST = 4, 1, 20
+#: fine step of a knee's level [DN]; chosen
+_STEP_DN = 0.5
+
+#: fine steps to either side of a coarse level: more than half a coarse step; chosen
+_AROUND = 4
+
+#: fine steps to either side of a level that is known; chosen
+_BESIDE_IT = 1
+
+#: largest number of fine steps from where the search began; chosen
+_FARTHEST = 20
 
 #: how far a level's own share of the light begins under the knee of the file [DN]
 _ROUNDED_DOWN_DN = 0.5
@@ -68,11 +83,17 @@ _NEAR_DN = 4.0
 #: share of the quiet pixels that lie on either side of a knee at least
 _BESIDE = 0.01
 
-#: -2 log likelihood that a knee must gain: two more numbers, by chance once in 10^4; and in deviations of the tiles
-_GAIN, _SURE = 18.4, 3.0
+#: -2 log likelihood that a knee must gain: two more numbers, by chance once in 10^4
+_GAIN = 18.4
 
-#: the print's own finest detail that a pixel may have, and the largest finest detail, in standard deviations of noise
-_QUIET, _LARGEST = 0.5, 4.0
+#: gain that a knee must have, in standard deviations over the tiles; chosen
+_SURE = 3.0
+
+#: largest finest detail of the print in a pixel, in standard deviations of noise; chosen
+_QUIET = 0.5
+
+#: finest detail beyond which a pixel is an outlier, in standard deviations of noise; chosen
+_LARGEST = 4.0
 
 #: squares of the weights of finest detail along an axis (32, 36): of the pixels of a tile and its rim, for those within
 _WEIGHTS = sum(np.eye(_TILE_PX, _TILE_PX + 2 * _RIM_PX, at) * weight for at, weight in enumerate(FINEST**2))

@@ -24,7 +24,11 @@ from mitsim.twin.sensor.figures import SpecimenField
 from mitsim.twin.sensor.input_captures import InputCapture
 from mitsim.twin.sensor.parameters import ROOM_KEYS
 
-_PATCH_PX, _FEWEST_FOR_TERMS = 20, 24
+#: side of a patch, whose median is one value of the light [px]; chosen
+_PATCH_PX = 20
+
+#: least number of patches for all six terms: four for each; fewer give a constant
+_FEWEST_FOR_TERMS = 24
 
 
 @dataclass(frozen=True)

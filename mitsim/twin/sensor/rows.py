@@ -22,8 +22,11 @@ from mitsim.decoding.matching.stereo import StereoGeometry
 from mitsim.twin.compare.specimen_patches import patch_rows
 from mitsim.twin.finish.place import Place
 
-#: least number of patches for a line; outlier limit in standard deviations
-_FEWEST, _CLIP = 6, 3.0
+#: least number of patches for a line; chosen
+_FEWEST = 6
+
+#: outlier limit in standard deviations; chosen
+_CLIP = 3.0
 _MAD_TO_SIGMA = 1.482602218505602
 
 

@@ -32,8 +32,11 @@ from mitsim.sensor.vignetting import camera_illumination
 from mitsim.twin.compare.plate import REFLECTANCE, plate
 from mitsim.twin.finish.place import Place
 
-#: rays per pixel; number of cached renders
-_SAMPLES, _KEPT = 16, 48
+#: rays per pixel; chosen
+_SAMPLES = 16
+
+#: largest number of cached renders, which bounds the memory; chosen
+_KEPT = 48
 
 #: pixels around the window, for the reach of the lens blur and of the features
 MARGIN_PX = 12

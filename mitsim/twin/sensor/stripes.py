@@ -30,14 +30,23 @@ from mitsim.twin.sensor.input_captures import InputCapture
 from mitsim.twin.sensor.noise import without_fixed_pattern
 from mitsim.twin.sensor.photon_transfer import one_image_line
 
-#: side of the window around a pixel that must be uniform, and its largest variation as a share of white
-_EVEN_PX, _EVEN_SHARE = 7, 0.3
+#: side of the window around a pixel that must be uniform [px]; chosen
+_EVEN_PX = 7
 
-#: least white minus black [DN] of a pixel's modulation; side of the blocks whose scatter gives the uncertainty
-_LEAST_DN, _BLOCK_PX = 8.0, 40
+#: its largest variation as a share of white; chosen
+_EVEN_SHARE = 0.3
 
-#: share of full scale below which a pixel is unsaturated; least significance of an aperture in standard uncertainties
-_UNSATURATED, _SURE = 0.97, 2.0
+#: least white minus black of a pixel's modulation [DN]; chosen
+_LEAST_DN = 8.0
+
+#: side of the blocks whose scatter gives the uncertainty [px]; chosen
+_BLOCK_PX = 40
+
+#: share of full scale below which a pixel is unsaturated; chosen
+_UNSATURATED = 0.97
+
+#: least significance of an aperture, in standard uncertainties; chosen
+_SURE = 2.0
 
 
 @dataclass(frozen=True)
