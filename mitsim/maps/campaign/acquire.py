@@ -31,7 +31,7 @@ from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decoding.cloud import Geometry, capture_cloud, capture_geometry, sensor_geometry
 from mitsim.decoding.depth_range import depths_of, range_warning
 from mitsim.maps.campaign.plan import Campaign, Shot, view_axes
-from mitsim.maps.campaign.pose_doubt import pose_doubt
+from mitsim.maps.campaign.pose_doubt import may_be_inverted, seen_plane
 from mitsim.maps.campaign.store import Finished
 from mitsim.running.progress import say
 from mitsim.sensor.sensor import Sensor
@@ -136,7 +136,7 @@ def measured(capture: Capture, shot: Shot, geometry: Geometry, sensor: Sensor, k
     if own_sensor(capture, sensor) is not sensor:
         geometry = capture_geometry(capture, sensor.settings)
     cloud = coupon_cloud(capture, coupon, geometry, sensor)
-    if capture.source != "simulated" and (doubt := pose_doubt(cloud, coupon)):
+    if capture.source != "simulated" and (doubt := _pose_doubt(capture, shot, cloud, geometry, sensor)):
         say(f"warning: {shot.series.name}, {shot.name}: {doubt}")
     patches = measure_patches(cloud, coupon)
     if not keep_images:
@@ -147,6 +147,26 @@ def measured(capture: Capture, shot: Shot, geometry: Geometry, sensor: Sensor, k
         "normal": [float(component) for component in shot.normal],
     }
     return Finished(patches, capture.source, replace(capture, settings={**capture.settings, "coupon": shown}))
+
+
+def _pose_doubt(capture: Capture, shot: Shot, cloud: PointCloud, geometry: Geometry, sensor: Sensor) -> str:
+    """Return a warning if the points of a capture contradict the pose of its coupon, or ""."""
+    place = coupon_place(capture, shot)
+    coupon, inverted = shot.series.sample.at(place), shot.series.sample.at(place.inverse())
+    plane = seen_plane(cloud, coupon)
+    if plane is not None and plane.fits:
+        return ""
+    if may_be_inverted(coupon, inverted):
+        other = seen_plane(coupon_cloud(capture, inverted, geometry, sensor), inverted)
+        if other is not None and other.fits:
+            return (
+                "the points lie in the plane of the coupon if its pose is inverted: pose.json needs world_from_sensor, "
+                "from the sensor to the coupon's frame, and seems to have sensor_from_coupon"
+            )
+    column, row = geometry.grid.project(coupon.centre)
+    if plane is None and not (0 <= column < geometry.grid.width and 0 <= row < geometry.grid.height):
+        return "the coupon at its pose is outside the image: check the pose"
+    return "" if plane is None else plane.doubt
 
 
 def coupon_place(capture: Capture, shot: Shot) -> Transform:
@@ -182,7 +202,7 @@ def coupon_cloud(capture: Capture, coupon: Coupon, geometry: Geometry, sensor: S
     measured : decodes and measures the patches
     """
     grid = geometry.grid
-    corners = grid.project(coupon.corners())
+    corners = np.nan_to_num(grid.project(coupon.corners()))  # NaN is behind the sensor
     low = np.clip(np.floor(corners.min(axis=0)).astype(int) - 2, 0, [grid.width - 1, grid.height - 1])
     high = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 3, low + 1, [grid.width, grid.height])
     return capture_cloud(capture, sensor.settings, geometry, Roi.between(*low, *high), sensor.imager)
@@ -213,7 +233,7 @@ def found_shots(folder: str | Path, campaign: Campaign) -> dict[Path, Shot]:
     """Return the captures of coupons in a folder and its subfolders as shots of a campaign.
 
     Each capture must name its sample (``settings.coupon.sample``) and have a pose, with the coupon's frame as the
-    world. It belongs to the nearest planned distance.
+    world, z toward the sensor. It belongs to the nearest planned distance.
 
     Raises
     ------
@@ -282,6 +302,9 @@ def _found_shot(place: Path, campaign: Campaign) -> Shot:
     if world_from_sensor is None:
         hint = "mitsim import --coupon COLUMN ROW WIDTH HEIGHT takes it from the plane of a coupon's points"
         raise InputError(place / "pose.json", "world_from_sensor", "null", "the pose, in the coupon's frame", hint)
+    if world_from_sensor.translation[2] <= 0:
+        found, allowed = "a sensor behind the coupon", "a position with z over 0 in the coupon's frame"
+        raise InputError(place / "pose.json", "world_from_sensor", found, allowed, "the coupon's z faces the sensor")
     pose = world_from_sensor.inverse()
     distance = float(np.linalg.norm(pose.translation - campaign.sensor.rig.reference.sensor_from_camera.translation))
     nominal = min(campaign.distances, key=lambda planned: abs(np.log(distance / planned)))

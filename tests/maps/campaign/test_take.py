@@ -152,6 +152,7 @@ def altered(kept, tmp_path, change):
             lambda c: replace(c, world_from_sensor=replace(c.world_from_sensor, translation=np.array([0, 0, 700.0]))),
             "distance",
         ),
+        (lambda c: replace(c, world_from_sensor=Transform(np.eye(3), np.array([0, 0, -500.0]))), "world_from_sensor"),
     ],
 )
 def test_a_capture_that_cannot_be_placed_is_named(kept, tmp_path, change, field):
@@ -240,3 +241,29 @@ def test_a_pose_that_contradicts_the_points_is_told(kept, capfd, turn, shift, to
     capture = replace(capture, source="device", world_from_sensor=moved)
     measured(capture, shot, capture_geometry(capture, plan.sensor.settings), plan.sensor, False)
     assert ("from the coupon at its pose: check the pose" in capfd.readouterr().err) == told
+
+
+def said_of(plan, place, shot, capfd, pose):
+    capture = replace(read_capture(place), source="device", world_from_sensor=pose)
+    measured(capture, shot, capture_geometry(capture, plan.sensor.settings), plan.sensor, False)
+    return capfd.readouterr().err
+
+
+def test_poses_of_the_inverse_direction_are_told(kept, capfd):
+    """Before, a tilt of 32 deg gave no patch, or F = 0, in silence. The pose without a tilt is its own inverse."""
+    plan, folder = kept
+    shots = {place: shot for place, shot in found_shots(folder, plan).items() if "white" in shot.series.sample.finish}
+    assert len(shots) > 5
+    for place, shot in shots.items():
+        pose = read_capture(place).world_from_sensor
+        assert said_of(plan, place, shot, capfd, pose) == ""
+        told = "if its pose is inverted" in said_of(plan, place, shot, capfd, pose.inverse())
+        assert told == (shot.normal[2] < 0.99)
+
+
+@pytest.mark.parametrize("turn", [(0, 60, 0), (0, 180, 0), (90, 0, 0)])
+def test_a_coupon_out_of_the_image_is_told(kept, capfd, turn):
+    plan, folder = kept
+    place, shot = next(iter(found_shots(folder, plan).items()))
+    pose = read_capture(place).world_from_sensor @ Transform.from_degrees(turn, (0.0, 0.0, 0.0))
+    assert "the coupon at its pose is outside the image" in said_of(plan, place, shot, capfd, pose)
