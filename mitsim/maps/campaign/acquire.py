@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -31,7 +32,7 @@ from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decoding.cloud import Geometry, capture_cloud, capture_geometry, sensor_geometry
 from mitsim.decoding.depth_range import depths_of, range_warning
 from mitsim.maps.campaign.plan import Campaign, Shot, view_axes
-from mitsim.maps.campaign.pose_doubt import may_be_inverted, seen_plane
+from mitsim.maps.campaign.pose_doubt import DIRECTION, fits, fits_inverted, may_be_inverted, pose_doubt
 from mitsim.maps.campaign.store import Finished
 from mitsim.running.progress import say
 from mitsim.sensor.sensor import Sensor
@@ -45,6 +46,9 @@ Source = Callable[[Sequence[Shot]], Iterator[tuple[Shot, Finished]]]
 
 #: number of captures out of range that are named one by one
 NAMED = 5
+
+#: number of captures whose poses are checked for their direction before all are measured
+_CHECKED = 5
 
 #: largest relative difference between the distance of a found capture and its planned distance
 DISTANCE_SLACK = 0.05
@@ -132,11 +136,13 @@ def measured(capture: Capture, shot: Shot, geometry: Geometry, sensor: Sensor, k
     --------
     coupon_cloud : the cloud that it measures
     """
-    coupon = shot.series.sample.at(coupon_place(capture, shot))
+    sample, place = shot.series.sample, coupon_place(capture, shot)
+    coupon = sample.at(place)
     if own_sensor(capture, sensor) is not sensor:
         geometry = capture_geometry(capture, sensor.settings)
-    cloud = coupon_cloud(capture, coupon, geometry, sensor)
-    if capture.source != "simulated" and (doubt := _pose_doubt(capture, shot, cloud, geometry, sensor)):
+    decode = partial(coupon_cloud, capture, geometry=geometry, sensor=sensor)
+    cloud = decode(coupon)
+    if capture.source != "simulated" and (doubt := pose_doubt(cloud, decode, sample, place)):
         say(f"warning: {shot.series.name}, {shot.name}: {doubt}")
     patches = measure_patches(cloud, coupon)
     if not keep_images:
@@ -149,24 +155,28 @@ def measured(capture: Capture, shot: Shot, geometry: Geometry, sensor: Sensor, k
     return Finished(patches, capture.source, replace(capture, settings={**capture.settings, "coupon": shown}))
 
 
-def _pose_doubt(capture: Capture, shot: Shot, cloud: PointCloud, geometry: Geometry, sensor: Sensor) -> str:
-    """Return a warning if the points of a capture contradict the pose of its coupon, or ""."""
-    place = coupon_place(capture, shot)
-    coupon, inverted = shot.series.sample.at(place), shot.series.sample.at(place.inverse())
-    plane = seen_plane(cloud, coupon)
-    if plane is not None and plane.fits:
-        return ""
-    if may_be_inverted(coupon, inverted):
-        other = seen_plane(coupon_cloud(capture, inverted, geometry, sensor), inverted)
-        if other is not None and other.fits:
-            return (
-                "the points lie in the plane of the coupon if its pose is inverted: pose.json needs world_from_sensor, "
-                "from the sensor to the coupon's frame, and seems to have sensor_from_coupon"
-            )
-    column, row = geometry.grid.project(coupon.centre)
-    if plane is None and not (0 <= column < geometry.grid.width and 0 <= row < geometry.grid.height):
-        return "the coupon at its pose is outside the image: check the pose"
-    return "" if plane is None else plane.doubt
+def check_directions(campaign: Campaign, found: dict[Path, Shot]) -> None:
+    """Check a few captures of :func:`found_shots`, of all tilts, for poses that are inverted as a whole.
+
+    Raises
+    ------
+    InputError
+        If the points of two or more lie in the plane of the coupon at the inverse pose, and those of none at its pose.
+    """
+    told = []
+    tilted = [place for place, shot in found.items() if may_be_inverted(shot.series.sample, shot.sensor_from_coupon)]
+    tilted.sort(key=lambda place: found[place].normal[2])
+    for place in tilted[:: max(len(tilted) // _CHECKED, 1)]:
+        capture, shot = read_capture(place), found[place]
+        decode = partial(
+            coupon_cloud, capture, geometry=capture_geometry(capture, campaign.sensor.settings), sensor=campaign.sensor
+        )
+        if capture.source == "simulated" or fits(decode, shot.series.sample.at(shot.sensor_from_coupon)):
+            return
+        told += [place] if fits_inverted(decode, shot.series.sample, shot.sensor_from_coupon) else []
+    if len(told) > 1:
+        inside = f"poses that fit the points only if they are inverted, also in {', '.join(map(str, told[1:]))}"
+        raise InputError(told[0] / "pose.json", "world_from_sensor", inside, "from sensor to coupon", DIRECTION)
 
 
 def coupon_place(capture: Capture, shot: Shot) -> Transform:

@@ -9,6 +9,7 @@ image.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,8 @@ from characterisation.coupon.patches import Coupon
 from characterisation.features.fits import fit_plane
 from characterisation.features.robust_fit import FitError
 from characterisation.point_cloud import PointCloud
+from mitsim.maps.campaign.coupons import Sample
+from mitsim.sensor.transforms import Transform
 
 #: largest tilt that raises no doubt [deg]; a sensor's own is smaller; chosen
 _TILT_DEG = 5.0
@@ -34,32 +37,69 @@ _LEAST_SHARE = 0.5
 _APART = 0.05
 
 
+#: what an inverted pose should be
+DIRECTION = "pose.json needs world_from_sensor, from the sensor to the coupon's frame, and seems to have its inverse"
+
+#: decodes the part of a capture that shows a coupon
+Decode = Callable[[Coupon], PointCloud]
+
+
 @dataclass(frozen=True)
-class SeenPlane:
+class _SeenPlane:
     """Tilt and offset [mm] of the plane of a coupon's points from the coupon at its pose, and whether it ``fits``."""
 
     tilt_deg: float
     offset: float
     fits: bool
 
-    @property
-    def doubt(self) -> str:
-        """A warning if it does not fit, or ""."""
-        if self.fits:
-            return ""
+
+def pose_doubt(cloud: PointCloud, decode: Decode, sample: Sample, sensor_from_coupon: Transform) -> str:
+    """Return a warning if the points of a capture contradict the pose of its coupon, or "".
+
+    Parameters
+    ----------
+    cloud
+        Of the coupon at its pose, sensor frame.
+    decode
+        Gives the cloud of the same capture about a coupon at another place.
+    sample, sensor_from_coupon
+        The coupon, and its pose [mm].
+    """
+    coupon, grid = sample.at(sensor_from_coupon), cloud.grid
+    plane = _seen_plane(cloud, coupon)
+    if plane is not None and plane.fits:
+        return ""
+    if fits_inverted(decode, sample, sensor_from_coupon):
+        return f"the points lie in the plane of the coupon if its pose is inverted: {DIRECTION}"
+    if plane is not None:
         return (
-            f"the points lie in a plane {self.tilt_deg:.1f} deg and {self.offset:+.1f} mm from the coupon at its pose: "
-            "check the pose, or give mitsim import the window of the coupon (--coupon)"
+            f"the points lie in a plane {plane.tilt_deg:.1f} deg and {plane.offset:+.1f} mm from the coupon at its "
+            "pose: check the pose, or give mitsim import the window of the coupon (--coupon)"
         )
+    column, row = grid.project(coupon.centre)
+    inside = 0 <= column < grid.width and 0 <= row < grid.height
+    return "" if inside else "the coupon at its pose is outside the image: check the pose"
 
 
-def may_be_inverted(coupon: Coupon, inverted: Coupon) -> bool:
-    """Return whether a coupon at the inverse pose faces the sensor, at another place than the coupon."""
+def fits(decode: Decode, coupon: Coupon) -> bool:
+    """Return whether the points about a coupon lie in its plane."""
+    plane = _seen_plane(decode(coupon), coupon)
+    return plane is not None and plane.fits
+
+
+def fits_inverted(decode: Decode, sample: Sample, sensor_from_coupon: Transform) -> bool:
+    """Return whether the points lie in the plane of the coupon at the inverse of its pose, which is another place."""
+    return may_be_inverted(sample, sensor_from_coupon) and fits(decode, sample.at(sensor_from_coupon.inverse()))
+
+
+def may_be_inverted(sample: Sample, sensor_from_coupon: Transform) -> bool:
+    """Return whether the coupon at the inverse of its pose faces the sensor, at a place that is another one."""
+    coupon, inverted = sample.at(sensor_from_coupon), sample.at(sensor_from_coupon.inverse())
     apart = np.linalg.norm(coupon.centre - inverted.centre) > _APART * np.linalg.norm(coupon.centre)
     return bool(apart and inverted.normal @ inverted.centre < 0)
 
 
-def seen_plane(cloud: PointCloud, coupon: Coupon) -> SeenPlane | None:
+def _seen_plane(cloud: PointCloud, coupon: Coupon) -> _SeenPlane | None:
     """Return the plane of the points of a coupon at its pose (both sensor frame); None without one."""
     axes = np.stack([coupon.across, np.cross(coupon.normal, coupon.across), coupon.normal])
     x, y, z = axes @ (cloud.points[cloud.valid].astype(float) - coupon.centre).T
@@ -81,4 +121,4 @@ def seen_plane(cloud: PointCloud, coupon: Coupon) -> SeenPlane | None:
     noise = fit.residual_std
     tilted = tilt > _TILT_DEG and slope * half > noise
     aside = abs(offset) > max(_OFFSET * float(np.linalg.norm(coupon.centre)), noise)
-    return SeenPlane(tilt, offset, not tilted and not aside)
+    return _SeenPlane(tilt, offset, not tilted and not aside)

@@ -17,6 +17,7 @@ from mitsim.decoding.cloud import capture_geometry
 from mitsim.maps.campaign import store
 from mitsim.maps.campaign.acquire import (
     NAMED,
+    check_directions,
     found_shots,
     found_source,
     in_turn,
@@ -259,6 +260,25 @@ def test_poses_of_the_inverse_direction_are_told(kept, capfd):
         assert said_of(plan, place, shot, capfd, pose) == ""
         told = "if its pose is inverted" in said_of(plan, place, shot, capfd, pose.inverse())
         assert told == (shot.normal[2] < 0.99)
+
+
+@pytest.mark.parametrize("inverted", ["all", "none", "one"])
+def test_a_campaign_of_inverted_poses_is_refused(kept, tmp_path, inverted):
+    """One of many is told as it is measured."""
+    plan, folder = kept
+    for number, place in enumerate(sorted(found_shots(folder, plan))):
+        capture = read_capture(place)
+        wrong = inverted == "all" or (inverted == "one" and number == 1)
+        pose = capture.world_from_sensor.inverse() if wrong else capture.world_from_sensor
+        write_capture(replace(capture, source="device", world_from_sensor=pose), tmp_path / str(number))
+    found = found_shots(tmp_path, plan)
+    if inverted == "all":
+        with pytest.raises(
+            InputError, match=r"pose.json: world_from_sensor: found poses that fit .*only if .* inverted"
+        ):
+            check_directions(plan, found)
+    else:
+        check_directions(plan, found)
 
 
 @pytest.mark.parametrize("turn", [(0, 60, 0), (0, 180, 0), (90, 0, 0)])
