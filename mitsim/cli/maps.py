@@ -65,10 +65,11 @@ def make(
     if compact is not None:
         options.check_file(compact)
     found = None if captures is None else found_shots(captures, plan)
+    if found is not None:
+        check_directions(plan, found)
     for line in out_of_range(plan, found):
         say(line)
     if found is not None:
-        check_directions(plan, found)
         source = in_turn(found_source(found), plan)
         performance_map = measure_captures(plan, list(found.values()), source, output)
     elif live is not None:

@@ -228,3 +228,11 @@ def test_a_quaternion_of_unknown_order_or_length_is_refused(tmp_path, name, chan
     (tmp_path / "a.json").write_text(json.dumps(cameras))
     with pytest.raises(InputError, match=rf"{name}: found four numbers.*a name that ends in xyzw or wxyz"):
         read_calibration(tmp_path / "a.json", SIZE)
+
+
+def test_a_pose_of_the_second_camera_in_a_common_frame_is_not_its_pose_from_the_first(tmp_path):
+    """Before, T_cam_imu of one camera was read as its pose from the other."""
+    cameras = {f"cam{number}": {"K": matrix.tolist(), "D": BENT[number]} for number, matrix in enumerate(K)}
+    cameras["cam1"]["T_cam_imu"] = BODY[1].tolist()
+    (tmp_path / "a.json").write_text(json.dumps(cameras))
+    assert read_calibration(tmp_path / "a.json", SIZE).unrelated
