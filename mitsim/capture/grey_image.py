@@ -1,11 +1,12 @@
 """Read grey images from common image files, and check them.
 
-Signal chain: bytes -> chunks of a PNG, checked -> decoded image -> one channel of colour images, if requested -> grey
-image (H, W) of 8 or 16 bits.
+Signal chain: bytes -> chunks of a PNG, checked; pages of a TIFF -> decoded image -> one channel of colour images, if
+requested -> grey image (H, W) of 8 or 16 bits.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.checked_files import LARGEST_FILE, read_bounded
 from characterisation.files.errors import InputError
+from mitsim.capture.tiff_pages import TIFF_MARKS, tiff_pages
 from mitsim.sensor.png import LONGEST_SIDE_PX, PNG_SIGNATURE, check_png, decode_png, is_grey_png
 
 #: suffixes of the image files that are read
@@ -47,9 +49,9 @@ def channel_name(channel: int) -> str:
 
 
 def is_colour(path: Path) -> bool:
-    """Return whether an image file can be read and has channels that differ."""
+    """Return whether the first image of a file can be read and has channels that differ."""
     try:
-        read_grey(path)
+        next(read_pages(path))
     except InputError as error:
         return error.field == "colour"
     return False
@@ -64,9 +66,44 @@ def read_grey(path: Path, *, channel: int | None = None) -> Image:
     Raises
     ------
     InputError
-        If the file cannot be read, is not an image, or has channels that differ.
+        If the file cannot be read, is not an image, has several pages, or channels that differ.
     """
     return decode_grey(_bytes_of(path), path, channel=channel)
+
+
+def read_pages(path: Path, *, channel: int | None = None) -> Iterator[Image]:
+    """Yield the grey images (H, W) of a file as :func:`read_grey` does: all pages of a TIFF, in order.
+
+    Raises
+    ------
+    InputError
+        As :func:`read_grey`, with the number of the page among several.
+    """
+    data = _bytes_of(path)
+    pages = _pages(data, path)
+    for place, label in zip(pages, page_labels(path, len(pages)), strict=True):
+        yield _checked(_decoded(data, label, channel, place), label)
+
+
+def page_labels(path: str | Path, count: int) -> list[str]:
+    """Return a name for each of the images in a file, for messages and records; the only one has that of the file."""
+    return [str(path)] if count == 1 else [f"{path}, page {number} of {count}" for number in range(1, count + 1)]
+
+
+def page_count(path: Path) -> int:
+    """Return the number of images in a file.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or is a damaged TIFF.
+    """
+    begin = read_bounded(path, first=4)
+    return len(tiff_pages(_bytes_of(path), path)) if begin in TIFF_MARKS else 1
+
+
+def _pages(data: bytes, where: str | Path) -> list[int]:
+    return tiff_pages(data, where) if data[:4] in TIFF_MARKS else [0]
 
 
 def read_depths(path: Path) -> NDArray[Any]:
@@ -114,15 +151,27 @@ def decode_grey(data: bytes, where: str | Path, *, channel: int | None = None) -
     return _checked(_decoded(data, where, channel), where)
 
 
-def _decoded(data: bytes, where: str | Path, channel: int | None) -> NDArray[Any]:
-    """Return the numbers (H, W) of an image: its only channel, or the one that is asked for."""
+def _decoded(data: bytes, where: str | Path, channel: int | None, page: int | None = None) -> NDArray[Any]:
+    """Return the numbers (H, W) of an image: its only channel, or the one that is asked for.
+
+    ``page`` is its number in the file; by default the file has one.
+    """
+    if page is None:
+        page, *others = _pages(data, where)
+        if others:
+            found, hint = f"{1 + len(others)} pages", "save the page that is meant as a file of its own"
+            raise InputError(where, "pages", found, "one image", hint)
     if data.startswith(PNG_SIGNATURE):
         check_png(data, where)  # OpenCV would decode the undamaged part of a damaged PNG
         if is_grey_png(data):
             return decode_png(data, where)
     image = None
-    with suppress(cv2.error):  # reported below, as where OpenCV returns None
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    with suppress(cv2.error, IndexError):  # reported below, as where OpenCV returns None
+        numbers = np.frombuffer(data, np.uint8)
+        if page:
+            image = cv2.imdecodemulti(numbers, cv2.IMREAD_UNCHANGED, range=(page, page + 1))[1][0]
+        elif data:
+            image = cv2.imdecode(numbers, cv2.IMREAD_UNCHANGED)
     if image is None:
         raise InputError(where, "", "a file that is not an image, or is damaged", f"one of {', '.join(SUFFIXES)}")
     if image.ndim == 3:

@@ -45,7 +45,7 @@ def make(
     """
     options.start(variant)
     from characterisation.files.documents import read_toml
-    from mitsim.maps.campaign.acquire import found_shots, found_source, in_turn, out_of_range
+    from mitsim.maps.campaign.acquire import check_directions, found_shots, found_source, in_turn, out_of_range
     from mitsim.maps.campaign.live import live_source, place_by_place, plan_live
     from mitsim.maps.campaign.plan import CampaignFile, plan_campaign
     from mitsim.maps.campaign.run import measure_captures, run_campaign
@@ -65,6 +65,8 @@ def make(
     if compact is not None:
         options.check_file(compact)
     found = None if captures is None else found_shots(captures, plan)
+    if found is not None:
+        check_directions(plan, found)
     for line in out_of_range(plan, found):
         say(line)
     if found is not None:

@@ -7,9 +7,7 @@ A camera matrix is a matrix under a usual name (:mod:`mitsim.sensor.calibration_
 ``fy``, ``cx``, ``cy`` (``ppx``, ``ppy`` of librealsense); or two lists, such as ``focal_length`` and
 ``principal_point``; or one list of four beside a lens model or an image size (Kalibr, EuRoC). Distortion and pose stand
 in the same map, in a map inside it, or in those around it that have no other eye; size and model in any map around it.
-``T_cn_cnm1`` of Kalibr takes coordinates of the camera before to this one, ``T_cam_imu`` those of the IMU, in metres. A
-pose in the map of each camera takes coordinates of one common frame to the camera. Nine numbers of a rotation are by
-rows; those of librealsense (``rs2_extrinsics``) are by columns, and its lengths in metres.
+Poses: :mod:`mitsim.sensor.calibration_poses`.
 """
 
 from __future__ import annotations
@@ -22,9 +20,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from mitsim.sensor.calibration_names import USUAL_NAMES
+from mitsim.sensor.calibration_numbers import Composed, dotted, vector
+from mitsim.sensor.calibration_poses import pose_in, second_from_first
 
 #: number of maps around the deepest one that is searched; chosen
 _DEEPEST = 8
@@ -38,7 +37,7 @@ _SINGLE = (("fx", "fl_x"), ("fy", "fl_y"), ("cx", "ppx"), ("cy", "ppy"))
 _DOUBLE = (("focal_length", "focallength", "focal_px", "focal"), ("principal_point", "principalpoint", "principal_px"))
 
 #: names of an image's width and height
-_SIDES = (("width", "height"), ("image_width", "image_height"), ("w", "h"))
+_SIDES = (("width", "height"), ("image_width", "image_height"), ("img_width", "img_height"), ("w", "h"))
 
 #: names in small letters: of matrices in a map, of sizes, and of distortions
 _MATRICES = frozenset(name.lower() for name in (*USUAL_NAMES["matrix"][0], "matrix", "intrinsics", "intrinsic"))
@@ -49,25 +48,14 @@ _LENSES = frozenset(name.lower() for name in (*USUAL_NAMES["distortion"][0], "co
 _BENT = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "taux", "tauy")
 _FISHEYE = ("k1", "k2", "k3", "k4")
 
-#: Kalibr's name of the pose of a camera from the one before it
-_STEP = "T_cn_cnm1"
-#: Kalibr's name of the pose of a camera from the IMU
-_COMMON = "T_cam_imu"
-
 #: names under which maps state the model of a lens
-LENS_MODELS = ("camera_model", "distortion_model", "camera_type", "lens_model", "model_type", "model", "type")
+LENS_MODELS = (
+    *("camera_model", "distortion_model", "distortion_type", "camera_type", "lens_model"),
+    *("model_type", "model", "type"),
+)
 
 #: a map by its dotted name
 _Named = tuple[str, dict[str, Any]]
-
-
-@dataclass(frozen=True)
-class Composed:
-    """A ``value`` in OpenCV's form, the dotted names of its ``sources``, and the ``table`` that qualifies it."""
-
-    value: NDArray[np.float64]
-    sources: tuple[str, ...]
-    table: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -143,32 +131,16 @@ def usual_values(eyes: Sequence[Eye]) -> dict[str, Composed]:
         for name in {eye.name, eye.matrix_map}:
             out |= {f"+{what} of {name}": value for what, value in eye.values.items() if name}
     cameras, ordered = cameras_of(eyes)
-    poses = {"rotation": "+R", "translation": "+T"}
     if len(cameras) == 1:
         out |= _under(cameras[0], {"matrix": "+K", "distortion": "+D1", "size": "+size"})
     elif ordered and cameras:
         out |= _under(cameras[0], {"matrix": "+K1", "distortion": "+D1", "size": "+size"})
-        out |= _under(cameras[1], {"matrix": "+K2", "distortion": "+D2", "size": "+size2"} | poses)
-        if _STEP not in {source.rpartition(".")[2] for source in cameras[1].sources("rotation")}:
-            out |= _between(cameras[0], cameras[1])
+        out |= _under(cameras[1], {"matrix": "+K2", "distortion": "+D2", "size": "+size2"})
+        out |= second_from_first(cameras[0].values, cameras[1].values)
     for eye in [eye for eye in eyes if eye.is_projector][:1]:
         out |= _under(eye, {"matrix": "+K_proj", "distortion": "+D_proj", "size": "+size_proj"})
         out |= _under(eye, {"rotation": "+R_proj", "translation": "+T_proj"})
     return out
-
-
-def _between(first: Eye, second: Eye) -> dict[str, Composed]:
-    """Return R and T from the first camera to the second, if both are posed in a common frame."""
-    poses = [(eye.values.get("rotation"), eye.values.get("translation")) for eye in (first, second)]
-    (R1, T1), (R2, T2) = poses
-    if R1 is None or T1 is None or R2 is None or T2 is None:
-        return {}
-    turn1, turn2 = (Rotation.from_rotvec(R.value).as_matrix() if R.value.size == 3 else R.value for R in (R1, R2))
-    turn = turn2 @ turn1.T
-    return {
-        "+R": Composed(turn, (*R1.sources, *R2.sources), R2.table),
-        "+T": Composed(T2.value - turn @ T1.value, (*T1.sources, *T2.sources), T2.table),
-    }
 
 
 def _under(eye: Eye, names: dict[str, str]) -> dict[str, Composed]:
@@ -182,6 +154,9 @@ def _without_dots(tree: dict[str, Any]) -> dict[str, Any]:
         holder, dot, inner = name.rpartition(".")
         if dot and isinstance(out.get(holder, {}), dict):
             out[holder] = {**out.get(holder, {}), inner: value}
+    for name in ("Camera1", "Camera2"):  # ORB-SLAM3 states the size and the lens model of both once
+        if isinstance(out.get(name), dict) and isinstance(out.get("Camera"), dict):
+            out[name] = {**out["Camera"], **out[name]}
     return out
 
 
@@ -214,7 +189,7 @@ def _eye(path: list[_Named], depth: int, matrix: Composed) -> Eye:
         "matrix": Composed(matrix.value, matrix.sources, qualifying),
         "distortion": _lens(own, is_fisheye(qualifying)),
         "size": _size(around),
-        **_pose(own),
+        **pose_in(own),
     }
     name = path[depth - 1][0] or (path[1][0] if len(path) > 1 else "")
     return Eye(name, path[-1][0], {what: value for what, value in values.items() if value is not None})
@@ -302,49 +277,7 @@ def size_of(value: Any) -> NDArray[np.float64] | None:
     return None
 
 
-def _pose(maps: list[_Named]) -> dict[str, Composed]:
-    """Return R and T from the first camera to this eye, if its maps state them; those of no map need no search."""
-    of_librealsense = any("ppx" in table for _, table in maps)
-    for name, table in maps:
-        key = _STEP if _STEP in table else _COMMON
-        step = vector(table.get(key), 16)
-        if step is not None:
-            motion, metres, source = step.reshape(4, 4), {"unit": "m"}, (dotted(name, key),)
-            return {
-                "rotation": Composed(motion[:3, :3], source, metres),
-                "translation": Composed(motion[:3, 3], source, metres),
-            }
-        turn = next((each for each in ("R", "rotation", "rotation_matrix") if each in table), "")
-        shift = next((each for each in ("T", "t", "translation") if each in table), "")
-        R, T = vector(table.get(turn)), vector(table.get(shift), 3)
-        if name and T is not None and R is not None and len(R) in (3, 9):
-            rotation = R.reshape(3, 3) if len(R) == 9 else R
-            if of_librealsense and len(R) == 9 and np.ndim(table[turn]) == 1:
-                rotation, table = rotation.T, {"unit": "m"} | table
-            return {
-                "rotation": Composed(rotation, (dotted(name, turn),), table),
-                "translation": Composed(T, (dotted(name, shift),), table),
-            }
-    return {}
-
-
 def _number(value: Any) -> float:
     """Return a number; NaN of what is none, which the check of the matrix refuses."""
     found = vector(value, 1)
     return float("nan") if found is None else float(found[0])
-
-
-def dotted(*names: str) -> str:
-    """Return names joined by dots, without the empty ones."""
-    return ".".join(name for name in names if name)
-
-
-def vector(value: Any, size: int | None = None) -> NDArray[np.float64] | None:
-    """Return a value as finite numbers (n,), by rows; None if it is anything else, or has another ``size``."""
-    if value is None:
-        return None
-    try:
-        numbers = np.asarray(value, float).reshape(-1)
-    except (ValueError, TypeError, OverflowError):
-        return None
-    return numbers if np.isfinite(numbers).all() and (size is None or len(numbers) == size) else None

@@ -27,7 +27,7 @@ _WRITTEN: dict[str, tuple[str, str, str]] = {
         distortion_coefficients distortion_coeffs distortion_coeff dist_coeffs dist_coeff dist_coefs distCoeff
         distortion camera_distortion cam_kc cam_dist kc Dc D D1 distCoeffs distCoeffs1 distCoeffsL
         distortion_coefficients_1 distortion_coefficients_left D_left left_distortion
-        left_distortion_coefficients kc_left kc_cam DL dist dist1 distL +D1
+        left_distortion_coefficients kc_left kc_cam DL dist dist1 distL distortion_vector +D1
         """,
         """
         D2 distCoeffs2 distCoeffsR distortion_coefficients_2 distortion_coefficients_right D_right
@@ -51,8 +51,11 @@ _WRITTEN: dict[str, tuple[str, str, str]] = {
     ),
     "rotation": (
         "",
-        "R rotation rotation_matrix R_stereo om +R",
-        "R projector_R proj_R pro_R Rp R_p rotation rotation_matrix om +R_proj +R",
+        "R rotation rotation_matrix quaternion quaternion_xyzw quaternion_wxyz R_stereo om +R",
+        """
+        R projector_R proj_R pro_R Rp R_p rotation rotation_matrix quaternion quaternion_xyzw quaternion_wxyz om
+        +R_proj +R
+        """,
     ),
     "translation": (
         "",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,31 @@ from mitsim.sensor.transforms import is_rotation
 
 #: longest rotation vector [rad]; that of Rodrigues' formula is up to pi, of an adjustment a little more
 _LONGEST_VECTOR = 3.5
+
+
+@dataclass(frozen=True)
+class Composed:
+    """A ``value`` in OpenCV's form, the dotted names of its ``sources``, and the ``table`` that qualifies it."""
+
+    value: NDArray[np.float64]
+    sources: tuple[str, ...]
+    table: dict[str, Any]
+
+
+def dotted(*names: str) -> str:
+    """Return names joined by dots, without the empty ones."""
+    return ".".join(name for name in names if name)
+
+
+def vector(value: Any, size: int | None = None) -> NDArray[np.float64] | None:
+    """Return a value as finite numbers (n,), by rows; None if it is anything else, or has another ``size``."""
+    if value is None:
+        return None
+    try:
+        numbers = np.asarray(value, float).reshape(-1)
+    except (ValueError, TypeError, OverflowError):
+        return None
+    return numbers if np.isfinite(numbers).all() and (size is None or len(numbers) == size) else None
 
 
 def numbers_of(value: Any, file: Path, key: str, shapes: tuple[tuple[int, ...], ...]) -> NDArray[np.float64]:

@@ -8,7 +8,8 @@ sources and the table that qualifies it (:mod:`mitsim.sensor.calibration_qualifi
 - Computer Vision Toolbox of MATLAB: a structure made by ``toStruct``. Pixels count from 1, and sizes are (rows,
   columns). ``IntrinsicMatrix``, ``RotationOfCamera2`` and ``TranslationOfCamera2`` act on row vectors, so the matrices
   are transposed; ``K`` and ``PoseCamera2`` (R2022b and later) act on column vectors.
-- Kalibr, ORB-SLAM, librealsense and others, whose values stand in maps: :mod:`mitsim.sensor.calibration_eyes`.
+- Settings of ORB-SLAM3: ``Stereo.T_c1_c2`` takes coordinates of the second camera to the first.
+- Kalibr, librealsense and others, whose values stand in maps: :mod:`mitsim.sensor.calibration_eyes`.
 - ROS: a message ``sensor_msgs/CameraInfo`` has the values of a calibration file as flat lists, under one letter each.
 """
 
@@ -20,7 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.sensor.calibration_eyes import Composed, dotted, eyes_of, usual_values, vector
+from mitsim.sensor.calibration_eyes import eyes_of, usual_values
+from mitsim.sensor.calibration_numbers import Composed, dotted, vector
+from mitsim.sensor.calibration_poses import inverse
+from mitsim.sensor.calibration_quaternions import with_rotations
 
 #: endings of names in MATLAB's toolbox and similar programs: one camera, the cameras of a pair, camera and projector
 _ENDINGS = ("", "_left", "_right", "_cam", "_proj", "_camera", "_projector")
@@ -36,8 +40,10 @@ _MESSAGE = {
 
 def with_usual_names(tree: dict[str, Any]) -> dict[str, Any]:
     """Return the tree of one file, with composed values under names that begin with a plus."""
+    tree = with_rotations(tree)
     out = _of_message(tree)
     out |= usual_values(eyes_of(out)) | _bouguet(out)
+    out |= _orb_slam(out)
     for name, holder in [("", tree), *((name, value) for name, value in tree.items() if isinstance(value, dict))]:
         if isinstance(holder.get("CameraParameters1"), dict):
             out |= _toolbox_pair(holder, name)
@@ -59,6 +65,19 @@ def _of_message(tree: dict[str, Any]) -> dict[str, Any]:
         numbers = vector(tree[name], None if letter == "d" else math.prod(shape))
         out[usual] = tree[name] if numbers is None else numbers.reshape(shape)
     return out | {"image_width": tree["width"], "image_height": tree["height"]}
+
+
+def _orb_slam(tree: dict[str, Any]) -> dict[str, Any]:
+    """Return the values that settings of ORB-SLAM3 state once for two cameras [m]; a rectified pair has one matrix."""
+    metres = {"unit": "m"}
+    step, baseline = vector(tree.get("Stereo.T_c1_c2"), 16), vector(tree.get("Stereo.b"), 1)
+    if step is not None:
+        posed = Composed(inverse(step.reshape(4, 4)), ("Stereo.T_c1_c2",), metres)
+        return {"+R": posed, "+T": posed}
+    if str(tree.get("Camera.type")).lower() != "rectified" or baseline is None or "+K" not in tree:
+        return {}
+    out = {"+K2": tree["+K"], "+T": Composed(np.array([-baseline[0], 0, 0]), ("Stereo.b",), metres)}
+    return out | {"+R": Composed(np.eye(3), ("Stereo.b",), metres)}
 
 
 def _bouguet(tree: dict[str, Any]) -> dict[str, Any]:

@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
-from mitsim.sensor.calibration_eyes import LENS_MODELS, vector
+from mitsim.sensor.calibration_eyes import LENS_MODELS
+from mitsim.sensor.calibration_numbers import vector
 from mitsim.sensor.camera import Camera
 
 #: focal length over the longer side: fields of view from 169 deg to 0.06 deg
@@ -47,7 +48,7 @@ UNITS_MM = {
 LENGTHS_MM = {word: UNITS_MM[word] for word in ("um", "mm", "cm", "m", "inch", "foot")}
 
 #: names under which files state their unit of length
-_UNIT_NAMES = ("unit", "units", "length_unit", "world_units", "WorldUnits", "translation_unit", "baseline_unit")
+UNIT_NAMES = ("unit", "units", "length_unit", "world_units", "WorldUnits", "translation_unit", "baseline_unit")
 
 #: units of other quantities that may have the same name
 _NOT_LENGTHS = ("px", "pixel", "pixels", "deg", "degree", "degrees", "rad", "radian", "radians", "none")
@@ -56,7 +57,15 @@ _NOT_LENGTHS = ("px", "pixel", "pixels", "deg", "degree", "degrees", "rad", "rad
 _MODELS = {
     **dict.fromkeys(
         (
-            *("plumb_bob", "radtan", "radial-tangential", "rational_polynomial", "brown_conrady", "none"),
+            *(
+                "plumb_bob",
+                "radtan",
+                "radial-tangential",
+                "radialtangential",
+                "rational_polynomial",
+                "brown_conrady",
+                "none",
+            ),
             *("pinhole", "perspective", "opencv"),
         ),
         "perspective",
@@ -257,12 +266,14 @@ def lens_model(
     found: str | None = None
     for name in LENS_MODELS:
         text = table.get(name)
+        if name == "distortion_type" and isinstance(text, int | float):
+            text = {0: "perspective", 1: "fisheye"}.get(int(text), str(text))  # MC-Calib
         if not isinstance(text, str) or not text:
             continue
         word = text.lower().removeprefix("distortion.")  # as librealsense's wrappers write it
         known = _MODELS.get(word)
         other = word in _OTHER_MODELS or (word in _OF_ZEROS and not straight)
-        if name == "distortion_model":
+        if name in ("distortion_model", "distortion_type"):
             other = known is None and not straight
         if other and given is None:
             hint = 'if the coefficients are OpenCV\'s, say so in a sensor file: model = "perspective" or "fisheye"'
@@ -281,7 +292,7 @@ def unit_mm(table: dict[str, Any], where: str | Path) -> float | None:
     InputError
         If the unit is unknown.
     """
-    for name in _UNIT_NAMES:
+    for name in UNIT_NAMES:
         text = table.get(name)
         if isinstance(text, str) and text:
             unit = UNITS_MM.get(text.lower())

@@ -16,8 +16,10 @@ from typing import Any
 import numpy as np
 
 from characterisation.files.errors import InputError
-from mitsim.sensor.calibration_eyes import Composed, Eye, eyes_of, vector
+from mitsim.sensor.calibration_eyes import Eye, cameras_of, eyes_of
 from mitsim.sensor.calibration_formats import read_documents
+from mitsim.sensor.calibration_numbers import Composed, vector
+from mitsim.sensor.calibration_poses import second_from_first
 from mitsim.sensor.calibration_programs import with_usual_names
 
 #: names of quantities derived from the rest of a calibration, or that state its quality
@@ -115,7 +117,13 @@ def read_tree(files: list[Path]) -> CalibrationTree:
         If a file is missing or cannot be read.
     """
     read = [(file, with_usual_names(document)) for file in files for document in read_documents(file)]
-    return CalibrationTree([file for file, _ in read], [values for _, values in read])
+    tree = CalibrationTree([file for file, _ in read], [values for _, values in read])
+    if len(files) == len(read) == 2:  # of one camera each, as of EuRoC
+        first, second = (cameras_of(eyes_of(values))[0] for values in tree.values)
+        if len(first) == len(second) == 1 and first[0].sources("rotation"):
+            tree.values[1] |= second_from_first(first[0].values, second[0].values)
+            tree.seen.update((0, source) for source in first[0].sources("rotation"))
+    return tree
 
 
 def tree_of(tables: dict[str, dict[str, Any]]) -> CalibrationTree:

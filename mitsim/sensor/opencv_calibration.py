@@ -26,7 +26,9 @@ from mitsim.sensor.calibration_doubts import baseline_note, facing_note, lens_no
 from mitsim.sensor.calibration_eyes import size_of
 from mitsim.sensor.calibration_names import USUAL_NAMES, Names
 from mitsim.sensor.calibration_numbers import by_rows, checked_matrix, numbers_of, rotation_matrix
+from mitsim.sensor.calibration_poses import is_motion
 from mitsim.sensor.calibration_qualifiers import lens_model, of_images, read_out_of, rectified_pair, unit_mm
+from mitsim.sensor.calibration_quaternions import ORDERED
 from mitsim.sensor.calibration_tree import CalibrationTree, Found, read_tree
 
 
@@ -142,9 +144,9 @@ def has_pair(tree: CalibrationTree) -> bool:
 def _with_files_of_ros(
     calibration_table: CalibrationTable, named: list[str], tree: CalibrationTree
 ) -> CalibrationTable:
-    """Return the table; files of ROS, each of which has one camera, are given to the cameras in their order."""
+    """Return the table; files of one camera each, as of ROS, are given to the cameras in their order."""
     cameras = calibration_table.cameras
-    alone = [{"camera_matrix", "projection_matrix"} <= set(values) for values in tree.values]
+    alone = [{"camera_matrix", "projection_matrix"} <= set(values) or "+K" in values for values in tree.values]
     if calibration_table.keys or not len(cameras) == len(named) == len(alone) == 2 or not all(alone):
         return calibration_table
     keys = {name: EyeKeys(file=file) for name, file in zip(cameras, named, strict=True)}
@@ -302,11 +304,18 @@ def _pose(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[s
     pair = rectified_pair(values.tables[0], values.tables[-1])
     needed = pair is None
     motions = ((4, 4), (3, 4))
-    shapes = ((3, 3), (9,), (3,), (3, 1), (1, 3), *motions)
+    shapes = ((3, 3), (9,), (3,), (3, 1), (1, 3), (4,), (4, 1), (1, 4), *motions)
     rotation = values.find(name, place, "rotation", shapes, needed and "rotation_deg" not in own)
     translation = values.find(name, place, "translation", ((3,), *motions), needed and "position_mm" not in own)
     if rotation is not None and translation is not None:
         R, T = rotation.value, translation.value
+        for found in (rotation, translation):
+            if not is_motion(found.value):
+                hint = "write it by rows, the translation in the last column"
+                raise InputError(found.file, found.name, found.value.tolist(), "4 x 4 with the last row 0 0 0 1", hint)
+        if R.size == 4:
+            allowed = f"a rotation matrix or vector, or {ORDERED}"
+            raise InputError(rotation.file, rotation.name, f"four numbers, {R.ravel().tolist()}", allowed)
         R, T = R[:3, :3] if R.shape in motions else R, T[:3, 3] if T.shape in motions else T
         stated = unit_mm(translation.table, translation.file)
     elif pair is not None:

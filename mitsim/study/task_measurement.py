@@ -29,6 +29,7 @@ from characterisation.tasks.task_reading import check_features
 from mitsim.decoding.input_clouds import margin_of
 from mitsim.maps.prediction.predictor import EDGE_MARGIN_PX, Predictor
 from mitsim.scene.load import Scene
+from mitsim.sensor.calibration_poses import is_motion
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.poses import as_pose
 from mitsim.sensor.sensor import Sensor
@@ -289,10 +290,11 @@ def read_pose(path: Path, view: int | None = None) -> Transform:
 
 def _pose(path: Path, matrix: Any) -> Transform:
     try:
-        pose = Transform.from_matrix(np.array(matrix, float).reshape(4, 4))
+        rows = np.array(matrix, float).reshape(4, 4)
+        pose = Transform.from_matrix(rows)
     except (OverflowError, TypeError, ValueError):
         raise InputError(path, "world_from_sensor", repr(matrix)[:60], "a 4 x 4 matrix, rows first [mm]") from None
-    if not is_rotation(pose.rotation, 1e-4) or not np.isfinite(pose.translation).all():
+    if not is_motion(rows) or not is_rotation(pose.rotation, 1e-4) or not np.isfinite(pose.translation).all():
         raise InputError(
             path, "world_from_sensor", "a matrix that is not a rigid motion", "a rotation, and a translation in mm"
         )

@@ -218,6 +218,56 @@ def _kalibr(folder):
     return path
 
 
+def _orb_slam(folder):
+    from tests.sensor.test_calibrated_poses import BENT, FIRST_FROM_SECOND, orb_slam
+
+    path = folder / "settings.yaml"
+    path.write_text(orb_slam("PinHole", BENT, ("k1", "k2", "p1", "p2"), FIRST_FROM_SECOND), encoding="utf-8")
+    return path
+
+
+def _mc_calib(folder):
+    from tests.sensor.test_calibrated_poses import ROUND, mc_calib
+
+    return mc_calib(folder, 1, ROUND)
+
+
+def _quaternion(folder):
+    from tests.sensor.test_calibrated_poses import QUATERNIONS, posed, xyz
+
+    cameras, quaternion, shift = posed(QUATERNIONS["quaternion"], metres=1.0)
+    path = folder / "quaternion.json"
+    path.write_text(json.dumps(cameras | {"quaternion": quaternion, "translation": xyz(shift)}), encoding="utf-8")
+    return path
+
+
+def _pose_of_ros(folder):
+    path = folder / "pose.yaml"
+    place, turn = "x: 0.1\n  y: -0.02\n  z: 0.5\n", "x: 0.0\n  y: 0.6\n  z: 0.0\n  w: 0.8\n"
+    path.write_text(f"position:\n  {place}orientation:\n  {turn}", encoding="utf-8")
+    return path
+
+
+def _read_pose_option(path):
+    from mitsim.capture.recordings.pose_file import read_pose
+
+    read_pose(path)
+
+
+def _stack_of_pages(folder):
+    import cv2
+
+    cv2.imwritemulti(str(folder / "stack.tif"), [np.full((6, 8), level, np.uint16) for level in (100, 200, 300)])
+    return folder / "stack.tif"
+
+
+def _read_stack(path):
+    from mitsim.capture.grey_image import page_count, read_pages
+
+    page_count(path)
+    list(read_pages(path))
+
+
 def _toolbox(folder):
     from scipy.io import savemat
 
@@ -680,6 +730,11 @@ READERS: dict[str, Reader] = {
     "calibration.npz": Reader(_npz, _read_calibration),
     "calibration.yaml of ROS": Reader(_ros, _read_cameras),
     "camchain.yaml": Reader(_kalibr, _read_cameras),
+    "settings of ORB-SLAM3": Reader(_orb_slam, _read_cameras),
+    "cameras of MC-Calib": Reader(_mc_calib, _read_cameras),
+    "quaternion.json": Reader(_quaternion, _read_cameras),
+    "pose of ROS": Reader(_pose_of_ros, _read_pose_option),
+    "stack.tif": Reader(_stack_of_pages, _read_stack),
     "stereo.mat": Reader(_toolbox, _read_cameras),
     "maps.json": Reader(_maps_of_cameras("maps.json"), _read_cameras),
     "maps.yaml": Reader(_maps_of_cameras("maps.yaml"), _read_cameras),

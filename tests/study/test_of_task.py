@@ -74,6 +74,10 @@ def test_poses_of_every_kind_of_file(statement, tmp_path):
         ("[]", "a JSON object"),
         ('{"world_from_sensor": null}', "4 x 4 matrix"),
         (json.dumps({"world_from_sensor": (2 * np.eye(4)).tolist()}), "not a rigid motion"),
+        (
+            json.dumps({"world_from_sensor": (np.eye(4) + np.eye(4, k=-1) * [0, 0, 500, 0]).tolist()}),
+            "not a rigid motion",
+        ),
         (json.dumps({"world_from_sensor": [10**400] * 16}), "4 x 4 matrix"),
         ('{"views": [{"no": 1}]}', "entries that cannot be read"),
         ('{"views": [{"view": 1e999, "part_from_sensor": 1}]}', "entries that cannot be read"),

@@ -3,14 +3,15 @@
 Signal chain: sensor file -> files of each camera, in order -> images, checked for number, size, bits and colour ->
 :class:`~mitsim.capture.capture.Capture` with the code and the decoder's settings of the sensor file.
 
-Files are ordered by number: ``image_2.png`` comes before ``image_10.png``. The sensor file's ``[pattern]`` describes
-the images; an ``image_sequence`` lists them in any order.
+Files are ordered by number: ``image_2.png`` comes before ``image_10.png``. Each page of a TIFF is an image. The sensor
+file's ``[pattern]`` describes the images; an ``image_sequence`` lists them in any order.
 """
 
 from __future__ import annotations
 
 import re
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,16 @@ from characterisation.files.threads import in_threads
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_bits import bits_of, from_bit_0
-from mitsim.capture.grey_image import CHANNELS, SUFFIXES, Image, channel_name, is_colour, read_grey
+from mitsim.capture.grey_image import (
+    CHANNELS,
+    SUFFIXES,
+    Image,
+    channel_name,
+    is_colour,
+    page_count,
+    page_labels,
+    read_pages,
+)
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.light_code import LightCode, roles
@@ -56,22 +66,23 @@ def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNEL
     both = len(rig.cameras) == 2 and (decoder.triangulate == "cameras" or len(sensor.images or {}) == 2)
     used = list(rig.cameras) if both else list(rig.cameras)[:1]
     images: dict[str, Image] = {}
-    files: dict[str, list[Path]] = {}
+    files: dict[str, list[str]] = {}
     names, colour = {}, False
     for name in used:
         found = _files(folder, sensor, name, len(used))
-        if len(found) != count:
+        counts = [page_count(path) for path in found]
+        if sum(counts) != count:
             raise InputError(
                 folder,
                 f"images of {name}",
-                f"{len(found)}{_ends(found)}",
+                f"{sum(counts)}{_ends(found)}",
                 f"{count}, as the pattern of {sensor.name}",
                 advice(found, name, count, sensor.ambient_image) if found else _content(folder, used),
             )
-        files[name] = found
-        images[name] = _stack(found, rig.cameras[name], channel)
+        files[name] = _labels(found, counts)
+        images[name] = _stack(found, counts, rig.cameras[name], channel)
         colour |= is_colour(found[0])
-        names[name] = [path.relative_to(folder).as_posix() for path in found]
+        names[name] = _labels([path.relative_to(folder).as_posix() for path in found], counts)
     too_large = sensor.bits is not None and any(int(each.max()) >= 2**sensor.bits for each in images.values())
     empty = 0
     if sensor.bits is None or too_large:
@@ -120,7 +131,7 @@ def size_of_images(folder: Path) -> tuple[int, int] | None:
         for path in sorted(folder.glob(pattern), key=counted):
             if path.suffix.lower() in SUFFIXES and path.is_file():
                 with suppress(InputError):
-                    image = read_grey(path, channel=CHANNELS["green"])
+                    image = next(read_pages(path, channel=CHANNELS["green"]))
                     return image.shape[1], image.shape[0]
     return None
 
@@ -148,26 +159,32 @@ def _files(folder: Path, sensor: Sensor, camera: str, cameras: int) -> list[Path
     return sorted(own, key=counted)
 
 
-def _stack(files: list[Path], camera: Camera, channel: int) -> Image:
-    """Return the images (P, H, W) of one camera."""
-    first = read_grey(files[0], channel=channel)
-    out = np.empty((len(files), camera.height, camera.width), first.dtype)
+def _labels(files: Sequence[Path | str], counts: list[int]) -> list[str]:
+    """Return the names of the images in files, with the number of the page in those of several."""
+    return [label for file, count in zip(files, counts, strict=True) for label in page_labels(file, count)]
+
+
+def _stack(files: list[Path], counts: list[int], camera: Camera, channel: int) -> Image:
+    """Return the images (P, H, W) of one camera, of which each file has a number in ``counts``."""
+    first, labels = next(read_pages(files[0], channel=channel)), _labels(files, counts)
+    out = np.empty((len(labels), camera.height, camera.width), first.dtype)
 
     def read(index: int) -> None:
-        path = files[index]
-        image = read_grey(path, channel=channel) if index else first
-        if image.shape != (camera.height, camera.width):
-            found = f"{image.shape[1]} x {image.shape[0]} px"
-            raise InputError(path, "size", found, f"{camera.width} x {camera.height} px, as the calibration says")
-        if image.dtype != first.dtype:
-            raise InputError(path, "depth", f"{image.itemsize * 8} bits", f"{first.itemsize * 8}, as {files[0].name}")
-        out[index] = image
+        for number, image in enumerate(read_pages(files[index], channel=channel), sum(counts[:index])):
+            if image.shape != (camera.height, camera.width):
+                found = f"{image.shape[1]} x {image.shape[0]} px"
+                allowed = f"{camera.width} x {camera.height} px, as the calibration says"
+                raise InputError(labels[number], "size", found, allowed)
+            if image.dtype != first.dtype:
+                allowed = f"{first.itemsize * 8}, as {files[0].name}"
+                raise InputError(labels[number], "depth", f"{image.itemsize * 8} bits", allowed)
+            out[number] = image
 
     in_threads(read, range(len(files)))
     return out
 
 
-def _check_levels(stack: Image, files: list[Path], bits: int) -> None:
+def _check_levels(stack: Image, files: list[str], bits: int) -> None:
     """Check that images (P, H, W) have the bits that the sensor file states.
 
     Raises

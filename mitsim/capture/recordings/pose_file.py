@@ -1,13 +1,15 @@
 """Read the pose of a sensor, ``world_from_sensor``, 4 x 4 [mm], from a file.
 
 The file is JSON, as ``pose.json`` of a capture, optionally with the covariance, or a list of rows; or text, four rows
-of four numbers, as NumPy, MATLAB and robots write them.
+of four numbers, as NumPy, MATLAB and robots write them; or JSON or YAML with a place and a quaternion of known order,
+such as a pose or a transform of ROS, which are in metres.
 """
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +18,22 @@ from characterisation.files.checked_files import read_bounded
 from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
 from mitsim.capture.calibration import PoseDocument
+from mitsim.sensor.calibration_numbers import vector
+from mitsim.sensor.calibration_qualifiers import UNIT_NAMES, unit_mm
+from mitsim.sensor.calibration_quaternions import ORDERED, with_rotations
 from mitsim.sensor.transforms import Transform
+from mitsim.sensor.yaml_values import read_yaml
 
-_WANTED = "pose.json of a capture, or four rows of four numbers: a rigid motion, mm"
+_WANTED = (
+    "pose.json of a capture; four rows of four numbers: a rigid motion, mm; or a map of position, mm or with its unit, "
+    f"and orientation: {ORDERED}"
+)
+
+#: messages of ROS in which a pose stands
+_MESSAGES = ("pose", "transform")
+
+#: names of a position, and endings of those of an orientation
+_PLACES, _TURNS = ("position", "translation"), ("orientation", "rotation", "quaternion", "xyzw", "wxyz")
 
 
 def read_pose(file: str | Path) -> tuple[Transform, NDArray[np.float64] | None]:
@@ -30,13 +45,18 @@ def read_pose(file: str | Path) -> tuple[Transform, NDArray[np.float64] | None]:
         If the file cannot be read, or contains no rigid motion.
     """
     file = Path(file)
-    text = read_bounded(file, "a pose").decode("utf-8", errors="replace").strip()
+    data = read_bounded(file, "a pose")
+    text = data.decode("utf-8", errors="replace").strip()
     if text.startswith(("{", "[")):
         try:
             table = json.loads(text)
         except (ValueError, RecursionError) as error:
             raise InputError(file, "", f"text that is not JSON ({error})", _WANTED) from None
         table = {"world_from_sensor": table} if isinstance(table, list) else table
+    elif ":" in text:
+        table, *more = read_yaml(file, data, _WANTED)
+        if more:
+            raise InputError(file, "", f"{1 + len(more)} documents", "one pose")
     else:
         try:
             rows = [
@@ -49,9 +69,29 @@ def read_pose(file: str | Path) -> tuple[Transform, NDArray[np.float64] | None]:
         if [len(row) for row in rows] != [4, 4, 4, 4]:
             raise InputError(file, "", "another text", _WANTED)
         table = {"world_from_sensor": rows}
-    if not isinstance(table, dict) or table.get("world_from_sensor") is None:
+    if "world_from_sensor" not in table:
+        table = {"world_from_sensor": _rows_of(file, table)}
+    if table["world_from_sensor"] is None:
         raise InputError(file, "world_from_sensor", "nothing", _WANTED)
     document = validate(file, table, PoseDocument)
     pose = document.transform()
     assert pose is not None  # checked above
     return pose, None if document.covariance is None else np.array(document.covariance)
+
+
+def _rows_of(file: Path, table: dict[str, Any]) -> list[list[float]]:
+    """Return the rows (4, 4) [mm] of a map with the position and the orientation of the sensor in the world."""
+    while (name := next((each for each in _MESSAGES if isinstance(table.get(each), dict)), None)) is not None:
+        table = table[name]
+    table = with_rotations(table)
+    names = [name for name in table if name not in UNIT_NAMES]
+    places = [name for name in names if name in _PLACES]
+    turns = [name for name in names if name.lower().endswith(_TURNS)]
+    T, R = (vector(table[each[0]]) if len(each) == 1 else None for each in (places, turns))
+    if T is None or R is None or len(names) > 2 or len(T) != 3 or len(R) != 9:
+        order = " of unknown order or length" if R is not None and len(R) == 4 else ""
+        raise InputError(file, "", f"{', '.join(map(str, table))}{order}", _WANTED)
+    rows = np.eye(4)
+    rows[:3, :3], rows[:3, 3] = R.reshape(3, 3), T * (unit_mm(table, file) or 1.0)
+    out: list[list[float]] = rows.tolist()
+    return out

@@ -40,6 +40,8 @@ _MARKS = {
     b"\x89PNG": "depth",
     b"II*\x00": "depth",
     b"MM\x00*": "depth",
+    b"II+\x00": "depth",
+    b"MM\x00+": "depth",
     b"P5": "depth",
     b"Pf\n": "depth",
 }

@@ -24,9 +24,10 @@ from mitsim.sensor.projector_images import counted
 
 #: what to do without a pose of the second camera
 _POSE = (
-    "name the values in a TOML beside the file: [calibration] with file, cameras, projector = false and "
-    "[calibration.keys.NAME], where rotation and translation take points of the first camera to the second (also both "
-    "the same 3 x 4 or 4 x 4 matrix); of rectified images R is the unit matrix and T = [-baseline, 0, 0]"
+    "name the values in a TOML beside the file: [calibration] with file (one, or that of each camera), cameras, "
+    "projector = false and [calibration.keys.NAME], where rotation and translation take points of the first camera to "
+    "the second (also both the same 3 x 4 or 4 x 4 matrix); of rectified images R is the unit matrix and T = "
+    "[-baseline, 0, 0]"
 )
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -31,7 +32,7 @@ from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decoding.cloud import Geometry, capture_cloud, capture_geometry, sensor_geometry
 from mitsim.decoding.depth_range import depths_of, range_warning
 from mitsim.maps.campaign.plan import Campaign, Shot, view_axes
-from mitsim.maps.campaign.pose_doubt import pose_doubt
+from mitsim.maps.campaign.pose_doubt import DIRECTION, fits, fits_inverted, may_be_inverted, pose_doubt
 from mitsim.maps.campaign.store import Finished
 from mitsim.running.progress import say
 from mitsim.sensor.sensor import Sensor
@@ -45,6 +46,9 @@ Source = Callable[[Sequence[Shot]], Iterator[tuple[Shot, Finished]]]
 
 #: number of captures out of range that are named one by one
 NAMED = 5
+
+#: number of captures whose poses are checked for their direction before all are measured
+_CHECKED = 5
 
 #: largest relative difference between the distance of a found capture and its planned distance
 DISTANCE_SLACK = 0.05
@@ -132,11 +136,13 @@ def measured(capture: Capture, shot: Shot, geometry: Geometry, sensor: Sensor, k
     --------
     coupon_cloud : the cloud that it measures
     """
-    coupon = shot.series.sample.at(coupon_place(capture, shot))
+    sample, place = shot.series.sample, coupon_place(capture, shot)
+    coupon = sample.at(place)
     if own_sensor(capture, sensor) is not sensor:
         geometry = capture_geometry(capture, sensor.settings)
-    cloud = coupon_cloud(capture, coupon, geometry, sensor)
-    if capture.source != "simulated" and (doubt := pose_doubt(cloud, coupon)):
+    decode = partial(coupon_cloud, capture, geometry=geometry, sensor=sensor)
+    cloud = decode(coupon)
+    if capture.source != "simulated" and (doubt := pose_doubt(cloud, decode, sample, place)):
         say(f"warning: {shot.series.name}, {shot.name}: {doubt}")
     patches = measure_patches(cloud, coupon)
     if not keep_images:
@@ -147,6 +153,30 @@ def measured(capture: Capture, shot: Shot, geometry: Geometry, sensor: Sensor, k
         "normal": [float(component) for component in shot.normal],
     }
     return Finished(patches, capture.source, replace(capture, settings={**capture.settings, "coupon": shown}))
+
+
+def check_directions(campaign: Campaign, found: dict[Path, Shot]) -> None:
+    """Check a few captures of :func:`found_shots`, of all tilts, for poses that are inverted as a whole.
+
+    Raises
+    ------
+    InputError
+        If the points of two or more lie in the plane of the coupon at the inverse pose, and those of none at its pose.
+    """
+    told = []
+    tilted = [place for place, shot in found.items() if may_be_inverted(shot.series.sample, shot.sensor_from_coupon)]
+    tilted.sort(key=lambda place: found[place].normal[2])
+    for place in tilted[:: max(len(tilted) // _CHECKED, 1)]:
+        capture, shot = read_capture(place), found[place]
+        decode = partial(
+            coupon_cloud, capture, geometry=capture_geometry(capture, campaign.sensor.settings), sensor=campaign.sensor
+        )
+        if capture.source == "simulated" or fits(decode, shot.series.sample.at(shot.sensor_from_coupon)):
+            return
+        told += [place] if fits_inverted(decode, shot.series.sample, shot.sensor_from_coupon) else []
+    if len(told) > 1:
+        inside = f"poses that fit the points only if they are inverted, also in {', '.join(map(str, told[1:]))}"
+        raise InputError(told[0] / "pose.json", "world_from_sensor", inside, "from sensor to coupon", DIRECTION)
 
 
 def coupon_place(capture: Capture, shot: Shot) -> Transform:
@@ -182,7 +212,7 @@ def coupon_cloud(capture: Capture, coupon: Coupon, geometry: Geometry, sensor: S
     measured : decodes and measures the patches
     """
     grid = geometry.grid
-    corners = grid.project(coupon.corners())
+    corners = np.nan_to_num(grid.project(coupon.corners()))  # NaN is behind the sensor
     low = np.clip(np.floor(corners.min(axis=0)).astype(int) - 2, 0, [grid.width - 1, grid.height - 1])
     high = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 3, low + 1, [grid.width, grid.height])
     return capture_cloud(capture, sensor.settings, geometry, Roi.between(*low, *high), sensor.imager)
@@ -213,7 +243,7 @@ def found_shots(folder: str | Path, campaign: Campaign) -> dict[Path, Shot]:
     """Return the captures of coupons in a folder and its subfolders as shots of a campaign.
 
     Each capture must name its sample (``settings.coupon.sample``) and have a pose, with the coupon's frame as the
-    world. It belongs to the nearest planned distance.
+    world, z toward the sensor. It belongs to the nearest planned distance.
 
     Raises
     ------
@@ -282,6 +312,9 @@ def _found_shot(place: Path, campaign: Campaign) -> Shot:
     if world_from_sensor is None:
         hint = "mitsim import --coupon COLUMN ROW WIDTH HEIGHT takes it from the plane of a coupon's points"
         raise InputError(place / "pose.json", "world_from_sensor", "null", "the pose, in the coupon's frame", hint)
+    if world_from_sensor.translation[2] <= 0:
+        found, allowed = "a sensor behind the coupon", "a position with z over 0 in the coupon's frame"
+        raise InputError(place / "pose.json", "world_from_sensor", found, allowed, "the coupon's z faces the sensor")
     pose = world_from_sensor.inverse()
     distance = float(np.linalg.norm(pose.translation - campaign.sensor.rig.reference.sensor_from_camera.translation))
     nominal = min(campaign.distances, key=lambda planned: abs(np.log(distance / planned)))

@@ -8,6 +8,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import yaml
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from characterisation.files.errors import InputError
@@ -246,3 +248,46 @@ def test_depths_that_nobody_has_named_are_said_to_be_assumed(pairs):
     words = "assumed: the capture has no range; set --range"
     assert words in run("decode", pairs / "capture", "-o", pairs / "cloud.ply").output
     assert words not in run("decode", pairs / "capture", "--range", 300, 900, "-o", pairs / "cloud.ply").output
+
+
+TURN = Rotation.from_euler("xyz", [170.0, 12.0, 40.0], degrees=True)
+X, Y, Z, W = TURN.as_quat().tolist()
+PLACE = {"x": 0.1, "y": -0.02, "z": 0.5}
+FOUR = {"x": X, "y": Y, "z": Z, "w": W}
+
+#: the sensor at 100, -20, 500 mm in the world, turned by TURN
+OF_QUATERNIONS = {
+    "echo of ROS": yaml.dump({"header": {"frame_id": "map"}, "pose": {"position": PLACE, "orientation": FOUR}})
+    + "---\n",
+    "transform": json.dumps({"child_frame_id": "sensor", "transform": {"translation": PLACE, "rotation": FOUR}}),
+    "x, y, z, w": json.dumps({"position": [100, -20, 500], "quaternion_xyzw": [X, Y, Z, W]}),
+    "w, x, y, z in cm": json.dumps({"translation": [10, -2, 50], "quaternion_wxyz": [W, X, Y, Z], "unit": "cm"}),
+    "matrix": json.dumps({"translation": [100, -20, 500], "rotation": TURN.as_matrix().tolist()}),
+}
+
+
+@pytest.mark.parametrize("name", OF_QUATERNIONS)
+def test_a_pose_of_a_position_and_an_orientation(tmp_path, name):
+    (tmp_path / "pose").write_text(OF_QUATERNIONS[name])
+    pose, covariance = read_pose(tmp_path / "pose")
+    points = np.array([[0.0, 0.0, 0.0], [30.0, -40.0, 600.0]])
+    np.testing.assert_allclose(pose.points(points), TURN.apply(points) + np.array([100, -20, 500]), atol=1e-9)
+    assert covariance is None
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"position": [0, 0, 500], "orientation": [0, 0, 0, 1]}, "position, orientation of unknown order or length"),
+        ({"position": [0, 0, 500], "quaternion_xyzw": [0, 0, 0, 2]}, "of unknown order or length"),
+        ({"pose": {"pose": {"position": PLACE}}}, "found position; allowed"),
+        ({"position": PLACE, "orientation": FOUR, "covariance": [0.0] * 36}, "found position, orientation, covariance"),
+        ({"position": PLACE, "orientation": FOUR, "unit": "miles"}, "unit: found 'miles'"),
+        ({"position": [1, 2], "orientation": FOUR}, "found position, orientation; allowed"),
+    ],
+)
+def test_a_pose_of_unknown_meaning_is_refused(tmp_path, table, words):
+    for text in (json.dumps(table), yaml.dump(table, sort_keys=False)):
+        (tmp_path / "pose").write_text(text)
+        with pytest.raises(InputError, match=words):
+            read_pose(tmp_path / "pose")

@@ -17,6 +17,7 @@ from mitsim.decoding.cloud import capture_geometry
 from mitsim.maps.campaign import store
 from mitsim.maps.campaign.acquire import (
     NAMED,
+    check_directions,
     found_shots,
     found_source,
     in_turn,
@@ -152,6 +153,7 @@ def altered(kept, tmp_path, change):
             lambda c: replace(c, world_from_sensor=replace(c.world_from_sensor, translation=np.array([0, 0, 700.0]))),
             "distance",
         ),
+        (lambda c: replace(c, world_from_sensor=Transform(np.eye(3), np.array([0, 0, -500.0]))), "world_from_sensor"),
     ],
 )
 def test_a_capture_that_cannot_be_placed_is_named(kept, tmp_path, change, field):
@@ -240,3 +242,48 @@ def test_a_pose_that_contradicts_the_points_is_told(kept, capfd, turn, shift, to
     capture = replace(capture, source="device", world_from_sensor=moved)
     measured(capture, shot, capture_geometry(capture, plan.sensor.settings), plan.sensor, False)
     assert ("from the coupon at its pose: check the pose" in capfd.readouterr().err) == told
+
+
+def said_of(plan, place, shot, capfd, pose):
+    capture = replace(read_capture(place), source="device", world_from_sensor=pose)
+    measured(capture, shot, capture_geometry(capture, plan.sensor.settings), plan.sensor, False)
+    return capfd.readouterr().err
+
+
+def test_poses_of_the_inverse_direction_are_told(kept, capfd):
+    """Before, a tilt of 32 deg gave no patch, or F = 0, in silence. The pose without a tilt is its own inverse."""
+    plan, folder = kept
+    shots = {place: shot for place, shot in found_shots(folder, plan).items() if "white" in shot.series.sample.finish}
+    assert len(shots) > 5
+    for place, shot in shots.items():
+        pose = read_capture(place).world_from_sensor
+        assert said_of(plan, place, shot, capfd, pose) == ""
+        told = "if its pose is inverted" in said_of(plan, place, shot, capfd, pose.inverse())
+        assert told == (shot.normal[2] < 0.99)
+
+
+@pytest.mark.parametrize("inverted", ["all", "none", "one"])
+def test_a_campaign_of_inverted_poses_is_refused(kept, tmp_path, inverted):
+    """One of many is told as it is measured."""
+    plan, folder = kept
+    for number, place in enumerate(sorted(found_shots(folder, plan))):
+        capture = read_capture(place)
+        wrong = inverted == "all" or (inverted == "one" and number == 1)
+        pose = capture.world_from_sensor.inverse() if wrong else capture.world_from_sensor
+        write_capture(replace(capture, source="device", world_from_sensor=pose), tmp_path / str(number))
+    found = found_shots(tmp_path, plan)
+    if inverted == "all":
+        with pytest.raises(
+            InputError, match=r"pose.json: world_from_sensor: found poses that fit .*only if .* inverted"
+        ):
+            check_directions(plan, found)
+    else:
+        check_directions(plan, found)
+
+
+@pytest.mark.parametrize("turn", [(0, 60, 0), (0, 180, 0), (90, 0, 0)])
+def test_a_coupon_out_of_the_image_is_told(kept, capfd, turn):
+    plan, folder = kept
+    place, shot = next(iter(found_shots(folder, plan).items()))
+    pose = read_capture(place).world_from_sensor @ Transform.from_degrees(turn, (0.0, 0.0, 0.0))
+    assert "the coupon at its pose is outside the image" in said_of(plan, place, shot, capfd, pose)
