@@ -59,7 +59,7 @@ _Named = tuple[str, dict[str, Any]]
 
 
 @dataclass(frozen=True)
-class Eye:
+class CalibratedEye:
     """A camera or projector: the dotted ``name`` of its map, that of its matrix, and its ``values``.
 
     ``values`` by ``matrix``, ``distortion``, ``size``, ``rotation`` and ``translation``, if the file states them.
@@ -88,7 +88,7 @@ class Eye:
         return None if number is None else int(number[1])
 
 
-def eyes_of(tree: dict[str, Any]) -> list[Eye]:
+def eyes_of(tree: dict[str, Any]) -> list[CalibratedEye]:
     """Return the eyes of one file, in its order.
 
     A matrix under a usual name in no map is none of them, since such names need no search.
@@ -99,7 +99,7 @@ def eyes_of(tree: dict[str, Any]) -> list[Eye]:
         if matrix is not None and not any("radialdistortion" in map(str.lower, table) for _, table in path):
             found.append((path, matrix))  # MATLAB's, whose pixels count from 1, has other readers
     alone = not any(vector(value, 9) is not None for value in tree.values())
-    out: list[Eye] = []
+    out: list[CalibratedEye] = []
     for path, matrix in found:
         depth = next(
             at + 1
@@ -111,7 +111,7 @@ def eyes_of(tree: dict[str, Any]) -> list[Eye]:
     return out
 
 
-def cameras_of(eyes: Sequence[Eye]) -> tuple[list[Eye], bool]:
+def cameras_of(eyes: Sequence[CalibratedEye]) -> tuple[list[CalibratedEye], bool]:
     """Return the eyes that are no projectors, and whether their order is known: from their names, or from a pose."""
     cameras = [eye for eye in eyes if not eye.is_projector]
     places = [eye.place for eye in cameras]
@@ -121,7 +121,7 @@ def cameras_of(eyes: Sequence[Eye]) -> tuple[list[Eye], bool]:
     return sorted(cameras, key=lambda eye: "rotation" in eye.values), posed.count(False) <= 1
 
 
-def usual_values(eyes: Sequence[Eye]) -> dict[str, Composed]:
+def usual_values(eyes: Sequence[CalibratedEye]) -> dict[str, Composed]:
     """Return the values of eyes under the usual names with a plus, and each as ``+WHAT of NAME``.
 
     Several cameras without an order have no usual names: the user has to choose.
@@ -143,7 +143,7 @@ def usual_values(eyes: Sequence[Eye]) -> dict[str, Composed]:
     return out
 
 
-def _under(eye: Eye, names: dict[str, str]) -> dict[str, Composed]:
+def _under(eye: CalibratedEye, names: dict[str, str]) -> dict[str, Composed]:
     return {name: eye.values[what] for what, name in names.items() if what in eye.values}
 
 
@@ -175,7 +175,7 @@ def _maps(path: list[_Named]) -> Iterator[list[_Named]]:
                 yield from _maps([*path, (dotted(name, own), inner)])
 
 
-def _eye(path: list[_Named], depth: int, matrix: Composed) -> Eye:
+def _eye(path: list[_Named], depth: int, matrix: Composed) -> CalibratedEye:
     """Return the eye of the last map of a path; the maps around it from ``depth`` on have no other eye."""
     own: list[_Named] = []
     for name, table in reversed(path[depth - 1 :]):
@@ -192,7 +192,7 @@ def _eye(path: list[_Named], depth: int, matrix: Composed) -> Eye:
         **pose_in(own),
     }
     name = path[depth - 1][0] or (path[1][0] if len(path) > 1 else "")
-    return Eye(name, path[-1][0], {what: value for what, value in values.items() if value is not None})
+    return CalibratedEye(name, path[-1][0], {what: value for what, value in values.items() if value is not None})
 
 
 def _is_beside(value: Any) -> bool:

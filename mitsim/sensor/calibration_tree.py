@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from characterisation.files.errors import InputError
-from mitsim.sensor.calibration_eyes import Eye, cameras_of, eyes_of
+from mitsim.sensor.calibration_eyes import CalibratedEye, cameras_of, eyes_of
 from mitsim.sensor.calibration_formats import read_documents
 from mitsim.sensor.calibration_numbers import Composed, vector
 from mitsim.sensor.calibration_poses import second_from_first
@@ -88,7 +88,7 @@ class CalibrationTree:
                 raise InputError(other.file, name, both, "a value of one file, or the same in all", hint)
         return found[0] if found else None
 
-    def eyes(self) -> list[Eye]:
+    def eyes(self) -> list[CalibratedEye]:
         """Return the cameras and projectors that stand in maps."""
         return [eye for tree in self.values for eye in eyes_of(tree)]
 
