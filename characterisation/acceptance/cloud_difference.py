@@ -138,15 +138,15 @@ def distribution(difference: Floats, points_given: int) -> Difference:
     )
 
 
-def same_grid(one: ViewGrid, other: ViewGrid) -> bool:
+def same_grid(grid: ViewGrid, other: ViewGrid) -> bool:
     """Return whether two grids have the same rays, to a hundredth of a pixel and a micrometre."""
-    if (one.width, one.height) != (other.width, other.height):
+    if (grid.width, grid.height) != (other.width, other.height):
         return False
-    if not np.allclose(one.origin, other.origin, atol=1e-3):
+    if not np.allclose(grid.origin, other.origin, atol=1e-3):
         return False
-    corners = np.array([0, one.width - 1, 0, one.width - 1]), np.array([0, 0, one.height - 1, one.height - 1])
-    apart = np.linalg.norm(one.rays_at(*corners) - other.rays_at(*corners), axis=-1)
-    return bool((apart < 0.01 * one.angular_pitch).all())
+    corners = np.array([0, grid.width - 1, 0, grid.width - 1]), np.array([0, 0, grid.height - 1, grid.height - 1])
+    apart = np.linalg.norm(grid.rays_at(*corners) - other.rays_at(*corners), axis=-1)
+    return bool((apart < 0.01 * grid.angular_pitch).all())
 
 
 class _Searched:

@@ -224,7 +224,7 @@ def fit_form(points: ArrayLike, surface: Plane | Cylinder, viewpoint: ArrayLike 
         variance * np.eye(modes.shape[1]),
         float(np.sqrt(variance)),
         len(chosen),
-        np.column_stack([_scaled(one) for one in _coordinates(surface, at.foot[chosen])]),
+        np.column_stack([_scaled(coordinate) for coordinate in _coordinates(surface, at.foot[chosen])]),
         heights,
         float(np.sqrt(noise / len(chosen) * np.mean(slope**2))),
     )

@@ -195,17 +195,17 @@ def _check_form(path: Path, data: xr.Dataset, schema: Schema) -> None:
             raise InputError(path, name, str(variable.dtype), _IN_WORDS[one.kind], schema.hint)
 
 
-def _check_values(path: Path, name: str, values: NDArray[Any], one: Variable) -> None:
-    if one.kind == "text":
+def _check_values(path: Path, name: str, values: NDArray[Any], variable: Variable) -> None:
+    if variable.kind == "text":
         if not all(isinstance(value, str) and len(value) <= LONGEST_TEXT for value in values.ravel().tolist()):
             raise InputError(path, name, "values that are not text", "texts")
         return
     if not values.size:
         return
     unknown = np.isnan(values) if values.dtype.kind == "f" else np.zeros(values.shape, bool)
-    if unknown.any() and not one.gaps:
+    if unknown.any() and not variable.gaps:
         raise InputError(path, name, f"{np.count_nonzero(unknown)} values that are not numbers", "numbers")
-    low, high = (0, 1) if one.kind == "truth" else (one.low, one.high)
+    low, high = (0, 1) if variable.kind == "truth" else (variable.low, variable.high)
     wrong = ~unknown & ~((values >= low) & (values <= high) & np.isfinite(values))
     if wrong.any():
         allowed = "finite numbers" if math.isinf(low) and math.isinf(high) else f"{low:g} to {high:g}"

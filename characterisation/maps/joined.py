@@ -81,7 +81,7 @@ def mean_over(maps: Sequence[PerformanceMap]) -> PerformanceMap:
     """
     data = maps[0].data.copy(deep=True)
     fraction, sigma, fraction_error, sigma_error = (
-        np.stack([one.data[name].values.astype(float) for one in maps])
+        np.stack([performance_map.data[name].values.astype(float) for performance_map in maps])
         for name in ("recovered_fraction", "ray_noise_std", "recovered_fraction_error", "ray_noise_std_error")
     )
     count = len(maps)
@@ -103,7 +103,7 @@ def mean_over(maps: Sequence[PerformanceMap]) -> PerformanceMap:
     for name in ("false_fraction", "noise_area", "persistent_share", "bias_share", "patches"):
         if name not in data:
             continue
-        values = np.stack([one.data[name].values.astype(float) for one in maps])
+        values = np.stack([performance_map.data[name].values.astype(float) for performance_map in maps])
         finite = np.isfinite(values)
         with np.errstate(invalid="ignore"):
             fields[name] = np.where(finite, values, 0.0).sum(axis=0) / np.where(
@@ -124,7 +124,11 @@ def with_directions(
     """
     angles = np.arange(len(maps)) * 180.0 / len(maps)
     fields = {
-        stored: (LAY_NODES, np.stack([one.data[name].values for one in maps], axis=1), maps[0].data[name].attrs)
+        stored: (
+            LAY_NODES,
+            np.stack([performance_map.data[name].values for performance_map in maps], axis=1),
+            maps[0].data[name].attrs,
+        )
         for name, stored in LAY_FIELDS.items()
     }
     described = {"units": "deg", "long_name": "direction of u of a surface with a lay, about the mirror direction"}

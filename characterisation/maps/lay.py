@@ -135,9 +135,9 @@ def between_directions(
 def _in_directions(surface: Surface, number: NDArray[np.int64], distance: Floats, normals: Floats) -> list[Floats]:
     """Return F, sigma and their errors, (n,) each, from the direction of each point."""
     out = [np.full(len(distance), np.nan) for _ in range(4)]
-    for k, one in enumerate(surface.directions):
+    for k, direction in enumerate(surface.directions):
         chosen = np.flatnonzero(number == k)
         if len(chosen):
-            for values, found in zip(out, one.look_up(distance[chosen], normals[chosen]), strict=False):
+            for values, found in zip(out, direction.look_up(distance[chosen], normals[chosen]), strict=False):
                 values[chosen] = found
     return out

@@ -88,7 +88,7 @@ class Light:
         return f"reflectance {self.reflectance:.3g}, {self.wide_angle:.3g} at wide angles{lobe}"
 
 
-NUMBERS = tuple(one.name for one in fields(Light) if one.name not in ("kind", "as_made"))
+NUMBERS = tuple(field.name for field in fields(Light) if field.name not in ("kind", "as_made"))
 
 #: variables of a map by field: name, unit, long name
 VARIABLES: dict[str, tuple[str, str, str]] = {
@@ -112,15 +112,17 @@ SCHEMA = {
 }
 
 
-def same_light(one: Light, other: Light) -> bool:
+def same_light(light: Light, other: Light) -> bool:
     """Return whether two surfaces have equal optical properties, within :data:`SAME`."""
-    return one.kind == other.kind and all(_near(a, b, b) for a, b in zip(one.numbers(), other.numbers(), strict=True))
+    return light.kind == other.kind and all(
+        _near(a, b, b) for a, b in zip(light.numbers(), other.numbers(), strict=True)
+    )
 
 
-def lies_between(one: Light, low: Light, high: Light) -> bool:
+def lies_between(light: Light, low: Light, high: Light) -> bool:
     """Return whether each number of a surface lies between those of two others, within :data:`SAME`."""
-    return one.kind == low.kind == high.kind and all(
-        _near(number, *ends) for number, *ends in zip(one.numbers(), low.numbers(), high.numbers(), strict=True)
+    return light.kind == low.kind == high.kind and all(
+        _near(number, *ends) for number, *ends in zip(light.numbers(), low.numbers(), high.numbers(), strict=True)
     )
 
 
@@ -137,11 +139,11 @@ def light_variables(lights: Sequence[Light | None]) -> dict[str, tuple[str, Any,
     for field, (name, units, description) in VARIABLES.items():
         attributes = {"long_name": description} | ({"units": units} if units else {})
         if field == "kind":
-            values: Any = np.array(["" if one is None else one.kind for one in lights], dtype=str)
+            values: Any = np.array(["" if light is None else light.kind for light in lights], dtype=str)
         elif field == "as_made":
-            values = np.array([one is not None and one.as_made for one in lights], np.int8)
+            values = np.array([light is not None and light.as_made for light in lights], np.int8)
         else:
-            values = np.array([math.nan if one is None else getattr(one, field) for one in lights], float)
+            values = np.array([math.nan if light is None else getattr(light, field) for light in lights], float)
         out[name] = ("sample", values, attributes)
     return out
 

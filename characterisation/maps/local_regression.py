@@ -159,9 +159,9 @@ def local_fit(
             part = _Tile(coarse, by_abscissa, place, radius[chosen], slopes, link)
             found.append(part.fit(radius[chosen], None if own is None else own[which[chosen]], keep))
         order = np.concatenate(tiles)
-        estimate[which[order], rung[order]] = np.concatenate([one.estimate for one in found])
+        estimate[which[order], rung[order]] = np.concatenate([fit.estimate for fit in found])
         for name, values in sums.items():
-            values[which[order], rung[order]] = np.concatenate([getattr(one, name) for one in found])
+            values[which[order], rung[order]] = np.concatenate([getattr(fit, name) for fit in found])
     return LocalFit(estimate, **sums)
 
 

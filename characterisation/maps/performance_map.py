@@ -232,7 +232,7 @@ class PerformanceMap:
         from characterisation.plots.discs import draw_performance, noise_limits
         from characterisation.plots.style import axes_for
 
-        name, rough = next((one for one in self.samples if finish in (None, one[0])), (str(finish), math.nan))
+        name, rough = next((sample for sample in self.samples if finish in (None, sample[0])), (str(finish), math.nan))
         if roughness is not None or name not in self.finishes:
             rough = self.require(name, math.nan if roughness is None else roughness)
         nearest, farthest = float(self._distances[0]), float(self._distances[-1])

@@ -98,7 +98,7 @@ def _row(pairs: Sequence[Pair]) -> dict[str, float]:
     both = [p for p in known if math.isfinite(p.predicted.sigma) and math.isfinite(p.measured.sigma)]
     sigma = np.array([p.predicted.sigma / p.measured.sigma - 1 for p in both])
     sigma_error = np.array(
-        [math.hypot(*(one.sigma_error / one.sigma for one in (p.measured, p.predicted))) for p in both]
+        [math.hypot(*(overall.sigma_error / overall.sigma for overall in (p.measured, p.predicted))) for p in both]
     )
     points = np.array([p.measured.fraction for p in both])
     one_sided = [p for p in known if math.isfinite(p.predicted.sigma) != math.isfinite(p.measured.sigma)]

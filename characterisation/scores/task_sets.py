@@ -115,18 +115,25 @@ class _JoinedSet:
         best: dict[InputQuantity, ExpectedInput],
         joining: SetJoining,
     ) -> None:
-        self.quantities = list(dict.fromkeys(one for quantities in needed_inputs.values() for one in quantities))
-        sizes = [len(best[one].fit.covariance) for one in self.quantities]
+        self.quantities = list(
+            dict.fromkeys(quantity for quantities in needed_inputs.values() for quantity in quantities)
+        )
+        sizes = [len(best[quantity].fit.covariance) for quantity in self.quantities]
         ends = dict(zip(self.quantities, np.cumsum(sizes), strict=True))
         self.rigid = [
-            np.zeros((size, 6)) if one.kind == "pose" else rigid_derivatives(best[one].estimate, joining.about)
-            for one, size in zip(self.quantities, sizes, strict=True)
+            np.zeros((size, 6))
+            if quantity.kind == "pose"
+            else rigid_derivatives(best[quantity].estimate, joining.about)
+            for quantity, size in zip(self.quantities, sizes, strict=True)
         ]
         self.quadratic = np.zeros((len(needed_inputs), sum(sizes), sum(sizes)))
         for m, (name, quantities) in enumerate(needed_inputs.items()):
-            places = [np.arange(ends[one] - len(best[one].fit.covariance), ends[one]) for one in quantities]
-            motion = np.concatenate([self.rigid[self.quantities.index(one)] for one in quantities])
-            variances = np.concatenate([np.diag(best[one].fit.covariance) for one in quantities])
+            places = [
+                np.arange(ends[quantity] - len(best[quantity].fit.covariance), ends[quantity])
+                for quantity in quantities
+            ]
+            motion = np.concatenate([self.rigid[self.quantities.index(quantity)] for quantity in quantities])
+            variances = np.concatenate([np.diag(best[quantity].fit.covariance) for quantity in quantities])
             form = invariant(joint_quadratic_form(task, name, best), motion, variances)
             self.quadratic[m][np.ix_(np.concatenate(places), np.concatenate(places))] = form
 
@@ -136,12 +143,12 @@ class _JoinedSet:
             one.fit if isinstance(one := known[quantity], ExpectedInput) and one.fit.chance >= least_chance else None
             for quantity in self.quantities
         ]
-        causes = max((one.shared.shape[1] for one in fits if one is not None), default=1)
+        causes = max((fit.shared.shape[1] for fit in fits if fit is not None), default=1)
         return JoinedView(
-            tuple(None if one is None else one.noise_covariance for one in fits),
+            tuple(None if fit is None else fit.noise_covariance for fit in fits),
             tuple(
-                np.zeros((len(motion), causes)) if one is None else one.shared
-                for one, motion in zip(fits, self.rigid, strict=True)
+                np.zeros((len(motion), causes)) if fit is None else fit.shared
+                for fit, motion in zip(fits, self.rigid, strict=True)
             ),
         )
 

@@ -157,8 +157,8 @@ def budget(
     drawn = float(every[known].var(ddof=1))
     found = components(
         every[known],
-        {name: np.asarray(one, float)[known] for name, one in numbers.items()},
-        {name: np.asarray(one)[known] for name, one in seeds.items()},
+        {name: np.asarray(number, float)[known] for name, number in numbers.items()},
+        {name: np.asarray(seed)[known] for name, seed in seeds.items()},
         errors.part(known).gradients if isinstance(errors, OneSidedErrors) else None,
     )
     low, high = _intervals(found)

@@ -97,7 +97,9 @@ def size_dependence(
     if len(error) < 3 * _LEAST:
         return None
     apart = error - error.mean()
-    varied = [(one, one.values[first]) for one in numbers if np.ptp(one.values[first]) > 0]
+    varied = [
+        (drawn_number, drawn_number.values[first]) for drawn_number in numbers if np.ptp(drawn_number.values[first]) > 0
+    ]
     if not varied or not np.ptp(np.abs(apart)) > 0:
         return None
     tests = [spearmanr(np.abs(apart), values) for _, values in varied]

@@ -93,16 +93,16 @@ def components(
     parts = np.array_split(np.arange(count), max(1, round(count / AT_ONCE)))
     scale = float(values.std()) or 1.0
     along = None if directions is None else np.asarray(directions, float)
-    by_group = {name: _standard(np.asarray(one, float)) for name, one in numbers.items()}
+    by_group = {name: _standard(np.asarray(number, float)) for name, number in numbers.items()}
     by_group = {name: one for name, one in by_group.items() if one.shape[1]}
-    levels = _distinct({name: np.asarray(one) for name, one in seeds.items()}, parts)
+    levels = _distinct({name: np.asarray(seed) for name, seed in seeds.items()}, parts)
     names = (*by_group, *levels, RESIDUAL)
     drawn = np.array([name in by_group for name in names])
     found = np.zeros(len(names))
     covariance = np.zeros((len(names), len(names)))
     for part in parts:
         kernels = [one[part] @ one[part].T / one.shape[1] for one in by_group.values()]
-        kernels += [(one[part][:, None] == one[part]).astype(float) for one in levels.values()]
+        kernels += [(level[part][:, None] == level[part]).astype(float) for level in levels.values()]
         stack = np.array([*kernels, np.eye(len(part))])
         if along is not None:
             stack *= along[part] @ along[part].T
@@ -126,10 +126,10 @@ def _distinct(seeds: Mapping[str, NDArray[np.int64]], parts: list[NDArray[np.int
     """Return the groups whose shared seeds every part of the trials can tell from those of others."""
     out: dict[str, NDArray[np.int64]] = {}
     known: list[tuple[bytes, ...]] = [tuple(np.eye(len(part), dtype=bool).tobytes() for part in parts)]
-    for name, one in seeds.items():
-        same = tuple((one[part][:, None] == one[part]).tobytes() for part in parts)
+    for name, seed in seeds.items():
+        same = tuple((seed[part][:, None] == seed[part]).tobytes() for part in parts)
         if not any(a == b for other in known for a, b in zip(same, other, strict=True)):
-            out[name] = one
+            out[name] = seed
             known.append(same)
     return out
 

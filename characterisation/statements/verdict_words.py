@@ -79,20 +79,20 @@ def fits_all(judged: Sequence[Judged]) -> bool:
     return not any(one.verdict in ("does not fit", "undecidable") for one in judged)
 
 
-def _ratio(one: Judged) -> float:
-    ratio = one.uncertainty / one.needed if one.needed > 0 else math.inf
+def _ratio(judged: Judged) -> float:
+    ratio = judged.uncertainty / judged.needed if judged.needed > 0 else math.inf
     return math.inf if math.isnan(ratio) else ratio
 
 
-def _why(one: Judged) -> str:
-    words = "is undecidable" if one.verdict == "undecidable" else "does not fit"
-    if not math.isfinite(one.uncertainty):
-        by = "by screening, no view can make it" if one.trials == 0 else "no virtual measurement gave a value"
-        return f"{one.name} {words}: {by}"
-    if one.fits_corrected:
-        return f"{one.name} {words} unless its bias is subtracted"
-    needed = f", {_two(one.needed)} {one.unit} needed" if math.isfinite(one.needed) else ""
-    return f"{one.name} {words}: standard uncertainty {_two(one.uncertainty)} {one.unit}{needed}"
+def _why(judged: Judged) -> str:
+    words = "is undecidable" if judged.verdict == "undecidable" else "does not fit"
+    if not math.isfinite(judged.uncertainty):
+        by = "by screening, no view can make it" if judged.trials == 0 else "no virtual measurement gave a value"
+        return f"{judged.name} {words}: {by}"
+    if judged.fits_corrected:
+        return f"{judged.name} {words} unless its bias is subtracted"
+    needed = f", {_two(judged.needed)} {judged.unit} needed" if math.isfinite(judged.needed) else ""
+    return f"{judged.name} {words}: standard uncertainty {_two(judged.uncertainty)} {judged.unit}{needed}"
 
 
 def _percent(share: float) -> str:

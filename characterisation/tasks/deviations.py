@@ -281,13 +281,13 @@ def _pose_turn(pose: Pose, ideal: Pose) -> Array:
 
 
 def _from_right_angle(fits: Sequence[Any], ideal: Sequence[Any]) -> Array:
-    first, second = (direction(_alike(one, wanted)) for one, wanted in zip(fits, ideal, strict=True))
+    first, second = (direction(_alike(fit, wanted)) for fit, wanted in zip(fits, ideal, strict=True))
     return np.array([[np.arcsin(np.clip(first @ second, -1.0, 1.0))]])
 
 
 def _tilt(fits: Sequence[Any], ideal: Sequence[Any]) -> Array:
     """Return the angle (1, 3) [rad] of two lines as a vector across the second."""
-    first, second = (direction(_alike(one, wanted)) for one, wanted in zip(fits, ideal, strict=True))
+    first, second = (direction(_alike(fit, wanted)) for fit, wanted in zip(fits, ideal, strict=True))
     if direction(ideal[0]) @ direction(ideal[1]) < 0:
         second = -second
     across = first - (first @ second) * second

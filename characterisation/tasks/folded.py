@@ -116,7 +116,7 @@ class FoldedValue:
 def folded_values(task: Task) -> dict[str, FoldedValue]:
     """Return the measurements of a task whose values fold, by name."""
     found = {name: folded_value(task, name) for name in task.measurements}
-    return {name: one for name, one in found.items() if one is not None}
+    return {name: value for name, value in found.items() if value is not None}
 
 
 def folded_value(task: Task, measurement: str) -> FoldedValue | None:

@@ -39,7 +39,7 @@ def direction(feature: Plane | Axis) -> Array:
 
 def askew_deg(features: Sequence[object]) -> float:
     """Return the angle [deg], 0 to 90, between the lines of two planes or axes; 0 of anything else."""
-    lines = [direction(one) for one in features if isinstance(one, Plane | Cylinder | Cone)]
+    lines = [direction(feature) for feature in features if isinstance(feature, Plane | Cylinder | Cone)]
     if len(lines) != 2:
         return 0.0
     return float(np.degrees(np.arcsin(min(float(np.linalg.norm(np.cross(lines[0], lines[1]))), 1.0))))
@@ -56,17 +56,17 @@ def intersection(features: Sequence[Plane | Axis]) -> Point:
     ValueError
         If the features are none of the three.
     """
-    kinds = sorted("plane" if isinstance(one, Plane) else "axis" for one in features)
+    kinds = sorted("plane" if isinstance(feature, Plane) else "axis" for feature in features)
     if kinds not in (["axis", "plane"], ["plane", "plane", "plane"], ["axis", "axis"]):
         raise ValueError(f"no point follows from {' and '.join(kinds)}")
-    middle = np.mean([one.point for one in features], axis=0)
+    middle = np.mean([feature.point for feature in features], axis=0)
     rows, values = [], []
-    for one in features:
-        along = direction(one)
+    for feature in features:
+        along = direction(feature)
         # distances are along the normal of a plane, and perpendicular to an axis
-        across = np.outer(along, along) if isinstance(one, Plane) else np.eye(3) - np.outer(along, along)
+        across = np.outer(along, along) if isinstance(feature, Plane) else np.eye(3) - np.outer(along, along)
         rows.append(across)
-        values.append(across @ (one.point - middle))
+        values.append(across @ (feature.point - middle))
     matrix = np.concatenate(rows)
     solution, _, _, singular = np.linalg.lstsq(matrix, np.concatenate(values), rcond=None)
     if singular[-1] < PARALLEL:
@@ -101,7 +101,7 @@ def between_planes(first: Plane, second: Plane, middle: Array) -> tuple[float, A
     """
     other = second.normal if first.normal @ second.normal >= 0 else -second.normal
     mean = unit(first.normal + other)
-    high, low = ((one.point - middle) @ one.normal / (mean @ one.normal) for one in (first, second))
+    high, low = ((plane.point - middle) @ plane.normal / (mean @ plane.normal) for plane in (first, second))
     return float(high - low), mean
 
 

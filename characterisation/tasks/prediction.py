@@ -155,16 +155,18 @@ def expected_measurement(
         known.append(one)
     scale = _scale(task, measurement)
     parts = [
-        scale * evaluate(value, [one.estimate], one.fit.covariance)[1]
-        for one, value in zip(known, _one_by_one(model.value, known), strict=True)
+        scale * evaluate(value, [expected_input.estimate], expected_input.fit.covariance)[1]
+        for expected_input, value in zip(known, _one_by_one(model.value, known), strict=True)
     ]
     chances = {
-        name: one.fit.chance for quantity, one in zip(quantities, known, strict=True) for name in quantity.features
+        name: expected_input.fit.chance
+        for quantity, expected_input in zip(quantities, known, strict=True)
+        for name in quantity.features
     }
-    together = _at_its_points(model.value, [one.fit.middle for one in known])
-    shared = np.concatenate([one.fit.shared for one in known])
-    covariance = block_diag(*[one.fit.noise_covariance for one in known]) + shared @ shared.T
-    total = scale * evaluate(together, [one.estimate for one in known], covariance)[1]
+    together = _at_its_points(model.value, [expected_input.fit.middle for expected_input in known])
+    shared = np.concatenate([expected_input.fit.shared for expected_input in known])
+    covariance = block_diag(*[expected_input.fit.noise_covariance for expected_input in known]) + shared @ shared.T
+    total = scale * evaluate(together, [expected_input.estimate for expected_input in known], covariance)[1]
     if not math.isfinite(total):
         return ExpectedMeasurement(math.nan, 0.0, "the measurement has no value here", quantities, tuple(parts))
     return ExpectedMeasurement(total, math.prod(chances.values()), "", quantities, tuple(parts))
@@ -180,17 +182,20 @@ def joint_quadratic_form(task: Task, measurement: str, inputs: Mapping[InputQuan
     """
     model = measurement_model(task, measurement)
     known = [inputs[quantity] for quantity in model.inputs]
-    value = _at_its_points(model.value, [one.fit.middle for one in known])
-    estimates = [one.estimate for one in known]
-    sizes = [len(one.fit.covariance) for one in known]
+    value = _at_its_points(model.value, [expected_input.fit.middle for expected_input in known])
+    estimates = [expected_input.estimate for expected_input in known]
+    sizes = [len(expected_input.fit.covariance) for expected_input in known]
     best = value(*estimates)
-    steps = STEP * np.concatenate([np.sqrt(np.diag(one.fit.covariance)) for one in known])
+    steps = STEP * np.concatenate([np.sqrt(np.diag(expected_input.fit.covariance)) for expected_input in known])
 
     def moment(step: Floats) -> float:
         total = 0.0
         for sign in (1.0, -1.0):
             parts = np.split(sign * step, np.cumsum(sizes)[:-1])
-            moved = [one.moved(part) if part.any() else one for one, part in zip(estimates, parts, strict=True)]
+            moved = [
+                estimate.moved(part) if part.any() else estimate
+                for estimate, part in zip(estimates, parts, strict=True)
+            ]
             total += 0.5 * (value(*moved) - best) ** 2
         return total
 
@@ -211,7 +216,10 @@ def _scale(task: Task, measurement: str) -> float:
 
 def _one_by_one(value: Callable[..., float], known: Sequence[ExpectedInput]) -> list[Callable[[Any], float]]:
     """Return the measurement as a function of each of its inputs alone, with the others fixed."""
-    at_points, estimates = _at_its_points(value, [one.fit.middle for one in known]), [one.estimate for one in known]
+    at_points, estimates = (
+        _at_its_points(value, [expected_input.fit.middle for expected_input in known]),
+        [one.estimate for one in known],
+    )
 
     def alone(index: int) -> Callable[[Any], float]:
         return lambda moved: at_points(*estimates[:index], moved, *estimates[index + 1 :])
@@ -225,8 +233,8 @@ def _at_its_points(value: Callable[..., float], middles: Sequence[Floats]) -> Ca
     def at_points(*estimates: Any) -> float:
         return value(
             *[
-                one.at_foot_of(middle) if isinstance(one, Cylinder | Cone) else one
-                for one, middle in zip(estimates, middles, strict=True)
+                estimate.at_foot_of(middle) if isinstance(estimate, Cylinder | Cone) else estimate
+                for estimate, middle in zip(estimates, middles, strict=True)
             ]
         )
 

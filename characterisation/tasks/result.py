@@ -110,12 +110,12 @@ def repeatability(clouds: Sequence[Sequence[Result]]) -> list[Repeatability]:
     """Return the repeatability of each measurement over all clouds, in the order in which the names first occur."""
     by_name: dict[str, list[Result]] = {}
     for results in clouds:
-        for one in results:
-            by_name.setdefault(one.name, []).append(one)
+        for result in results:
+            by_name.setdefault(result.name, []).append(result)
     out = []
     for name, results in by_name.items():
-        values = np.array([one.value for one in results if one.possible])
-        known = np.array([one.uncertainty for one in results if math.isfinite(one.uncertainty)])
+        values = np.array([result.value for result in results if result.possible])
+        known = np.array([result.uncertainty for result in results if math.isfinite(result.uncertainty)])
         out.append(
             Repeatability(
                 name,

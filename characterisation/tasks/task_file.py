@@ -265,9 +265,9 @@ class Task(Document):
             return feature.nominal(sensor_from_part)
         parents = [self.features[parent].nominal(sensor_from_part) for parent in feature.of or ()]
         if feature.kind == "intersection":
-            return intersection([one for one in parents if not isinstance(one, Sphere)])
+            return intersection([surface for surface in parents if not isinstance(surface, Sphere)])
         if feature.kind == "mid_plane":
-            return mid_plane(*[one for one in parents if isinstance(one, Plane)])
+            return mid_plane(*[surface for surface in parents if isinstance(surface, Plane)])
         (plane,) = parents
         assert isinstance(plane, Plane) and feature.point_mm is not None
         motion = np.eye(4) if sensor_from_part is None else np.asarray(sensor_from_part, float)

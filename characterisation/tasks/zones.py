@@ -89,8 +89,8 @@ def datum_motion(measured: Sequence[Datum], nominal: Sequence[Datum]) -> Array:
     frames = []
     for datums in (measured, nominal):
         directions = [
-            direction(one) * (1.0 if direction(one) @ direction(ideal) >= 0 else -1.0)
-            for one, ideal in zip(datums, nominal, strict=True)
+            direction(datum) * (1.0 if direction(datum) @ direction(ideal) >= 0 else -1.0)
+            for datum, ideal in zip(datums, nominal, strict=True)
         ]
         primary, secondary, tertiary = datums
         first = directions[0]
@@ -154,9 +154,9 @@ def frame_fault(datums: Sequence[Datum]) -> str:
         return "" if meet else "three datum planes that meet in one point"
     if isinstance(secondary, Plane):
         return "datums: plane, axis, axis; plane, axis, plane; or three planes"
-    for one in (secondary, tertiary):
-        sine = float(np.linalg.norm(np.cross(direction(one), primary.normal)))
-        if sine < ASKEW if isinstance(one, Plane) else sine > ASKEW:
+    for surface in (secondary, tertiary):
+        sine = float(np.linalg.norm(np.cross(direction(surface), primary.normal)))
+        if sine < ASKEW if isinstance(surface, Plane) else sine > ASKEW:
             return "datum axes perpendicular to the primary plane, and datum planes that cross it"
     if not isinstance(tertiary, Plane):
         apart = tertiary.point - secondary.point

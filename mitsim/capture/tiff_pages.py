@@ -17,8 +17,10 @@ TIFF_MARKS = {b"II*\0": "<", b"MM\0*": ">", b"II+\0": "<", b"MM\0+": ">"}
 #: most pages of a file
 _MOST_PAGES = 10_000
 
-#: tag of the kind of a page, and its bits of a reduced copy and of a mask
-_KIND, _REDUCED_OR_MASK = 254, 0b101
+#: tag of the kind of a page
+_KIND = 254
+#: bits of the kind: a reduced copy, and a mask
+_REDUCED_OR_MASK = 0b101
 
 
 def tiff_pages(data: bytes, where: str | Path) -> list[int]:

@@ -77,9 +77,9 @@ def acceptance(
         raise InputError(command, "", "no artefact", "--plane or --sphere", f"see {command} --help")
     chosen = tuple(topic) if topic else None
     given = [read_cloud(path, sensor, topic=chosen, frame=frame, unit=unit) for path in cloud_paths(clouds)]
-    results = [cloud_figures(one.cloud, artefacts, baseline) for one in given]
+    results = [cloud_figures(input_cloud.cloud, artefacts, baseline) for input_cloud in given]
     several = len(given) > 1
-    together = joint_figures([one.cloud for one in given], artefacts) if several else []
+    together = joint_figures([input_cloud.cloud for input_cloud in given], artefacts) if several else []
     over = repeatability(results) if several else []
     beside: tuple[list[Result], list[Result]] | None = None
     if simulated is not None:
@@ -96,13 +96,13 @@ def acceptance(
         targets |= {name: RecordedTarget("sphere", window) for name, (window, _) in artefacts.spheres.items()}
         beside = beside_simulated(given[0].cloud, targets, simulated, figures, seed)
     if as_json:
-        whose = [(one.path, one.cloud.sensor, one.cloud.source) for one in given]
+        whose = [(input_cloud.path, input_cloud.cloud.sensor, input_cloud.cloud.source) for input_cloud in given]
         document = measured_document(whose, results, over) | {"all_clouds": [result_values(one) for one in together]}
         if beside is not None:
             document |= {"beside": beside_document(simulated or "", *beside)}
         print(json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False))
     else:
-        print(result_tables([one.path for one in given], results, over))
+        print(result_tables([input_cloud.path for input_cloud in given], results, over))
         if together:
             print("\nall clouds\n" + result_table(together))
         if beside is not None:

@@ -95,7 +95,9 @@ def run(
     suffix = _suffix(output, RUN_SUFFIXES)
     folder = _run_in(folder)
     scene = read_run_scene(folder, views)
-    scans = [(view, kind, cloud_points(one)) for view in scene.views for kind, one in view.clouds.items()]
+    scans = [
+        (view, kind, cloud_points(point_cloud)) for view in scene.views for kind, point_cloud in view.clouds.items()
+    ]
     if suffix in (".mcap", ".e57") and not scans:
         raise InputError("--views", "", f"{views}: none of these views has a cloud", "views with clouds", "see clouds/")
     options.check_file(output)

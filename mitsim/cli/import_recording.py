@@ -141,7 +141,7 @@ def import_(
     from mitsim.capture.recordings.recording_files import plain_name
     from mitsim.decoding.checks.sanity import with_warnings
 
-    named = {one.name: given[one.name] for one in fields(ReadOptions)}
+    named = {field.name: given[field.name] for field in fields(ReadOptions)}
     reading = ReadOptions(**named | {"topic": tuple(topic) if topic else None, "images": _patterns(images)})
     imported = read_recording(path, reading, kind)
     capture = with_warnings(imported.capture)

@@ -152,7 +152,7 @@ def clouds(
     reference = None if against is None else read_cloud(against, sensor, reference=True, unit=unit)
     paths = cloud_paths(inputs)
     beside: tuple[list[Result], list[Result]] | None = None
-    targets = {name: one for name, one in request.plan.features.items() if one[0] != "cylinder"}
+    targets = {name: feature for name, feature in request.plan.features.items() if feature[0] != "cylinder"}
     if simulated is not None and not targets:
         raise InputError("--simulated", "", "no --plane and no --sphere", "a plane or a sphere to simulate")
 
@@ -232,10 +232,10 @@ def _task(
     statement = None if correct is None else read_view_statement(correct)
     given_pose = None if pose is None else read_pose(pose, view)
 
-    def measured(one: InputCloud) -> list[Result]:
-        world_from_sensor = given_pose or (None if one.capture is None else one.capture.world_from_sensor)
+    def measured(cloud: InputCloud) -> list[Result]:
+        world_from_sensor = given_pose or (None if cloud.capture is None else cloud.capture.world_from_sensor)
         if world_from_sensor is None:
-            raise InputError(one.path, "pose", "none", "the pose of the sensor: --pose FILE")
-        return measure_task(one.cloud, definition, loaded, world_from_sensor, statement, one.margin_px)
+            raise InputError(cloud.path, "pose", "none", "the pose of the sensor: --pose FILE")
+        return measure_task(cloud.cloud, definition, loaded, world_from_sensor, statement, cloud.margin_px)
 
     return measured

@@ -111,7 +111,7 @@ class Request:
     def _boxes(self) -> dict[str, Roi]:
         windows = {name: window for name, (_, window) in self.plan.features.items()}
         windows |= {name: plate.window for name, plate in self.plates.items()}
-        return {name: one for name, one in windows.items() if one is not None}
+        return {name: roi for name, roi in windows.items() if roi is not None}
 
 
 def _figures() -> ModuleType:
@@ -162,7 +162,7 @@ def read_request(
     pairs: list[tuple[PairKind, str, str]] = []
     for kind, texts in between.items():
         for text in texts:
-            names = [one.strip() for one in text.split(",")]
+            names = [word.strip() for word in text.split(",")]
             if len(names) != 2 or not all(names):
                 raise InputError(f"--{kind}", "", repr(text), "NAME,NAME of two features")
             pairs.append((cast(PairKind, kind), names[0], names[1]))

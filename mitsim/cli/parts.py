@@ -105,7 +105,7 @@ def check(
         print(json_module.dumps({**about, **as_data(facts, visible, found)}, indent=2))
     else:
         print(as_text(facts, visible, found))
-    if any(one.severity == "error" for one in found):
+    if any(finding.severity == "error" for finding in found):
         raise typer.Exit(1)
 
 

@@ -120,8 +120,8 @@ def render(
         known = {name: encode_exr(one) for name, one in every.items()}
     write_capture(capture, output, truth=known)
     if deviation:
-        finishes = [one for one in loaded.finishes if one and one.scatter]
-        for source in dict.fromkeys(f"{one}: {one.scatter.provenance}" for one in finishes if one.scatter):
+        finishes = [finish for finish in loaded.finishes if finish and finish.scatter]
+        for source in dict.fromkeys(f"{finish}: {finish.scatter.provenance}" for finish in finishes if finish.scatter):
             say(source)
     if blind:
         say(f"warning: {unseen}")

@@ -72,7 +72,7 @@ def beside_simulated(
         try:
             seen = seen_target(target.shape, target.window, recorded, name, target.distance)
         except FitError as error:
-            twin += [failed(one.name, one.unit, f"no twin: {error}") for one in real[len(twin) :]]
+            twin += [failed(result.name, result.unit, f"no twin: {error}") for result in real[len(twin) :]]
             continue
         say(f"simulating {preset.name} before {name}")
         cloud, window = simulated_target(seen, recorded, preset, name, seed)
@@ -108,19 +108,19 @@ def _pooled(name: str, unit: str, value: float, error: float) -> Result:
 def beside_table(recorded: Sequence[Result], simulated: Sequence[Result], sensor: str) -> str:
     """Return the table of both, with the ratio of simulated to recorded where both have a value other than 0."""
     rows = [["measurement", "recorded", "u", sensor, "u", "unit", "simulated / recorded"]]
-    for one, other in zip(recorded, simulated, strict=True):
-        ratio = other.value / one.value if one.possible and other.possible and one.value else math.nan
+    for result, other in zip(recorded, simulated, strict=True):
+        ratio = other.value / result.value if result.possible and other.possible and result.value else math.nan
         rows.append(
             [
-                one.name,
-                number_with_decimals(one.value, one.uncertainty),
-                uncertainty_text(one.uncertainty),
+                result.name,
+                number_with_decimals(result.value, result.uncertainty),
+                uncertainty_text(result.uncertainty),
                 number_with_decimals(other.value, other.uncertainty),
                 uncertainty_text(other.uncertainty),
-                one.unit,
+                result.unit,
                 f"{ratio:.3g}" if math.isfinite(ratio) else "-",
             ]
         )
-        reason = one.reason or other.reason
+        reason = result.reason or other.reason
         rows[-1] += [f"not possible: {reason}"] if reason else []
     return "\n".join(aligned(rows))

@@ -131,7 +131,7 @@ def choose(
     candidates, excluded = read_candidates(
         study, [sensors], options.asking(yes, " (and likewise for every other sensor)")
     )
-    candidates = [replace(one, study=with_plan(one.study, plan)) for one in candidates]
+    candidates = [replace(candidate, study=with_plan(candidate.study, plan)) for candidate in candidates]
     done = read_choice(output)
     if done is not None and done.finished:
         options.keep_finished(output, overwrite, CHOICE)
@@ -161,8 +161,8 @@ def choose(
     say(f"page: {output / 'choice.html'}\n{known.words}")
     if stopped:
         raise KeyboardInterrupt  # exit code 130
-    stated = [one for one in known.sensors if one.status == "stated"]
-    if not stated or (require_fit and not any(fits_all(judged(one)) for one in stated)):
+    stated = [sensor for sensor in known.sensors if sensor.status == "stated"]
+    if not stated or (require_fit and not any(fits_all(judged(sensor_entry)) for sensor_entry in stated)):
         raise typer.Exit(1)
 
 

@@ -75,8 +75,8 @@ def _folder() -> Path | None:
 def _digest(path: Path, settings: Iterable[object]) -> str | None:
     """Return the SHA-256 of everything that determines a cloud; None if the files are too many, too large or gone."""
     sha = hashlib.sha256(repr(own_build()).encode())
-    for one in settings:
-        sha.update(repr(one).encode())
+    for setting in settings:
+        sha.update(repr(setting).encode())
     files = [path] if path.is_file() else sorted(one for one in path.rglob("*") if one.is_file())
     try:
         if len(files) > MOST_FILES or sum(file.stat().st_size for file in files) > _LARGEST:

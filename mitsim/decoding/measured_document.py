@@ -18,36 +18,45 @@ _DIGITS = 2
 
 def result_table(results: Sequence[Result]) -> str:
     """Return the table of one cloud's measurements, one line for each."""
-    nominal = any(math.isfinite(one.nominal) for one in results)
-    corrected = any(one.origin == "statement" for one in results)
+    nominal = any(math.isfinite(result.nominal) for result in results)
+    corrected = any(result.origin == "statement" for result in results)
     head = ["measurement", "value", "unit", "u", *(["nominal", "error"] if nominal else []), "points"]
     rows = [head + (["bias subtracted"] if corrected else [])]
-    for one in results:
-        points = f"{one.points}/{one.points_given}" if one.points_given else ""
-        row = [one.name, number_with_decimals(one.value, one.uncertainty), one.unit, uncertainty_text(one.uncertainty)]
+    for result in results:
+        points = f"{result.points}/{result.points_given}" if result.points_given else ""
+        row = [
+            result.name,
+            number_with_decimals(result.value, result.uncertainty),
+            result.unit,
+            uncertainty_text(result.uncertainty),
+        ]
         if nominal:
-            row += [_number_text(one.nominal), number_with_decimals(one.error, one.uncertainty)]
-        row += [points] + ([_number_text(one.bias)] if corrected else [])
-        rows.append(row + ([f"not possible: {one.reason}"] if not one.possible else []))
+            row += [_number_text(result.nominal), number_with_decimals(result.error, result.uncertainty)]
+        row += [points] + ([_number_text(result.bias)] if corrected else [])
+        rows.append(row + ([f"not possible: {result.reason}"] if not result.possible else []))
     return "\n".join(aligned(rows))
 
 
 def repeatability_table(found: Sequence[Repeatability]) -> str:
     """Return the table of the repeatability over several clouds, one line for each measurement."""
-    nominal = any(math.isfinite(one.nominal) for one in found)
+    nominal = any(math.isfinite(repeatability.nominal) for repeatability in found)
     rows = [
         ["measurement", "n", "mean", "standard deviation", "unit", "u (rms of fits)", *(["error"] if nominal else [])]
     ]
-    for one in found:
+    for repeatability in found:
         rows.append(
             [
-                one.name,
-                f"{one.count}/{one.cloud_count}",
-                number_with_decimals(one.mean, one.deviation),
-                uncertainty_text(one.deviation),
-                one.unit,
-                uncertainty_text(one.uncertainty),
-                *([number_with_decimals(one.mean - one.nominal, one.deviation)] if nominal else []),
+                repeatability.name,
+                f"{repeatability.count}/{repeatability.cloud_count}",
+                number_with_decimals(repeatability.mean, repeatability.deviation),
+                uncertainty_text(repeatability.deviation),
+                repeatability.unit,
+                uncertainty_text(repeatability.uncertainty),
+                *(
+                    [number_with_decimals(repeatability.mean - repeatability.nominal, repeatability.deviation)]
+                    if nominal
+                    else []
+                ),
             ]
         )
     return "\n".join(aligned(rows))
@@ -66,10 +75,10 @@ def result_tables(
 
 def summary(clouds: Sequence[Sequence[Result]]) -> str:
     """Return one line: the number of measurements with a value, and the first without, with its reason."""
-    every = [one for results in clouds for one in results]
-    count = sum(one.possible for one in every)
+    every = [result for results in clouds for result in results]
+    count = sum(result.possible for result in every)
     text = f"{count} of {len(every)} measurements" + (f" in {len(clouds)} clouds" if len(clouds) > 1 else "")
-    first_failed = next((one for one in every if not one.possible), None)
+    first_failed = next((result for result in every if not result.possible), None)
     return text + (f"; {first_failed.name}: {first_failed.reason}" if first_failed else "")
 
 
@@ -112,24 +121,24 @@ def beside_document(sensor: str, recorded: Sequence[Result], simulated: Sequence
     """Return the figures of the first cloud and of a simulated sensor before its targets, as JSON values."""
     return {
         "sensor": sensor,
-        "recorded": [result_values(one) for one in recorded],
-        "simulated": [result_values(one) for one in simulated],
+        "recorded": [result_values(result) for result in recorded],
+        "simulated": [result_values(result) for result in simulated],
     }
 
 
-def result_values(one: Result) -> dict[str, Any]:
+def result_values(result: Result) -> dict[str, Any]:
     """Return a measurement as JSON values; NaN becomes None."""
     return {
-        "name": one.name,
-        "unit": one.unit,
-        "value": or_none(one.value),
-        "standard_uncertainty": or_none(one.uncertainty),
-        "uncertainty_from": one.origin,
-        "points": one.points,
-        "points_given": one.points_given,
-        "nominal": or_none(one.nominal),
-        "bias": one.bias,
-        "reason": one.reason,
+        "name": result.name,
+        "unit": result.unit,
+        "value": or_none(result.value),
+        "standard_uncertainty": or_none(result.uncertainty),
+        "uncertainty_from": result.origin,
+        "points": result.points,
+        "points_given": result.points_given,
+        "nominal": or_none(result.nominal),
+        "bias": result.bias,
+        "reason": result.reason,
     }
 
 

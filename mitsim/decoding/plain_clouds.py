@@ -128,7 +128,7 @@ def _of_arrays(path: Path, data: bytes, suffix: str) -> NDArray[np.floating]:
         arrays = dict(_arrays_in(read_mat(path, data, _MOST_NUMBERS, simplify_cells=True)))
     found = points_among(arrays)
     if found is None:
-        shapes = ", ".join(f"{name} {' x '.join(map(str, one.shape))}" for name, one in arrays.items())[:200]
+        shapes = ", ".join(f"{name} {' x '.join(map(str, array.shape))}" for name, array in arrays.items())[:200]
         allowed = "an array of n x 3, 3 x n or rows x columns x 3, or x, y and z alike"
         raise InputError(path, "", shapes or "no array", allowed)
     return found

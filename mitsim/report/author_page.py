@@ -84,20 +84,20 @@ def page_data(about: Authored, served: str) -> dict[str, Any]:
         "measurements": table.get("measurements", {}),
         "decision": table.get("decision"),
         "kinds": {kind: _definition(kind) for kind in DEFINITIONS},
-        "processes": {key: list(one.usual) for key, one in PROCESSES.items()},
+        "processes": {key: list(process.usual) for key, process in PROCESSES.items()},
         "metals": list(CONSTANTS),
         "known": characterised(about.sensor.name),
         "general": {"linear": LINEAR, "angles": ANGLES, "zones": ZONES},
         "colours": COLOURS,
         "served": served,
         "findings": findings_data(about.found),
-        "solid": solid(about.scene, {one.name for one in about.facts.shapes if np.isnan(one.area)}),
+        "solid": solid(about.scene, {shape.name for shape in about.facts.shapes if np.isnan(shape.area)}),
     }
 
 
 def findings_data(found: Sequence[SceneFinding]) -> list[dict[str, str]]:
     """Return the findings for the script."""
-    return [asdict(one) for one in found]
+    return [asdict(finding) for finding in found]
 
 
 def _definition(kind: Any) -> dict[str, Any]:

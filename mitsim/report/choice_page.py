@@ -38,7 +38,7 @@ def write_choice_page(folder: Path) -> Path:
 def page_content(choice: ChoiceDocument, folder: Path) -> dict[str, Any]:
     """Return everything that the template shows."""
     tolerances = choice.toleranced > 0
-    taking_part = [one for one in choice.sensors if one.status != "excluded"]
+    taking_part = [sensor for sensor in choice.sensors if sensor.status != "excluded"]
     return {
         "choice": choice,
         "part": Path(choice.scene).stem,
@@ -46,14 +46,21 @@ def page_content(choice: ChoiceDocument, folder: Path) -> dict[str, Any]:
         "tolerances": tolerances,
         "best": taking_part[0].name if taking_part else "no sensor",
         "names": [
-            (breakable(name), tolerance_words(one.tolerance, one.nominal, one.unit) if one.tolerance else "")
-            for name, one in choice.measurements.items()
+            (
+                breakable(name),
+                tolerance_words(measurement.tolerance, measurement.nominal, measurement.unit)
+                if measurement.tolerance
+                else "",
+            )
+            for name, measurement in choice.measurements.items()
         ],
         "asked": [_asked(choice, name) for name in choice.measurements],
-        "rows": [_row(choice, one) for one in taking_part],
-        "screened": any(one.status == "screened" for one in taking_part),
-        "sensors": [_details(choice, one, tolerances) for one in taking_part],
-        "excluded": [{"name": one.name, "why": one.why} for one in choice.sensors if one.status == "excluded"],
+        "rows": [_row(choice, entry) for entry in taking_part],
+        "screened": any(entry.status == "screened" for entry in taking_part),
+        "sensors": [_details(choice, entry, tolerances) for entry in taking_part],
+        "excluded": [
+            {"name": sensor.name, "why": sensor.why} for sensor in choice.sensors if sensor.status == "excluded"
+        ],
         "seconds": rounded(choice.seconds),
     }
 
@@ -69,25 +76,27 @@ def _asked(choice: ChoiceDocument, name: str) -> dict[str, str]:
     }
 
 
-def _row(choice: ChoiceDocument, one: SensorEntry) -> dict[str, Any]:
+def _row(choice: ChoiceDocument, entry: SensorEntry) -> dict[str, Any]:
     toleranced = choice.toleranced
     return {
-        "name": one.name,
-        "stated": one.status == "stated",
-        "why": one.why,
-        "fits": f"{one.fits if one.status == 'stated' else one.expected_fits} of {toleranced}" if toleranced else "",
-        "possible": one.possible_in_words,
-        "ratio": NONE if one.ratio is None else two_digits(one.ratio),
-        "capture": NONE if one.capture is None else f"{rounded(1e3 * one.capture.seconds)}\N{NO-BREAK SPACE}ms",
-        "exposures": "" if one.capture is None else _exposures(one),
-        "cells": [_cell(one.measurements[name], choice.measurements[name].unit) for name in choice.measurements],
+        "name": entry.name,
+        "stated": entry.status == "stated",
+        "why": entry.why,
+        "fits": f"{entry.fits if entry.status == 'stated' else entry.expected_fits} of {toleranced}"
+        if toleranced
+        else "",
+        "possible": entry.possible_in_words,
+        "ratio": NONE if entry.ratio is None else two_digits(entry.ratio),
+        "capture": NONE if entry.capture is None else f"{rounded(1e3 * entry.capture.seconds)}\N{NO-BREAK SPACE}ms",
+        "exposures": "" if entry.capture is None else _exposures(entry),
+        "cells": [_cell(entry.measurements[name], choice.measurements[name].unit) for name in choice.measurements],
     }
 
 
-def _exposures(one: SensorEntry) -> str:
-    assert one.capture is not None
-    times = listed([f"{two_digits(1e3 * seconds)}" for seconds in one.capture.exposures_s])
-    return f"{one.capture.images} × {times}\N{NO-BREAK SPACE}ms"
+def _exposures(entry: SensorEntry) -> str:
+    assert entry.capture is not None
+    times = listed([f"{two_digits(1e3 * seconds)}" for seconds in entry.capture.exposures_s])
+    return f"{entry.capture.images} × {times}\N{NO-BREAK SPACE}ms"
 
 
 def _cell(cell: CellEntry, unit: str) -> dict[str, str]:
@@ -104,19 +113,19 @@ def _cell(cell: CellEntry, unit: str) -> dict[str, str]:
     }
 
 
-def _details(choice: ChoiceDocument, one: SensorEntry, tolerances: bool) -> dict[str, Any]:
+def _details(choice: ChoiceDocument, entry: SensorEntry, tolerances: bool) -> dict[str, Any]:
     return {
-        "name": one.name,
-        "stated": one.status == "stated",
-        "why": one.why,
-        "impossible": [{"name": name, "why": with_degree_signs(why)} for name, why in one.impossible.items()],
-        "words": with_degree_signs(one.words),
-        "rows": sensor_rows(choice, one),
+        "name": entry.name,
+        "stated": entry.status == "stated",
+        "why": entry.why,
+        "impossible": [{"name": name, "why": with_degree_signs(why)} for name, why in entry.impossible.items()],
+        "words": with_degree_signs(entry.words),
+        "rows": sensor_rows(choice, entry),
         "tolerances": tolerances,
         "poses": [
             pose_texts(pose)
-            | {"for": listed([name for name, cell in one.measurements.items() if cell.view == pose.view]) or "none"}
-            for pose in one.poses
+            | {"for": listed([name for name, cell in entry.measurements.items() if cell.view == pose.view]) or "none"}
+            for pose in entry.poses
         ],
-        "trials": max((cell.trials for cell in one.measurements.values()), default=0),
+        "trials": max((cell.trials for cell in entry.measurements.values()), default=0),
     }

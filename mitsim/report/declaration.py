@@ -79,7 +79,9 @@ def _of_run(run: Run, geometry: SceneGeometry | None) -> Declaration:
         facts.append(("Pose of the sensor", pose_in_full(pose_of_view(run, document.view))))
         facts += _of_statement(document, "" if document.exposure else run.about.exposure_rule)
         facts += _influences(document, "round" in run.about.lay.values())
-        facts += _rules(one.decision.rule for one in document.measurements.values() if one.decision)
+        facts += _rules(
+            measurement.decision.rule for measurement in document.measurements.values() if measurement.decision
+        )
     digests = _digests(run.folder, ("statement.json", "task.json", "part.ply", "map.nc"))
     facts.append(("Made with", f"mitsim {run.about.mitsim}, seed {run.about.seed}; SHA-256 of {digests}"))
     date = run.about.date or _day(run.folder / "run.json")
@@ -101,14 +103,14 @@ def _of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None, folder: P
     facts += [("Pose of the sensor", pose_in_full(pose)) for pose in best.poses[:1]]
     exposures = ""
     if best.capture is not None:
-        times = listed([two_digits(1e3 * one) for one in best.capture.exposures_s])
+        times = listed([two_digits(1e3 * exposure_s) for exposure_s in best.capture.exposures_s])
         exposures = f"{best.capture.images} images of {times} ms each"
     if document is not None:
         facts += _of_statement(document, exposures)
         facts += _influences(document, about is not None and "round" in about.lay.values())
     else:
         facts.append(("Made by", "screening alone, from a performance map: no virtual measurement, no statement"))
-    facts += _rules(one.rule for one in choice.measurements.values())
+    facts += _rules(measurement.rule for measurement in choice.measurements.values())
     facts += _others(choice, best)
     digests = _digests(folder, (CHOICE,), own, ("statement.json",))
     maps = f"; map {best.map_digest}" if best.map_digest else ""
@@ -132,17 +134,17 @@ def _declared(
     return Declaration(title, date, number, first, rows, facts, _notes(document))
 
 
-def _row(result: ResultRow, one: StatedMeasurement | None) -> DeclaredRow:
-    if one is None:
+def _row(result: ResultRow, measurement: StatedMeasurement | None) -> DeclaredRow:
+    if measurement is None:
         return DeclaredRow(result, result.bias, NONE, NONE, NONE, NONE)
-    factor = one.coverage_factor
+    factor = measurement.coverage_factor
     return DeclaredRow(
         result,
-        bias_words(one.bias, one.standard_uncertainty, one.unit),
-        quantity(one.expanded_uncertainty, one.unit),
+        bias_words(measurement.bias, measurement.standard_uncertainty, measurement.unit),
+        quantity(measurement.expanded_uncertainty, measurement.unit),
         NONE if factor is None else rounded(factor, 2),
-        interval_words(one.interval, one.unit),
-        count(one.trials),
+        interval_words(measurement.interval, measurement.unit),
+        count(measurement.trials),
     )
 
 
@@ -161,16 +163,18 @@ def _notes(document: StatementDocument | None) -> list[str]:
         FAR_FROM_NOMINAL: "for a part far from nominal",
     }
     for part, words in by_part.items():
-        if names := [name for name, one in document.measurements.items() if one.errors_of == part]:
+        if names := [name for name, measurement in document.measurements.items() if measurement.errors_of == part]:
             notes.append(f"{listed(names)}: errors {words}.")
-    if names := [name for name, one in document.measurements.items() if not one.settled and one.trials]:
+    if names := [
+        name for name, measurement in document.measurements.items() if not measurement.settled and measurement.trials
+    ]:
         which = "all" if len(names) == len(document.measurements) else listed(names)
         notes.append(f"Not settled after JCGM 101, 7.9 (more virtual measurements may change a digit): {which}.")
     return [*notes, *(f"{one}." for one in document.doubts("the influences listed below"))]
 
 
 def _part(scene: str, finishes: Sequence[str]) -> str:
-    kinds = list(dict.fromkeys(one.replace(" um", " µm") for one in finishes))
+    kinds = list(dict.fromkeys(finish.replace(" um", " µm") for finish in finishes))
     name = Path(scene).name
     return f"{name}; finish: {listed(kinds)}" if kinds else name
 
@@ -187,7 +191,7 @@ def pose_in_full(pose: PoseEntry) -> str:
 
 
 def _of_statement(document: StatementDocument, exposures: str) -> list[tuple[str, str]]:
-    trials = max((one.trials for one in document.measurements.values()), default=0)
+    trials = max((measurement.trials for measurement in document.measurements.values()), default=0)
     how = "rendered and decoded" if document.measured_by == "render" else "drawn from a performance map"
     exposed = exposed_in_words(document.exposure)
     return [
@@ -200,9 +204,9 @@ def _of_statement(document: StatementDocument, exposures: str) -> list[tuple[str
 
 def _influences(document: StatementDocument, lay_left_out: bool) -> list[tuple[str, str]]:
     """Return the influences that are varied, fixed and left out (ISO/TS 15530-4)."""
-    varied = [one for one in document.influences if one.included]
-    fixed = [one for one in document.influences if not one.included and one.simulated]
-    left_out = [one for one in document.influences if not one.included and not one.simulated]
+    varied = [influence for influence in document.influences if influence.included]
+    fixed = [influence for influence in document.influences if not influence.included and influence.simulated]
+    left_out = [influence for influence in document.influences if not influence.included and not influence.simulated]
     missing = _names(left_out) + (["direction of machining marks"] if lay_left_out else [])
     # a map has its own finish, light and decoder; another unit has no size
     idle = {"unit", "finish", "light", "decoder"} if document.measured_by == "map" else {"unit"}
@@ -214,7 +218,7 @@ def _influences(document: StatementDocument, lay_left_out: bool) -> list[tuple[s
 
 
 def _names(influences: Sequence[InfluenceEntry]) -> list[str]:
-    return [one.name for one in influences]
+    return [influence.name for influence in influences]
 
 
 def _rules(rules: Iterable[str]) -> list[tuple[str, str]]:
@@ -225,16 +229,16 @@ def _rules(rules: Iterable[str]) -> list[tuple[str, str]]:
 def _others(choice: ChoiceDocument, best: SensorEntry) -> list[tuple[str, str]]:
     asked = choice.toleranced
     words = []
-    for one in choice.sensors:
-        if one is best or one.status == "excluded":
+    for sensor in choice.sensors:
+        if sensor is best or sensor.status == "excluded":
             continue
-        by = "" if one.status == "stated" else ", by screening alone"
+        by = "" if sensor.status == "stated" else ", by screening alone"
         fits = (
-            f"fits {one.fits} of {asked}"
-            if one.status == "stated"
-            else f"{one.expected_fits} of {asked} expected to fit"
+            f"fits {sensor.fits} of {asked}"
+            if sensor.status == "stated"
+            else f"{sensor.expected_fits} of {asked} expected to fit"
         )
-        words.append(f"{one.name} ({fits if asked else one.possible_in_words or 'all possible'}{by})")
+        words.append(f"{sensor.name} ({fits if asked else sensor.possible_in_words or 'all possible'}{by})")
     return [("Also compared", ", ".join(words))] if words else []
 
 

@@ -96,9 +96,9 @@ def tone_of(results: Sequence[Judged]) -> Tone:
     """Return the tone of the results of one view: see :data:`Tone`."""
     if not fits_all(results):
         return "bad"
-    if any(one.without_value >= OFTEN or one.verdict == "not decided" for one in results):
+    if any(result.without_value >= OFTEN or result.verdict == "not decided" for result in results):
         return "warn"
-    return "good" if any(one.verdict == "fits" for one in results) else "plain"
+    return "good" if any(result.verdict == "fits" for result in results) else "plain"
 
 
 def of_run(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
@@ -106,20 +106,23 @@ def of_run(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
     document = run.statement
     if document is None:
         return _without_statement(run, geometry)
-    results = [_judged(name, one) for name, one in document.measurements.items()]
+    results = [_judged(name, measurement) for name, measurement in document.measurements.items()]
     view_scores = run.scores.sel(view=document.view)
-    asked = {name: (run.about.measurements[name].faces, one.verdict) for name, one in document.measurements.items()}
+    asked = {
+        name: (run.about.measurements[name].faces, measurement.verdict)
+        for name, measurement in document.measurements.items()
+    }
     poses: list[tuple[str, ArrayLike]] = [(f"view {document.view}", view_scores["world_from_sensor"].values)]
     verdicts = face_verdicts(asked)
     result = with_sets(result_in_words(results), fits_all(results), run.about.view_sets)
     return FirstScreen(
         with_degree_signs(result.words[:1].upper() + result.words[1:]),
         tone_of(results) if result.good else "bad",
-        [_run_row(run, view_scores, name, one) for name, one in document.measurements.items()],
+        [_run_row(run, view_scores, name, measurement) for name, measurement in document.measurements.items()],
         _picture(geometry, poses, verdicts, _caption(run, document.view)),
         poses,
         verdicts,
-        max((one.trials for one in document.measurements.values()), default=0),
+        max((measurement.trials for measurement in document.measurements.values()), default=0),
         tuple(with_degree_signs(line) for line in remedies_in_words(run.about.remedies)),
         tuple(document.doubts()),
     )
@@ -136,18 +139,20 @@ def _without_statement(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
     rows = [
         RowValues(
             name=name,
-            about=measured_words(one.kind, one.features),
-            unit=one.unit,
-            verdict="no tolerance" if one.tolerance is None else "not decided",
-            nominal=one.nominal,
-            tolerance=one.tolerance,
+            about=measured_words(measurement.kind, measurement.features),
+            unit=measurement.unit,
+            verdict="no tolerance" if measurement.tolerance is None else "not decided",
+            nominal=measurement.nominal,
+            tolerance=measurement.tolerance,
             bias=None,
             uncertainty=float(scores["measured_risk"].sel(measurement=name)),
             without_value=math.nan,
         ).texts()
-        for name, one in about.measurements.items()
+        for name, measurement in about.measurements.items()
     ]
-    verdicts = face_verdicts({name: (one.faces, "not decided") for name, one in about.measurements.items()})
+    verdicts = face_verdicts(
+        {name: (measurement.faces, "not decided") for name, measurement in about.measurements.items()}
+    )
     made = how_many(about.race_trials, "virtual measurement")
     return FirstScreen(
         f"View {leader} leads so far, by {made}; no uncertainty is stated yet",
@@ -176,16 +181,16 @@ def of_choice(
     verdicts = face_verdicts(
         {name: (choice.measurements[name].features, cell.verdict) for name, cell in best.measurements.items()}
     )
-    poses: list[tuple[str, ArrayLike]] = [(f"view {one.view}", one.world_from_sensor) for one in best.poses]
-    of = sum(one.status != "excluded" for one in choice.sensors)
+    poses: list[tuple[str, ArrayLike]] = [(f"view {pose.view}", pose.world_from_sensor) for pose in best.poses]
+    of = sum(sensor.status != "excluded" for sensor in choice.sensors)
     caption = f"{best.name}, the best of {of} sensor{'s' if of > 1 else ''}"
     if best.possible_in_words:
         caption += f" ({best.possible_in_words})"
     if best.poses:
         caption += f", in view {best.poses[0].view}: {pose_words(best.poses[0])}"
     results = judged(best)
-    made = [one for one in results if math.isfinite(one.uncertainty)]
-    lost = losses_in_words(made) if made and all(one.verdict == "no tolerance" for one in results) else ""
+    made = [result for result in results if math.isfinite(result.uncertainty)]
+    lost = losses_in_words(made) if made and all(result.verdict == "no tolerance" for result in results) else ""
     return FirstScreen(
         with_degree_signs("; ".join(filter(None, [choice.words, lost]))),
         tone_of(results),
@@ -201,15 +206,15 @@ def of_choice(
 def _others_fit_more(choice: ChoiceDocument, best: SensorEntry) -> Iterator[str]:
     """Yield a sentence on each sensor that fits more tolerances than the best, or may and was not measured."""
     yield from choice.fit_more
-    for one in choice.sensors:
-        if best.status == "stated" and one.status == "screened" and one.expected_fits > best.fits:
+    for sensor in choice.sensors:
+        if best.status == "stated" and sensor.status == "screened" and sensor.expected_fits > best.fits:
             yield (
-                f"{one.name} was not measured ({one.why}), but is expected to fit {one.expected_fits} of "
+                f"{sensor.name} was not measured ({sensor.why}), but is expected to fit {sensor.expected_fits} of "
                 f"{choice.toleranced} tolerances: allow more minutes"
             )
 
 
-def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[ResultRow]:
+def sensor_rows(choice: ChoiceDocument, sensor_entry: SensorEntry) -> list[ResultRow]:
     """Return the rows for the measurements of one sensor; screening alone gives no readings and no losses."""
     return [
         RowValues(
@@ -223,27 +228,27 @@ def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[ResultRow]:
             rule=asked.rule,
             **_same_names(cell, _MEASURED) | ({} if cell.trials else {"without_value": math.nan}),
             **_same_names(cell, _DECIDED),
-            stated=one.status == "stated",
+            stated=sensor_entry.status == "stated",
         ).texts()
-        for name, cell in one.measurements.items()
+        for name, cell in sensor_entry.measurements.items()
         for asked in (choice.measurements[name],)
     ]
 
 
-def _run_row(run: Run, view_scores: xr.Dataset, name: str, one: StatedMeasurement) -> ResultRow:
+def _run_row(run: Run, view_scores: xr.Dataset, name: str, measurement: StatedMeasurement) -> ResultRow:
     """Return the row of a measurement of a run; ``view_scores`` are the scores of the stated view."""
-    entry, decision, largest = run.about.measurements[name], one.decision, largest_line(one.budget)
+    entry, decision, largest = run.about.measurements[name], measurement.decision, largest_line(measurement.budget)
     limit, feature = (str(view_scores[key].sel(measurement=name).values) for key in ("limit", "limiting_feature"))
     points = float(view_scores["n"].sel(feature=feature)) if feature in view_scores["feature"].values else None
     return RowValues(
         name=name,
         about=measured_words(entry.kind, entry.features),
-        unit=one.unit,
+        unit=measurement.unit,
         nominal=entry.nominal,
-        tolerance=one.tolerance if entry.tolerance is None else entry.tolerance,
-        uncertainty=one.standard_uncertainty,
-        share=one.share_of_tolerance,
-        **_same_names(one, _MEASURED),
+        tolerance=measurement.tolerance if entry.tolerance is None else entry.tolerance,
+        uncertainty=measurement.standard_uncertainty,
+        share=measurement.share_of_tolerance,
+        **_same_names(measurement, _MEASURED),
         **({} if decision is None else _same_names(decision, ("rule", *_DECIDED))),
         limited=f"{limit} on {feature}" if limit and feature else limit,
         points=points if limit else None,
@@ -256,16 +261,16 @@ def _same_names(entry: object, names: Sequence[str]) -> dict[str, Any]:
     return {name: getattr(entry, name) for name in names}
 
 
-def _judged(name: str, one: StatedMeasurement) -> Judged:
-    decision = one.decision
+def _judged(name: str, measurement: StatedMeasurement) -> Judged:
+    decision = measurement.decision
     return Judged(
         name,
-        one.unit,
-        one.verdict,
-        or_nan(one.standard_uncertainty),
+        measurement.unit,
+        measurement.verdict,
+        or_nan(measurement.standard_uncertainty),
         or_nan(None if decision is None else decision.needed),
         decision is not None and decision.fits_corrected,
-        one.without_value,
+        measurement.without_value,
     )
 
 

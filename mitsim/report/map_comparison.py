@@ -39,7 +39,9 @@ _LABELS = {
 
 def common_samples(maps: Sequence[PerformanceMap]) -> list[Sample]:
     """Return the samples (finish, Ra [um]) of all maps, matt ones first, then by falling Ra."""
-    every = list(dict.fromkeys((name, f"{roughness}") for one in maps for name, roughness in one.samples))
+    every = list(
+        dict.fromkeys((name, f"{roughness}") for performance_map in maps for name, roughness in performance_map.samples)
+    )
     samples = [(name, float(roughness)) for name, roughness in every]
     return [samples[i] for i in matt_to_shiny(samples)]
 
@@ -49,27 +51,27 @@ def comparison_figure(
 ) -> Figure:
     """Draw discs over the orientation, a row for each map and a column for each sample, on one colour scale."""
     samples = common_samples(maps)
-    limits = np.array([noise_limits(one.data["ray_noise_std"].values) for one in maps])
+    limits = np.array([noise_limits(performance_map.data["ray_noise_std"].values) for performance_map in maps])
     norm = Normalize(0, 1) if what == "fraction" else LogNorm(float(limits[:, 0].min()), float(limits[:, 1].max()))
     colours = SEQUENTIAL if what == "fraction" else NOISE
     variable = "recovered_fraction" if what == "fraction" else "ray_noise_std"
     with drawing():
         figure = Figure((1.75 * len(samples) + 1.1, 1.7 * len(maps) + 1.3), layout="constrained")
         grid = np.asarray(figure.subplots(len(maps), len(samples), squeeze=False))
-        for number, (one, row) in enumerate(zip(maps, grid, strict=True)):
-            place = nearest_distance(one, distance_mm)
+        for number, (performance_map, row) in enumerate(zip(maps, grid, strict=True)):
+            place = nearest_distance(performance_map, distance_mm)
             for sample, axes in zip(samples, row, strict=True):
-                index = _index(one, sample)
+                index = _index(performance_map, sample)
                 if index is None:
                     disc(axes, 2 * math.sin(_LARGEST / 2))
                 else:
-                    values = one.data[variable].values[index, place]
-                    disc_image(axes, values, one.data["a"].values, _LARGEST).set(norm=norm, cmap=colours)
+                    values = performance_map.data[variable].values[index, place]
+                    disc_image(axes, values, performance_map.data["a"].values, _LARGEST).set(norm=norm, cmap=colours)
                 disc_view(axes, _LARGEST, labelled=number == 0)
                 if number == 0:
                     axes.set_title(finish_name(*sample).replace(", ", "\n"), fontsize=8)
-            distance = float(one.data["distance"].values[place])
-            row[0].set_ylabel(f"{sensor_name(one)}\n{distance:g} mm", labelpad=6, fontsize=7.5)
+            distance = float(performance_map.data["distance"].values[place])
+            row[0].set_ylabel(f"{sensor_name(performance_map)}\n{distance:g} mm", labelpad=6, fontsize=7.5)
         colour_bar(figure, grid, norm, colours, _LABELS[what], "neither" if what == "fraction" else "both")
     return figure
 
@@ -81,17 +83,17 @@ def strip_figure(maps: Sequence[PerformanceMap]) -> Figure:
     with drawing():
         figure = Figure((2.1 * len(samples) + 0.8, 5.4), layout="constrained")
         upper, lower = np.asarray(figure.subplots(2, len(samples), squeeze=False, sharex=True, sharey="row"))
-        for number, one in enumerate(maps):
-            low, high = one.data["distance"].values[[0, -1]]
+        for number, performance_map in enumerate(maps):
+            low, high = performance_map.data["distance"].values[[0, -1]]
             distance = np.geomspace(low, high, 41)
             for sample, top, bottom in zip(samples, upper, lower, strict=True):
-                if _index(one, sample) is None:
+                if _index(performance_map, sample) is None:
                     continue
                 for tilt, line in zip(TILTS_DEG, ("-", "--", ":"), strict=True):
                     normal = np.tile([0.0, math.sin(math.radians(tilt)), math.cos(math.radians(tilt))], (41, 1))
-                    answer = one.query(*sample, distance, normal)
+                    answer = performance_map.query(*sample, distance, normal)
                     style = {"ls": line, "color": cycle[number % len(cycle)], "lw": 1.1}
-                    label = sensor_name(one) if tilt == 0 else None
+                    label = sensor_name(performance_map) if tilt == 0 else None
                     top.plot(distance, answer.fraction, **style, label=label)
                     # clouds without noise have sigma = 0, which a logarithmic scale cannot show
                     bottom.plot(distance, np.where(answer.sigma > 0, answer.sigma, np.nan), **style)
@@ -118,9 +120,9 @@ def strip_figure(maps: Sequence[PerformanceMap]) -> Figure:
     return figure
 
 
-def nearest_distance(one: PerformanceMap, distance_mm: float | None) -> int:
+def nearest_distance(performance_map: PerformanceMap, distance_mm: float | None) -> int:
     """Return the index of the knot nearest in ratio to a distance [mm], or to mid range if None is given."""
-    known: NDArray[np.float64] = one.data["distance"].values.astype(float)
+    known: NDArray[np.float64] = performance_map.data["distance"].values.astype(float)
     target = math.sqrt(known[0] * known[-1]) if distance_mm is None else distance_mm
     return int(np.abs(np.log(known / target)).argmin())
 
@@ -134,21 +136,21 @@ def check_distance(maps: Sequence[PerformanceMap], distance_mm: float) -> None:
         Naming the maps that do not cover it, and their ranges.
     """
     outside = []
-    for one in maps:
-        near, far = map(float, one.data["distance"].values[[0, -1]])
+    for performance_map in maps:
+        near, far = map(float, performance_map.data["distance"].values[[0, -1]])
         if not near <= distance_mm <= far:
-            outside.append(f"{sensor_name(one)} from {near:g} to {far:g} mm")
+            outside.append(f"{sensor_name(performance_map)} from {near:g} to {far:g} mm")
     if outside:
         allowed = f"a distance that all maps cover; {', '.join(outside)}"
         hint = "omit those maps, or omit --distance to draw each map in the middle of its range"
         raise InputError("--distance", "", f"{distance_mm:g} mm", allowed, hint)
 
 
-def sensor_name(one: PerformanceMap) -> str:
+def sensor_name(performance_map: PerformanceMap) -> str:
     """Return the name of the sensor of a map."""
-    return str(one.data.attrs.get("sensor", "unnamed"))
+    return str(performance_map.data.attrs.get("sensor", "unnamed"))
 
 
-def _index(one: PerformanceMap, sample: Sample) -> int | None:
-    known = [(name, f"{roughness}") for name, roughness in one.samples]  # as texts, NaN equals NaN
+def _index(performance_map: PerformanceMap, sample: Sample) -> int | None:
+    known = [(name, f"{roughness}") for name, roughness in performance_map.samples]  # as texts, NaN equals NaN
     return known.index(own) if (own := (sample[0], f"{sample[1]}")) in known else None

@@ -93,7 +93,7 @@ def page_content(run: Run) -> dict[str, Any]:
         "race_confidence": percent(about.confidence.get(ALL, 0.0)),
         "race_margin": percent(about.race_margin),
         "race_loss": percent(about.losses[ALL]) if ALL in about.losses else "",
-        "runners_up": [_runner_up(run, one) for one in about.runners_up],
+        "runners_up": [_runner_up(run, up) for up in about.runners_up],
         "answers": [_answer(run, name) for name in run.measurements],
         "tolerances": bool(np.isfinite(scores["tolerance"].values).any()),
         "coverage": percent(NORMAL_COVERAGE),
@@ -174,11 +174,11 @@ def _answer(run: Run, name: str) -> dict[str, Any]:
     return row | pose_texts(pose_of_view(run, best)) | expected_texts(run, name, best) | measured
 
 
-def _runner_up(run: Run, one: RunnerUp) -> dict[str, Any]:
+def _runner_up(run: Run, up: RunnerUp) -> dict[str, Any]:
     """Return the texts of a view that comes next for all measurements."""
-    stated = NONE if one.stated_ratio is None else rounded(one.stated_ratio, 2)
-    texts = {"ratio": rounded(one.ratio, 2), "near": percent(one.near), "trials": count(one.trials), "stated": stated}
-    return pose_texts(pose_of_view(run, one.view)) | texts
+    stated = NONE if up.stated_ratio is None else rounded(up.stated_ratio, 2)
+    texts = {"ratio": rounded(up.ratio, 2), "near": percent(up.near), "trials": count(up.trials), "stated": stated}
+    return pose_texts(pose_of_view(run, up.view)) | texts
 
 
 def _agreement_row(name: str, found: Agreement) -> dict[str, str]:

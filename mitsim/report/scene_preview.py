@@ -122,8 +122,10 @@ def _colours(facts: SceneFacts, first: Sequence[str], measured: Collection[str])
     """Return one colour for each shape, in the order of the scene; more measured shapes than colours repeat them."""
     shapes = facts.shapes
     if measured:
-        rank = {one.name: k for k, one in enumerate(one for one in shapes if one.name in measured)}
-        return [SHAPES[rank[one.name] % len(SHAPES)] if one.name in rank else OTHER_SHAPE for one in shapes]
+        rank = {
+            shape_facts.name: k for k, shape_facts in enumerate(shape for shape in shapes if shape.name in measured)
+        }
+        return [SHAPES[rank[shape.name] % len(SHAPES)] if shape.name in rank else OTHER_SHAPE for shape in shapes]
     order = sorted(
         range(len(shapes)),
         key=lambda i: (shapes[i].emitter, shapes[i].name not in first, -np.nan_to_num(shapes[i].area), i),

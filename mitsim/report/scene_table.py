@@ -78,7 +78,7 @@ def as_data(facts: SceneFacts, visible: VisibleSurfaces, found: Sequence[SceneFi
         "bounds_mm": facts.bounds.tolist(),
         "features": shapes,
         "emitters": [{"type": kind, "flux_w": or_none(flux)} for kind, flux in facts.emitters],
-        "findings": [asdict(one) for one in found],
+        "findings": [asdict(finding) for finding in found],
     }
 
 

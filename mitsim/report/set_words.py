@@ -54,19 +54,21 @@ def set_result(entry: ViewSetEntry) -> SetResult:
 def with_sets(words: str, good: bool, entries: Sequence[ViewSetEntry]) -> SetResult:
     """The result of a run in words, followed by that of its sets of views."""
     results = [set_result(entry) for entry in entries]
-    return SetResult("; ".join([words, *(one.words for one in results)]), good and all(one.good for one in results))
+    return SetResult(
+        "; ".join([words, *(result.words for result in results)]), good and all(result.good for result in results)
+    )
 
 
-def _error(one: ConfirmedEntry | None) -> float:
+def _error(confirmed: ConfirmedEntry | None) -> float:
     """Root mean square error; NaN without values."""
-    if one is None or one.bias is None or one.standard_uncertainty is None:
+    if confirmed is None or confirmed.bias is None or confirmed.standard_uncertainty is None:
         return math.nan
-    return math.hypot(one.bias, one.standard_uncertainty)
+    return math.hypot(confirmed.bias, confirmed.standard_uncertainty)
 
 
-def _missed(name: str, one: ConfirmedEntry | None, error: float, limit: float, reached: bool) -> str:
+def _missed(name: str, confirmed: ConfirmedEntry | None, error: float, limit: float, reached: bool) -> str:
     if not reached:
         return f"{name} is out of reach"
-    if one is None or not math.isfinite(error):
+    if confirmed is None or not math.isfinite(error):
         return f"{name} has no value"
-    return f"{name} exceeds its limit: error {two_digits(error)} {one.unit}, {limit:g} {one.unit} allowed"
+    return f"{name} exceeds its limit: error {two_digits(error)} {confirmed.unit}, {limit:g} {confirmed.unit} allowed"

@@ -21,45 +21,63 @@ from mitsim.study.statement_file import BudgetEntry, ExposureEntry, StatedMeasur
 
 def statement_section(document: StatementDocument) -> dict[str, Any]:
     """Return everything that the section of the page shows, as texts."""
-    rows = [_row(name, one) for name, one in document.measurements.items()]
+    rows = [_row(name, measurement) for name, measurement in document.measurements.items()]
     shown = [
         group
         for group in GROUPS
-        if any(line.group == group for one in document.measurements.values() for line in one.budget)
+        if any(line.group == group for measurement in document.measurements.values() for line in measurement.budget)
     ]
     return {
         "view": document.view,
         "rendered": document.measured_by == "render",
-        "trials": max((one.trials for one in document.measurements.values()), default=0),
+        "trials": max((measurement.trials for measurement in document.measurements.values()), default=0),
         "calibration": _calibration(document),
         "exposure": exposed_in_words(document.exposure),
         "rows": rows,
-        "tolerances": any(one.tolerance is not None for one in document.measurements.values()),
+        "tolerances": any(measurement.tolerance is not None for measurement in document.measurements.values()),
         "legend": [{"colour": GROUPS[group][0], "name": GROUPS[group][1]} for group in shown],
-        "bars": [_bar(name, one) for name, one in document.measurements.items() if one.budget],
+        "bars": [_bar(name, measurement) for name, measurement in document.measurements.items() if measurement.budget],
         "budget_groups": [GROUPS[group][1] for group in shown],
-        "budget_rows": [_budget_row(name, one, shown) for name, one in document.measurements.items() if one.budget],
-        "included": [one.model_dump() for one in document.influences if one.included],
-        "open_lines": any(not line.settled for one in document.measurements.values() for line in one.budget),
-        "depends": dependences_in_words(
-            (name, one.unit, one.size_depends_on, None if one.decision is None else one.decision.needed)
-            for name, one in document.measurements.items()
+        "budget_rows": [
+            _budget_row(name, measurement, shown)
+            for name, measurement in document.measurements.items()
+            if measurement.budget
+        ],
+        "included": [influence.model_dump() for influence in document.influences if influence.included],
+        "open_lines": any(
+            not line.settled for measurement in document.measurements.values() for line in measurement.budget
         ),
-        "find_out": remedies_in_words(one.size_depends_on for one in document.measurements.values()),
+        "depends": dependences_in_words(
+            (
+                name,
+                measurement.unit,
+                measurement.size_depends_on,
+                None if measurement.decision is None else measurement.decision.needed,
+            )
+            for name, measurement in document.measurements.items()
+        ),
+        "find_out": remedies_in_words(measurement.size_depends_on for measurement in document.measurements.values()),
         "undrawn": [
             {"name": GROUPS.get(group, ("", group))[1], "source": source}
             for group, source in {
-                line.group: line.source for one in document.measurements.values() for line in one.budget if line.source
+                line.group: line.source
+                for measurement in document.measurements.values()
+                for line in measurement.budget
+                if line.source
             }.items()
         ],
-        "missing": [one.model_dump() for one in document.influences if not one.included],
+        "missing": [influence.model_dump() for influence in document.influences if not influence.included],
         "losses": lost_features(
-            (name, one.trials, [Loss(lost.reason, lost.count) for lost in one.losses])
-            for name, one in document.measurements.items()
+            (name, measurement.trials, [Loss(lost.reason, lost.count) for lost in measurement.losses])
+            for name, measurement in document.measurements.items()
         ),
-        "at_limit": [name for name, one in document.measurements.items() if one.errors_of == AT_THE_LIMIT],
-        "far": [name for name, one in document.measurements.items() if one.errors_of == FAR_FROM_NOMINAL],
-        "unsettled": [name for name, one in document.measurements.items() if not one.settled],
+        "at_limit": [
+            name for name, measurement in document.measurements.items() if measurement.errors_of == AT_THE_LIMIT
+        ],
+        "far": [
+            name for name, measurement in document.measurements.items() if measurement.errors_of == FAR_FROM_NOMINAL
+        ],
+        "unsettled": [name for name, measurement in document.measurements.items() if not measurement.settled],
     }
 
 
@@ -70,38 +88,41 @@ def _calibration(document: StatementDocument) -> str:
     return "; ".join(filter(None, [calibration, sizes]))
 
 
-def exposed_in_words(one: ExposureEntry | None) -> str:
+def exposed_in_words(exposure_entry: ExposureEntry | None) -> str:
     """Describe the exposure of the captures, unless it follows the sensor's own rule."""
-    if one is None:
+    if exposure_entry is None:
         return ""
-    times = listed([f"{1e3 * seconds:.3g}" for seconds in one.exposures_s])
-    merged = ", merged" if len(one.exposures_s) > 1 else ""
-    return f"{times} ms{merged}, at {percent(one.power)} of the projector's power"
+    times = listed([f"{1e3 * seconds:.3g}" for seconds in exposure_entry.exposures_s])
+    merged = ", merged" if len(exposure_entry.exposures_s) > 1 else ""
+    return f"{times} ms{merged}, at {percent(exposure_entry.power)} of the projector's power"
 
 
-def _row(name: str, one: StatedMeasurement) -> dict[str, str]:
-    known = one.bias is not None and one.standard_uncertainty is not None
+def _row(name: str, measurement: StatedMeasurement) -> dict[str, str]:
+    known = measurement.bias is not None and measurement.standard_uncertainty is not None
     return {
         "name": name,
-        "bias": bias_words(one.bias, one.bias_uncertainty, one.unit),
-        "bias_uncertainty": quantity(one.bias_uncertainty, one.unit),
-        "uncertainty": quantity(one.standard_uncertainty, one.unit),
-        "uncorrected": quantity(math.hypot(one.bias or 0, one.standard_uncertainty or 0) if known else None, one.unit),
-        "interval": interval_words(one.interval, one.unit),
-        "corrected": interval_words(one.interval_corrected, one.unit),
-        "without": percent(one.without_value),
-        "share": percent(one.share_of_tolerance),
-        "tolerance": NONE if one.tolerance is None else exact(one.tolerance, one.unit),
-        "verdict": one.verdict,
-        "repeatability": quantity(one.repeatability, one.unit),
-        "after_four": quantity(one.after_repeats.get("4"), one.unit),
+        "bias": bias_words(measurement.bias, measurement.bias_uncertainty, measurement.unit),
+        "bias_uncertainty": quantity(measurement.bias_uncertainty, measurement.unit),
+        "uncertainty": quantity(measurement.standard_uncertainty, measurement.unit),
+        "uncorrected": quantity(
+            math.hypot(measurement.bias or 0, measurement.standard_uncertainty or 0) if known else None,
+            measurement.unit,
+        ),
+        "interval": interval_words(measurement.interval, measurement.unit),
+        "corrected": interval_words(measurement.interval_corrected, measurement.unit),
+        "without": percent(measurement.without_value),
+        "share": percent(measurement.share_of_tolerance),
+        "tolerance": NONE if measurement.tolerance is None else exact(measurement.tolerance, measurement.unit),
+        "verdict": measurement.verdict,
+        "repeatability": quantity(measurement.repeatability, measurement.unit),
+        "after_four": quantity(measurement.after_repeats.get("4"), measurement.unit),
     }
 
 
-def _bar(name: str, one: StatedMeasurement) -> dict[str, Any]:
+def _bar(name: str, measurement: StatedMeasurement) -> dict[str, Any]:
     """Return the parts of a bar in per cent of its width, in the order of :data:`GROUPS`, so that colours line up."""
     left, parts = 0.0, []
-    by_group = {line.group: line for line in one.budget}
+    by_group = {line.group: line for line in measurement.budget}
     for group, (colour, words) in GROUPS.items():
         if group in by_group:
             line = by_group[group]
@@ -113,8 +134,8 @@ def _bar(name: str, one: StatedMeasurement) -> dict[str, Any]:
     return {"name": name, "parts": parts}
 
 
-def _budget_row(name: str, one: StatedMeasurement, groups: list[str]) -> dict[str, Any]:
-    by_group = {line.group: line for line in one.budget}
+def _budget_row(name: str, measurement: StatedMeasurement, groups: list[str]) -> dict[str, Any]:
+    by_group = {line.group: line for line in measurement.budget}
     cells = []
     for group in groups:
         line = by_group.get(group)
@@ -122,11 +143,14 @@ def _budget_row(name: str, one: StatedMeasurement, groups: list[str]) -> dict[st
             cells.append({"u": NONE, "share": ""})
             continue
         if line.settled:
-            u, share = quantity(math.sqrt(line.variance), one.unit), f"{percent(line.share)}; {_share_interval(line)}"
+            u, share = (
+                quantity(math.sqrt(line.variance), measurement.unit),
+                f"{percent(line.share)}; {_share_interval(line)}",
+            )
         else:
             u, share = "too few trials", _share_interval(line)
         cells.append({"u": u, "share": share})
-    return {"name": name, "cells": cells, "whole": quantity(one.standard_uncertainty, one.unit)}
+    return {"name": name, "cells": cells, "whole": quantity(measurement.standard_uncertainty, measurement.unit)}
 
 
 def _share_interval(line: BudgetEntry) -> str:

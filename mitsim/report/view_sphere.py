@@ -87,14 +87,14 @@ def _set_words(run: Run, entry: ViewSetEntry) -> dict[str, Any]:
         "limits": lines,
         "exact": minimal,
         "joined": entry.joined,
-        "tried": [_tried_words(one) for one in entry.tried if set(one.views) != set(entry.views)],
+        "tried": [_tried_words(tried) for tried in entry.tried if set(tried.views) != set(entry.views)],
     }
 
 
-def _tried_words(one: TriedEntry) -> str:
+def _tried_words(tried: TriedEntry) -> str:
     """Describe a set that was measured and not chosen."""
-    how = "a measurement without a value" if one.excess is None else f"{two_digits(one.excess)} times a limit"
-    views = f"{len(one.views)} view{'s' if len(one.views) > 1 else ''} ({', '.join(map(str, one.views))})"
+    how = "a measurement without a value" if tried.excess is None else f"{two_digits(tried.excess)} times a limit"
+    views = f"{len(tried.views)} view{'s' if len(tried.views) > 1 else ''} ({', '.join(map(str, tried.views))})"
     return f"also measured: {views}, {how}"
 
 

@@ -195,8 +195,8 @@ class Pool:
         workers = list(self._workers.values())
         self._workers.clear()
         self._prepared.clear()
-        for one in workers:
-            one.shutdown(wait=False, cancel_futures=True)
+        for worker in workers:
+            worker.shutdown(wait=False, cancel_futures=True)
         for one in workers if wait else ():
             one.shutdown()
 
@@ -261,7 +261,7 @@ def results_of(
     finished_orders : as they are finished
     """
     if workers is None:
-        return [work(one) for one in track(orders, label)]
+        return [work(order) for order in track(orders, label)]
     made = workers.distribute(range(len(orders)), orders.__getitem__, work)
     found = dict(track(made, label, len(orders)))
     return [found[number] for number in range(len(orders))]

@@ -203,7 +203,7 @@ def _mesh(shape: Any, merge: float) -> MeshFacts | None:
 
 def _merged_mesh(shapes: tuple[ShapeFacts, ...], merge: float) -> MeshFacts | None:
     """Merge all meshes, because a part that is divided into faces is closed only as a whole."""
-    meshes = [one.mesh for one in shapes if one.mesh is not None and not one.emitter]
+    meshes = [shape.mesh for shape in shapes if shape.mesh is not None and not shape.emitter]
     if not meshes:
         return None
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])[:-1]

@@ -69,8 +69,8 @@ def _lens(path: Path, place: str, eye: Any, shared: Any) -> Any:
     made = {key: value for key, value in eye.items() if key not in ("focal_mm", "pixel_um")}
     made["focal_px"] = [1000.0 * f / p for f, p in zip(focal, pitch, strict=True)]
     sizes = [made.get(key) for key in ("width", "height")]
-    if "principal_px" not in made and all(isinstance(one, int) for one in sizes):
-        made["principal_px"] = [(one - 1) / 2 for one in sizes if isinstance(one, int)]
+    if "principal_px" not in made and all(isinstance(size, int) for size in sizes):
+        made["principal_px"] = [(size - 1) / 2 for size in sizes if isinstance(size, int)]
     return made
 
 

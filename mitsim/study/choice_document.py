@@ -134,7 +134,7 @@ class SensorEntry(PartialDocument):
     def expected_fits(self) -> int:
         """Return the number of tolerances that are expected to fit, or do, by their demand."""
         cells = self.measurements.values()
-        return sum(one.verdict != "no tolerance" and one.demand is not None and one.demand <= 1 for one in cells)
+        return sum(cell.verdict != "no tolerance" and cell.demand is not None and cell.demand <= 1 for cell in cells)
 
     @property
     def fits_all(self) -> bool:
@@ -160,12 +160,12 @@ class ChoiceDocument(PartialDocument):
     @property
     def best(self) -> SensorEntry | None:
         """Return the first sensor that takes part; None without any."""
-        return next((one for one in self.sensors if one.status != "excluded" and one.measurements), None)
+        return next((sensor for sensor in self.sensors if sensor.status != "excluded" and sensor.measurements), None)
 
     @property
     def toleranced(self) -> int:
         """Return the number of measurements with a tolerance."""
-        return sum(one.tolerance is not None for one in self.measurements.values())
+        return sum(measurement.tolerance is not None for measurement in self.measurements.values())
 
     @property
     def fit_more(self) -> list[str]:
@@ -173,23 +173,23 @@ class ChoiceDocument(PartialDocument):
         best, out = self.best, list[str]()
         if best is None or best.status != "stated":
             return out
-        for one in self.sensors:
-            if one.status != "stated" or one.fits <= best.fits:
+        for sensor in self.sensors:
+            if sensor.status != "stated" or sensor.fits <= best.fits:
                 continue
             why = "it can make more measurements"
-            if len(one.impossible) <= len(best.impossible):
-                mine, other = (two_digits(or_nan(each.ratio)) for each in (best, one))
-                ratios = f"{mine} times its limit, that of {one.name} at {other}"
+            if len(sensor.impossible) <= len(best.impossible):
+                mine, other = (two_digits(or_nan(each.ratio)) for each in (best, sensor))
+                ratios = f"{mine} times its limit, that of {sensor.name} at {other}"
                 why = f"its worst measurement is at {ratios} times"
-            fits = f"{one.name} fits {one.fits} of {self.toleranced} tolerances, {best.name} {best.fits}"
+            fits = f"{sensor.name} fits {sensor.fits} of {self.toleranced} tolerances, {best.name} {best.fits}"
             out.append(f"{fits}. {best.name} leads, since {why}")
         return out
 
     @model_validator(mode="after")
     def _of_all(self) -> ChoiceDocument:
-        for one in self.sensors:
-            if one.status != "excluded" and set(one.measurements) != set(self.measurements):
-                raise ValueError(f"sensor {one.name} must have exactly one cell for each measurement")
+        for sensor in self.sensors:
+            if sensor.status != "excluded" and set(sensor.measurements) != set(self.measurements):
+                raise ValueError(f"sensor {sensor.name} must have exactly one cell for each measurement")
         return self
 
 

@@ -55,20 +55,22 @@ def dependences_in_words(rows: Iterable[tuple[str, str, SizeDependence | None, f
     ``rows`` have the name, the unit and the dependence of each measurement, and the uncertainty with which it fits its
     tolerance, None without one.
     """
-    return [_sentence(name, unit, one, needed) for name, unit, one, needed in rows if one is not None]
+    return [
+        _sentence(name, unit, dependence, needed) for name, unit, dependence, needed in rows if dependence is not None
+    ]
 
 
 def remedies_in_words(dependences: Iterable[SizeDependence | None]) -> str:
     """Return what a user can do to know the numbers of some dependences; empty without any."""
-    groups = dict.fromkeys(one.group for one in dependences if one is not None)
+    groups = dict.fromkeys(dependence.group for dependence in dependences if dependence is not None)
     words = ". ".join(REMEDIES[group] for group in groups if group in REMEDIES)
     return f"{words}." if words else ""
 
 
-def _sentence(name: str, unit: str, one: SizeDependence, needed: float | None) -> str:
-    phrases = _PHRASES.get((one.group, one.name), (f"low {one.name}", f"high {one.name}"))
-    of = f" of {one.of}" if one.of else ""
-    (low, high), (held_low, held_high) = one.uncertainty, one.inside
+def _sentence(name: str, unit: str, dependence: SizeDependence, needed: float | None) -> str:
+    phrases = _PHRASES.get((dependence.group, dependence.name), (f"low {dependence.name}", f"high {dependence.name}"))
+    of = f" of {dependence.of}" if dependence.of else ""
+    (low, high), (held_low, held_high) = dependence.uncertainty, dependence.inside
     # where the tolerance lies between both ends, the number decides whether the measurement fits
     between = needed is not None and min(low, high) <= needed < max(low, high)
     limit = f", and {quantity(needed, unit)} is needed" if needed is not None and between else ""

@@ -62,7 +62,7 @@ class ManyFile(Document):
     @field_validator("finishes")
     @classmethod
     def _named_once(cls, finishes: list[ManyFinish]) -> list[ManyFinish]:
-        names = [one.name for one in finishes]
+        names = [finish.name for finish in finishes]
         if len(set(names)) < len(names):
             raise ValueError("different names, since each finish has a folder of its name")
         return finishes

@@ -155,7 +155,9 @@ def open_study(
         near, far = sensor.working_range_mm
         around = [max(math.floor(standoffs[0] - radius), near), min(math.ceil(standoffs[-1] + radius), far)]
         campaign = read_campaign(folder / file.characterisation.campaign, sensor, around)
-        known = samples_of([(one.finish, one.roughness, one.light) for one in campaign.samples], "the campaign")
+        known = samples_of(
+            [(sample.finish, sample.roughness, sample.light) for sample in campaign.samples], "the campaign"
+        )
         distances = list(campaign.distances)
     else:
         own = file.characterisation.map or sensor.name
@@ -194,7 +196,7 @@ def report_doubts(study: Study) -> None:
     """Report features whose machining marks have no direction, or that do not lie on the shapes of the scene."""
     report_geometry(study.task, study.scene)
     finishes = finishes_of_features(study)
-    for sentence in lays_in_words({name: one.scatter for name, one in finishes.items() if one is not None}):
+    for sentence in lays_in_words({name: finish.scatter for name, finish in finishes.items() if finish is not None}):
         say(sentence)
 
 
@@ -233,7 +235,9 @@ def _with_limits(path: str | Path, file: StudyFile, task: Task) -> StudyFile:
     if file.set.limits:
         return file
     tolerances = {name: tolerance_of(task, name) for name in task.measurements}
-    limits = {name: needed(screened_errors(1.0), one) for name, one in tolerances.items() if one is not None}
+    limits = {
+        name: needed(screened_errors(1.0), tolerance) for name, tolerance in tolerances.items() if tolerance is not None
+    }
     if not limits:
         allowed = "a limit for at least one measurement, or a tolerance in the task"
         raise InputError(path, "set.limits", "none, and no tolerance in the task", allowed)

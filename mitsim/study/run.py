@@ -224,12 +224,12 @@ def lacking(study: Study, scores: xr.Dataset, raced: Raced, stated: StatedView |
     if len(raced.views) and stated is None:
         out.append("no statement of uncertainty")
     elif stated is not None:
-        open_ones = [one.measurement for one in stated.statements if not one.settled]
+        open_ones = [statement.measurement for statement in stated.statements if not statement.settled]
         if open_ones:
             trials = stated.statements[0].trials
             by = f"{trials} trial{'s' if trials > 1 else ''}"
             out.append(f"statement from {by}: {len(open_ones)} of {len(stated.statements)} not settled")
-        if not any(one.budget for one in stated.statements):
+        if not any(statement.budget for statement in stated.statements):
             out.append("no budget")
     if limit.over():
         out.append("pictures" if not stopped_by_user() else "stopped by the user")

@@ -104,7 +104,7 @@ def write_record(
     """
     study = session.study
     finishes = finishes_of_features(study)
-    lays = {name: lay_left_out(one.scatter) for name, one in finishes.items() if one is not None}
+    lays = {name: lay_left_out(finish.scatter) for name, finish in finishes.items() if finish is not None}
     about = {
         "schema_version": 1,
         "mitsim": __version__,
@@ -126,17 +126,17 @@ def write_record(
         "finished": True,
         "lacks": [],
         "leaders": raced.leaders(),
-        "confidence": {name: one.confidence for name, one in raced.standings.items()},
-        "losses": {name: one.loss for name, one in raced.standings.items()},
+        "confidence": {name: standing.confidence for name, standing in raced.standings.items()},
+        "losses": {name: standing.loss for name, standing in raced.standings.items()},
         "light_path_depth": study.file.measure.light_path_depth,
         "score_light_path_depth": study.file.score.light_path_depth,
         "render_residual": None,
-        "features": {name: str(one) for name, one in finishes.items()},
+        "features": {name: str(finish) for name, finish in finishes.items()},
         "lay": {name: left_out for name, left_out in lays.items() if left_out is not None},
         "measurements": {
-            name: {key: getattr(one, key) for key in ("kind", "nominal", "unit", "features", "tolerance")}
+            name: {key: getattr(measurement, key) for key in ("kind", "nominal", "unit", "features", "tolerance")}
             | {"shapes": list(study.task.shapes_for(name))}
-            for name, one in study.task.measurements.items()
+            for name, measurement in study.task.measurements.items()
         },
         "seconds": {},
         "python": platform.python_version(),

@@ -60,7 +60,7 @@ def write_scene_geometry(folder: Path, scene: Scene, sensor: Sensor) -> None:
     np.savez_compressed(
         out,
         corners=np.concatenate([np.empty((0, 3, 3)), *parts.values()]).astype(np.float32),
-        shape=np.repeat(np.arange(len(parts)), [len(one) for one in parts.values()]),
+        shape=np.repeat(np.arange(len(parts)), [len(part) for part in parts.values()]),
         names=np.array(list(parts), "U"),
         centres=np.array([eye.centre for eye in eyes]),
         rays=np.array(rays),

@@ -37,19 +37,19 @@ def statement_document(session: Session, stated: StatedView) -> dict[str, Any]:
         "calibration": unknowns.calibration.source,
         "unknowns": unknowns.table.model_dump(mode="json"),
         "measurements": {
-            one.measurement: _measurement(one)
-            | {"maker_sigma": maker_sigma(study.sensor, study.task.measurements[one.measurement], view.standoff)}
-            for one in stated.statements
+            statement.measurement: _measurement(statement)
+            | {"maker_sigma": maker_sigma(study.sensor, study.task.measurements[statement.measurement], view.standoff)}
+            for statement in stated.statements
         },
-        "influences": [asdict(one) for one in declared],
+        "influences": [asdict(influence) for influence in declared],
     }
 
 
-def _measurement(one: Statement) -> dict[str, Any]:
-    lines = one.budget
-    table = {key: value for key, value in asdict(one).items() if key not in ("measurement", "budget", "decided")}
-    table["decision"] = None if one.decided is None else asdict(one.decided)
+def _measurement(statement: Statement) -> dict[str, Any]:
+    lines = statement.budget
+    table = {key: value for key, value in asdict(statement).items() if key not in ("measurement", "budget", "decided")}
+    table["decision"] = None if statement.decided is None else asdict(statement.decided)
     table["budget"] = [asdict(line) | {"fresh": line.group in FRESH} for line in lines]
-    known = math.isfinite(one.repeatability) and math.isfinite(one.standard_uncertainty)
-    table["after_repeats"] = {str(n): one.after_repeats(n) for n in (1, 4, 16)} if known else {}
+    known = math.isfinite(statement.repeatability) and math.isfinite(statement.standard_uncertainty)
+    table["after_repeats"] = {str(n): statement.after_repeats(n) for n in (1, 4, 16)} if known else {}
     return {key: json_values(value) for key, value in table.items()}

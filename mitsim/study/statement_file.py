@@ -130,8 +130,11 @@ class StatementDocument(PartialDocument):
 
         ``left_out`` are words for the influences that are not included; by default it names each of them.
         """
-        rows = [(name, one.standard_uncertainty, one.maker_sigma) for name, one in self.measurements.items()]
-        names = "; ".join(one.name for one in self.influences if not one.included)
+        rows = [
+            (name, measurement.standard_uncertainty, measurement.maker_sigma)
+            for name, measurement in self.measurements.items()
+        ]
+        names = "; ".join(influence.name for influence in self.influences if not influence.included)
         return below_the_maker(rows, left_out or names, self.sensor)
 
 

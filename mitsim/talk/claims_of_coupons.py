@@ -157,11 +157,11 @@ def _at_most(value: float) -> str:
     return "less than 0.001" if value < 0.001 else f"at most {value:.3f}"
 
 
-def _regions(one: xr.Dataset, normal: Floats) -> Claim:
-    a, b = np.meshgrid(one["a"].values.astype(float), one["b"].values.astype(float))
+def _regions(dataset: xr.Dataset, normal: Floats) -> Claim:
+    a, b = np.meshgrid(dataset["a"].values.astype(float), dataset["b"].values.astype(float))
     inside = np.hypot(a, b) < math.sqrt(2)
     normals = inverse_lambert_projection(np.stack([a, b], axis=-1)[inside])
-    fraction = one["recovered_fraction"].values.astype(float)[inside]
+    fraction = dataset["recovered_fraction"].values.astype(float)[inside]
     apart = np.degrees(np.arccos(np.clip(normals @ normal, -1, 1)))
     incidence = np.degrees(np.arccos(np.clip(normals[:, 2], -1, 1)))
 
@@ -184,7 +184,9 @@ def validation(talk: Talk, results: Results) -> Slide:
     """Return slide *Simulation Validation*."""
     slide, table = Slide("Simulation Validation"), talk.file.coupons
     campaign = read_toml(talk.folder / table.campaign, CampaignFile)
-    rough = sorted((roughness_of(one) for one in campaign.samples), key=lambda ra: -math.inf if ra is None else -ra)
+    rough = sorted(
+        (roughness_of(sample) for sample in campaign.samples), key=lambda ra: -math.inf if ra is None else -ra
+    )
     cells = []
     for ra in rough:
         for distance in table.validated_distances_mm:
@@ -201,12 +203,12 @@ def validation(talk: Talk, results: Results) -> Slide:
     words = f"{shown} captured and drawn from the map, F and sigma over incidence, and residuals of all samples"
     slide.pictures["validation"] = (figures.validation_figure(clouds["clouds"], cells, shown), words)
     worst = {
-        name: [largest_of([float(one[key]) for n, _, one in cells if n == name]) for key in _RESIDUALS]
+        name: [largest_of([float(dataset[key]) for n, _, dataset in cells if n == name]) for key in _RESIDUALS]
         for name in dict.fromkeys(name for name, _, _ in cells)
     }
     good = {name: largest_of(values) < _LIMIT for name, values in worst.items()}
     last = list(good)[-1]
-    floor = largest_of([float(one["sigma_floor"]) for n, _, one in cells if n == last])
+    floor = largest_of([float(dataset["sigma_floor"]) for n, _, dataset in cells if n == last])
     others = [good[name] for name in good if name != last]
     slide.claims.append(
         Claim(
@@ -229,19 +231,23 @@ _RESIDUALS = ("fraction_residual", "sigma_residual")
 
 def _multiple_reflections(talk: Talk, results: Results, slide: Slide) -> None:
     """Add the comparison of direct light alone with all light, on the artefact."""
-    names = {(one.name, light): f"light_{light}_{one.key}" for one in talk.file.samples for light in ("direct", "all")}
+    names = {
+        (sample.name, light): f"light_{light}_{sample.key}"
+        for sample in talk.file.samples
+        for light in ("direct", "all")
+    }
     found = {key: results.get(name) for key, name in names.items()}
-    slide.missing.extend(names[key] for key, one in found.items() if one is None)
+    slide.missing.extend(names[key] for key, dataset in found.items() if dataset is None)
     pairs: dict[str, tuple[xr.Dataset, xr.Dataset]] = {}
-    for one in talk.file.samples:
-        direct, every = found[one.name, "direct"], found[one.name, "all"]
+    for sample in talk.file.samples:
+        direct, every = found[sample.name, "direct"], found[sample.name, "all"]
         if direct is not None and every is not None:
-            pairs[one.name] = (direct, every)
+            pairs[sample.name] = (direct, every)
     if not pairs:
         return
     words = "F captured over F from the map for the artefact's features, in direct light alone and in all light"
     slide.pictures["light"] = (figures.light_figure(pairs), words)
-    fractions = {name: [figures.fractions(one) for one in pair] for name, pair in pairs.items()}
+    fractions = {name: [figures.fractions(dataset) for dataset in pair] for name, pair in pairs.items()}
     residuals = {
         name: [float(np.abs(captured - expected).mean()) if len(expected) else math.nan for expected, captured in both]
         for name, both in fractions.items()

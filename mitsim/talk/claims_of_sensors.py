@@ -24,16 +24,17 @@ _GAUSSIAN = 0.05
 def surfaces(talk: Talk, results: Results) -> Slide:
     """Return slide *Measuring Challenging Surfaces*."""
     slide = Slide("Measuring Challenging Surfaces")
-    found = collected(results, {one.name: f"finish_{one.key}" for one in talk.file.finishes}, slide)
+    found = collected(results, {finish.name: f"finish_{finish.key}" for finish in talk.file.finishes}, slide)
     if not found:
         return slide
     slide.pictures["surfaces"] = (
         figures.surfaces_figure(found),
         f"The artefact in {listed(list(found))} before {talk.sensor.name}: image, cloud, and why pixels lack a point",
     )
-    shares = {name: figures.share(one) for name, one in found.items()}
+    shares = {name: figures.share(dataset) for name, dataset in found.items()}
     by_feature = {
-        name: (one["points"] / one["possible"].where(one["possible"] >= 100)).values for name, one in found.items()
+        name: (dataset["points"] / dataset["possible"].where(dataset["possible"] >= 100)).values
+        for name, dataset in found.items()
     }
     spread = largest_of([largest_of(values) + largest_of(-values) for values in by_feature.values()])
     known = map_in(talk.folder, talk.map_name)
@@ -71,9 +72,11 @@ def noise(talk: Talk, results: Results) -> Slide:
         return slide
     words = f"Residuals of {listed(list(found))} on a matt-white plate, with their histograms and the normal curve"
     slide.pictures["noise"] = (figures.noise_figure(found), words)
-    apart = {name: one.attrs["distance_one"] for name, one in found.items()}
-    two = [name for name, one in found.items() if one.attrs["two"]]
-    kurtosis = ", ".join(f"{name} {one.attrs['kurtosis']:+.2f}".replace("-0", "−0") for name, one in found.items())
+    apart = {name: dataset.attrs["distance_one"] for name, dataset in found.items()}
+    two = [name for name, dataset in found.items() if dataset.attrs["two"]]
+    kurtosis = ", ".join(
+        f"{name} {dataset.attrs['kurtosis']:+.2f}".replace("-0", "−0") for name, dataset in found.items()
+    )
     worst = max(apart.values())
     slide.claims.extend(
         [

@@ -47,9 +47,9 @@ def judged_of(talk: Talk, results: Results, measured: dict[str, xr.Dataset], sli
     slide
         Takes the names of missing results.
     """
-    names = {one.name: one.key for one in talk.file.samples}
+    names = {sample.name: sample.key for sample in talk.file.samples}
     scores = collected(results, {name: f"scores_{key}" for name, key in names.items()}, slide)
-    wanted = {one.name: trials_name(one) for one in talk.file.samples if one.key not in measured}
+    wanted = {sample.name: trials_name(sample) for sample in talk.file.samples if sample.key not in measured}
     errors = collected(results, wanted, slide)
     errors |= {name: measured[key] for name, key in names.items() if key in measured}
     both = [name for name in names if name in scores and name in errors]
@@ -132,14 +132,14 @@ def view_score(talk: Talk, judged: JudgedViews) -> Slide:
 def examples(talk: Talk, judged: JudgedViews) -> Slide:
     """Return slides *Example Result*."""
     slide = Slide("Example Results")
-    for one in talk.file.examples:
-        if one.sample not in judged.errors or one.sample not in judged.scores:
-            slide.missing.append(trials_name(talk.sample(one.sample)))
+    for example in talk.file.examples:
+        if example.sample not in judged.errors or example.sample not in judged.scores:
+            slide.missing.append(trials_name(talk.sample(example.sample)))
             continue
-        words = f"Deciles of V_m for {one.measurement} ({one.sample}), and spheres of V_m and of the true error"
-        picture = figures.example_figure(judged, one.sample, one.measurement)
-        slide.pictures[_picture(one)] = (picture, words)
-        slide.claims.append(_example(judged, one))
+        words = f"Deciles of V_m for {example.measurement} ({example.sample}), and spheres of V_m and of the true error"
+        picture = figures.example_figure(judged, example.sample, example.measurement)
+        slide.pictures[_picture(example)] = (picture, words)
+        slide.claims.append(_example(judged, example))
     return slide
 
 
@@ -159,15 +159,18 @@ _SURVIVORS = (
 )
 
 
-def _example(judged: JudgedViews, one: ExampleEntry) -> Claim:
-    cell, errors = judged.cell(one.sample, one.measurement, "V_m"), judged.errors[one.sample]
+def _example(judged: JudgedViews, example: ExampleEntry) -> Claim:
+    cell, errors = (
+        judged.cell(example.sample, example.measurement, "V_m"),
+        judged.errors[example.sample],
+    )
     values, views, share = cell["error"].values, cell["views"].values, cell["share"].values
-    unit = unit_symbol(str(judged.scores[one.sample]["unit"].sel(measurement=one.measurement).item()))
+    unit = unit_symbol(str(judged.scores[example.sample]["unit"].sel(measurement=example.measurement).item()))
     possible = int(views[1:].sum())
-    trials = errors["error"].sel(measurement=one.measurement).values[errors["tried"].values > 0]
+    trials = errors["error"].sel(measurement=example.measurement).values[errors["tried"].values > 0]
     measurable = int((np.isfinite(trials).mean(axis=1) >= 0.5).sum())
     if not possible:
-        return _nothing_possible(judged, one, measurable, float(share[0]))
+        return _nothing_possible(judged, example, measurable, float(share[0]))
     known = np.flatnonzero(np.isfinite(values[1:])) + 1
     correlations = [cell.attrs[f"{name}_correlation"] for name in QUANTITIES]
     ratio = float(values[known[0]] / values[known[-1]]) if len(known) > 1 else math.nan
@@ -175,8 +178,9 @@ def _example(judged: JudgedViews, one: ExampleEntry) -> Claim:
     top = max(best) / min(best) if len(best) > 1 else math.nan
     ends = "" if math.isnan(ratio) else f" ({two_digits(values[known[0]])} to {two_digits(values[known[-1]])} {unit})"
     found = (
-        f"{one.measurement}, {one.sample}: {possible} of {int(views.sum())} views are possible by V_m; {measurable} "
-        f"have a value in half of the trials. Trials with a value: {_percent(share[0])} where V_m says impossible, "
+        f"{example.measurement}, {example.sample}: {possible} of {int(views.sum())} views are possible by V_m; "
+        f"{measurable} have a value in half of the trials. Trials with a value: {_percent(share[0])} where V_m says "
+        f"impossible, "
         f"{_percent(_mean_share(cell))} elsewhere. Rank correlation of bins with error {_signed(correlations[0])}, "
         f"standard deviation {_signed(correlations[1])}, missing values {_signed(correlations[2])}. Error of the worst "
         f"over the best bin: {_ratio(ratio)}{ends}; the best three bins differ by the factor {_ratio(top)}."
@@ -186,34 +190,35 @@ def _example(judged: JudgedViews, one: ExampleEntry) -> Claim:
     figure = f"rank correlation {_signed(correlations[0])} with error, {_signed(correlations[1])} with deviation"
     why = _SURVIVORS if predicts and not all(good) else ""
     return Claim(
-        _WORDS.get(one.slide, one.measurement),
+        _WORDS.get(example.slide, example.measurement),
         found,
         figure,
         verdict(bool(good) and all(good), any(good) or predicts),
         why,
-        _picture(one),
+        _picture(example),
     )
 
 
-def _nothing_possible(judged: JudgedViews, one: ExampleEntry, measurable: int, share: float) -> Claim:
+def _nothing_possible(judged: JudgedViews, example: ExampleEntry, measurable: int, share: float) -> Claim:
     """Return the claim of an example without views that are possible by V_m."""
-    points, shapes = judged.scores[one.sample]["n"], list(judged.task.shapes_for(one.measurement))
+    points, shapes = judged.scores[example.sample]["n"], list(judged.task.shapes_for(example.measurement))
     most = listed([f"{float(points.sel(feature=name).max()):.0f} points of {name}" for name in shapes])
     views = points.sizes["view"]
     return Claim(
-        _WORDS.get(one.slide, one.measurement),
-        f"{one.measurement}, {one.sample}: V_m calls all {views} views impossible. Some are expected to show up to "
-        f"{most}, but none to show {MINIMUM_POINTS} of each. Of the trials {_percent(share)} have a value nonetheless, "
+        _WORDS.get(example.slide, example.measurement),
+        f"{example.measurement}, {example.sample}: V_m calls all {views} views impossible. Some are expected to show "
+        f"up to {most}, but none to show {MINIMUM_POINTS} of each. Of the trials {_percent(share)} have a value "
+        f"nonetheless, "
         f"by light from other faces. {measurable or 'No'} views have one in half of their trials.",
         f"0 of {views} views possible by V_m, {measurable} measurable in half of the trials",
         verdict(False, not measurable),
         "The prediction that this cannot be measured holds. Without possible views there is no correlation to test.",
-        _picture(one),
+        _picture(example),
     )
 
 
-def _picture(one: ExampleEntry) -> str:
-    return f"example_{one.measurement}"
+def _picture(example: ExampleEntry) -> str:
+    return f"example_{example.measurement}"
 
 
 def _mean_share(cell: xr.Dataset) -> float:

@@ -67,7 +67,7 @@ def campaign_of(folder: str, place: CouponPlace, **changes: object) -> Campaign:
     """Return the campaign of one sample at one distance."""
     path, roughness, distance = Path(folder) / place.campaign, place.roughness, place.distance
     content = read_toml(path, CampaignFile)
-    entries = [one for one in content.samples if roughness_of(one) == roughness]
+    entries = [sample for sample in content.samples if roughness_of(sample) == roughness]
     if not entries:
         named = "matt white" if roughness is None else f"Ra {roughness:g}"
         raise InputError(path, "samples", "no such sample", f"one of {named}", "the talk shows it")
@@ -255,15 +255,15 @@ def clouds_of_coupon(folder: str, place: CouponPlace, map_name: str, angle: floa
     drawn = prepared.predictor.predict(known, pose.inverse(), np.random.default_rng(seed), correlated=True)
     window, _ = _window(cloud, coupon)
     data = xr.Dataset(attrs={"distance_mm": place.distance, "Ra_um": place.roughness, "tilt_deg": angle})
-    for name, one in (("captured", cloud), ("drawn", drawn)):
-        rays = one.grid.rays()
-        reach = ((coupon.centre - one.grid.origin) @ coupon.normal) / (rays @ coupon.normal)
-        off = np.linalg.norm(one.points - one.grid.origin, axis=-1) - reach
-        cut = np.where(one.valid, off, np.nan)[window]
+    for name, point_cloud in (("captured", cloud), ("drawn", drawn)):
+        rays = point_cloud.grid.rays()
+        reach = ((coupon.centre - point_cloud.grid.origin) @ coupon.normal) / (rays @ coupon.normal)
+        off = np.linalg.norm(point_cloud.points - point_cloud.grid.origin, axis=-1) - reach
+        cut = np.where(point_cloud.valid, off, np.nan)[window]
         step = max(1, -(-max(cut.shape) // _SIDE_PX))
         steps = np.nan_to_num(np.clip(cut[::step, ::step] / STEP_MM, -30_000, 30_000), nan=NO_POINT)
         data[name] = (("row", "column"), steps.round().astype(np.int16), {"units": f"{STEP_MM:g} mm"})
-        data.attrs[f"share_{name}"] = float(one.valid[window].mean())
+        data.attrs[f"share_{name}"] = float(point_cloud.valid[window].mean())
     return data
 
 

@@ -95,16 +95,16 @@ def make(
     for piece in pieces:
         results.digests[piece.name] = piece.digest(talk.folder)
     missing = [piece for piece in pieces if results.get(piece.name) is None]
-    shown = [one.sample for one in talk.file.examples]
+    shown = [example.sample for example in talk.file.examples]
     wanted = [sample for sample in talk.file.samples if sample.key not in measured]
     wanted.sort(key=lambda sample: sample.name not in shown)  # those of the examples first
     samples = [_unfinished(talk, results, sample, folder) for sample in wanted]
     unfinished = [one for one in samples if one is not None]
     place = str(talk.folder)
-    of_trials = [one for found in unfinished for one in _trial_orders(talk, found)]
+    of_trials = [trial_order for found in unfinished for trial_order in _trial_orders(talk, found)]
     orders: list[_Order] = [*((place, piece) for piece in missing), *of_trials]
     if orders:
-        trials = sum(len(one.jobs) for one in of_trials)
+        trials = sum(len(of_trial.jobs) for of_trial in of_trials)
         seconds = _PIECE_S * len(missing) + _TRIAL_S * trials
         say_progress(
             f"{len(missing)} pieces of work and {trials} virtual measurements to make: about "

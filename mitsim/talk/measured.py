@@ -90,7 +90,7 @@ def _errors(talk: Talk, sample: ArtefactEntry, place: Path) -> dict[str, float]:
     cloud = capture_cloud(capture, settings, imager=imager)
     assert capture.world_from_sensor is not None  # as _shown has checked
     results = measure_task(cloud, study.task, study.scene, capture.world_from_sensor, margin_px=margin_of(settings))
-    return {name: float(one.error) for name, one in zip(study.task.measurements, results, strict=True)}
+    return {name: float(result.error) for name, result in zip(study.task.measurements, results, strict=True)}
 
 
 def _as_trials(talk: Talk, views: dict[int, list[dict[str, float]]]) -> xr.Dataset:

@@ -105,7 +105,7 @@ def write_talk(
     images = folder / "images"
     images.mkdir(parents=True, exist_ok=True)
     frames = {sensor_key(name): results.get(f"opening_{sensor_key(name)}") for name in talk.file.opening_sensors}
-    known = {name: one for name, one in frames.items() if one is not None}
+    known = {name: frame for name, frame in frames.items() if frame is not None}
     words = f"What {listed(list(known))} see of the artefact: rendered images of the projected light"
     opening = _drawn(images, "opening", opening_figure(known), words) if known else None
     pictures = [

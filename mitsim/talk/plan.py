@@ -76,7 +76,7 @@ class Piece:
         content = {
             "version": VERSION,
             "function": self.function,
-            "arguments": [_as_plain(one) for one in self.arguments],
+            "arguments": [_as_plain(argument) for argument in self.arguments],
             "sensors": [sensor_checksum(sensor_in(folder, name)) for name in self.sensors],
             "scenes": [_scene_digest(folder / path, parameters) for path, parameters in self.scenes],
             "files": [_file_digest(folder / name) for name in self.files],
@@ -97,17 +97,25 @@ def pieces_of(talk: Talk) -> list[Piece]:
     number = pictured_view(talk)
     sensor, known = (file.sensor,), talk.map_name
     pieces = [
-        Piece(f"opening_{sensor_key(name)}", "opening", (one.scene, _plain(one), name), (name,), (_scene(one),))
+        Piece(
+            f"opening_{sensor_key(name)}",
+            "opening",
+            (artefact_entry.scene, _plain(artefact_entry), name),
+            (name,),
+            (_scene(artefact_entry),),
+        )
         for name in file.opening_sensors
-        for one in (file.finishes or file.samples)[:1]
+        for artefact_entry in (file.finishes or file.samples)[:1]
     ]
     pieces += [
-        Piece(f"finish_{one.key}", "finish", (talk.study_file(one), number), sensor, (_scene(one),))
-        for one in file.finishes
+        Piece(f"finish_{finish.key}", "finish", (talk.study_file(finish), number), sensor, (_scene(finish),))
+        for finish in file.finishes
     ]
     place = CouponPlace(coupons.campaign, file.sensor, coupons.distance_mm, coupons.roughness_um)
     campaign = read_toml(talk.folder / coupons.campaign, CampaignFile)
-    of_coupons = tuple((str(Path(coupons.campaign).parent / one.scene), ()) for one in campaign.samples)
+    of_coupons = tuple(
+        (str(Path(coupons.campaign).parent / sample_entry.scene), ()) for sample_entry in campaign.samples
+    )
     refined = (coupons.subdivisions, coupons.refined, file.seed)
     pieces.append(Piece("characterised", "characterised", (place, *refined), sensor, of_coupons))
     pieces.append(Piece("tilts", "tilts", (place, tuple(coupons.tilts_deg)), sensor, of_coupons))
@@ -122,14 +130,20 @@ def pieces_of(talk: Talk) -> list[Piece]:
             poses = coupons.poses * (_SHOWN_POSES if rough == coupons.shown_roughness_um else 1)
             arguments = (there, known, poses, file.seed)
             pieces.append(Piece(validation_name(rough, distance), "validation", arguments, sensor, of_coupons, known))
-    for one in file.samples:
-        study = (talk.study_file(one),)
-        pieces.append(Piece(f"scores_{one.key}", "scores", study, sensor, (_scene(one),), known, (file.task,)))
+    for artefact_entry in file.samples:
+        study = (talk.study_file(artefact_entry),)
+        pieces.append(
+            Piece(
+                f"scores_{artefact_entry.key}", "scores", study, sensor, (_scene(artefact_entry),), known, (file.task,)
+            )
+        )
     numbers = compared_views(talk)
-    for one in file.samples:
+    for artefact_entry in file.samples:
         for name, depth in (("direct", 1), ("all", file.light_path_depth)):
-            seen = (talk.study_file(one, depth), numbers)
-            pieces.append(Piece(f"light_{name}_{one.key}", "light", seen, sensor, (_scene(one),), known))
+            seen = (talk.study_file(artefact_entry, depth), numbers)
+            pieces.append(
+                Piece(f"light_{name}_{artefact_entry.key}", "light", seen, sensor, (_scene(artefact_entry),), known)
+            )
     return pieces
 
 
@@ -157,12 +171,12 @@ def _as_plain(argument: Any) -> Any:
     return asdict(argument) if is_dataclass(argument) and not isinstance(argument, type) else argument
 
 
-def _scene(one: ArtefactEntry) -> tuple[str, tuple[tuple[str, str], ...]]:
-    return one.scene, _plain(one)
+def _scene(artefact_entry: ArtefactEntry) -> tuple[str, tuple[tuple[str, str], ...]]:
+    return artefact_entry.scene, _plain(artefact_entry)
 
 
-def _plain(one: ArtefactEntry) -> tuple[tuple[str, str], ...]:
-    return tuple((name, str(value)) for name, value in sorted(one.parameters.items()))
+def _plain(artefact_entry: ArtefactEntry) -> tuple[tuple[str, str], ...]:
+    return tuple((name, str(value)) for name, value in sorted(artefact_entry.parameters.items()))
 
 
 @lru_cache(maxsize=64)

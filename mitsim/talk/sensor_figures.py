@@ -39,7 +39,7 @@ def _bare(axes: Axes) -> None:
 def opening_figure(frames: Mapping[str, xr.Dataset]) -> Figure:
     """Draw the rendered frames of each sensor in a strip."""
     with drawing():
-        shown = [(name, frame) for name, one in frames.items() for frame in one["frames"].values]
+        shown = [(name, frame) for name, dataset in frames.items() for frame in dataset["frames"].values]
         across = min(len(shown), 6)
         down = -(-len(shown) // across)
         figure = Figure((1.85 * across, 1.6 * down))
@@ -61,16 +61,16 @@ def surfaces_figure(found: Mapping[str, xr.Dataset]) -> Figure:
     with drawing():
         figure = Figure((3.1 * len(found), 7.3), layout="constrained")
         grid = np.asarray(figure.subplots(3, len(found), squeeze=False))
-        depth = np.concatenate([one["depth"].values.ravel() for one in found.values()])
+        depth = np.concatenate([dataset["depth"].values.ravel() for dataset in found.values()])
         low, high = depth_limits(depth[np.isfinite(depth)], 2.0)
         present: set[int] = set()
-        for (name, one), (image, cloud, status) in zip(found.items(), grid.T, strict=True):
-            image.imshow(one["image"].values, cmap="gray", vmin=0, vmax=255)
-            image.set_title(f"{name}: {100 * share(one):.0f} % of the points")
-            shown = cloud.imshow(np.ma.masked_invalid(one["depth"].values), cmap=SEQUENTIAL, vmin=low, vmax=high)
+        for (name, dataset), (image, cloud, status) in zip(found.items(), grid.T, strict=True):
+            image.imshow(dataset["image"].values, cmap="gray", vmin=0, vmax=255)
+            image.set_title(f"{name}: {100 * share(dataset):.0f} % of the points")
+            shown = cloud.imshow(np.ma.masked_invalid(dataset["depth"].values), cmap=SEQUENTIAL, vmin=low, vmax=high)
             cloud.set_facecolor(FIELD)
-            draw_status(status, one["status"].values)
-            present |= set(np.unique(one["status"].values).tolist())
+            draw_status(status, dataset["status"].values)
+            present |= set(np.unique(dataset["status"].values).tolist())
             for axes in (image, cloud, status):
                 _bare(axes)
         colour_scale(figure, shown, grid[1].tolist(), "depth [mm]", aspect=18)
@@ -79,9 +79,9 @@ def surfaces_figure(found: Mapping[str, xr.Dataset]) -> Figure:
     return figure
 
 
-def share(one: xr.Dataset) -> float:
+def share(dataset: xr.Dataset) -> float:
     """Return the share of possible points on the artefact's features that were recovered."""
-    return float(one["points"].sum() / one["possible"].sum())
+    return float(dataset["points"].sum() / dataset["possible"].sum())
 
 
 def gradient(x: Floats, y: Floats) -> tuple[Floats, Floats]:
@@ -163,20 +163,20 @@ def noise_figure(found: Mapping[str, xr.Dataset]) -> Figure:
     with drawing():
         figure = Figure((2.65 * len(found), 5.0), layout="constrained")
         grid = np.asarray(figure.subplots(2, len(found), squeeze=False))
-        for (name, one), (picture, curve) in zip(found.items(), grid.T, strict=True):
-            limit = residual_limit(one["image"].values)
-            shown = picture.imshow(one["image"].values, cmap=DIVERGING, vmin=-limit, vmax=limit)
+        for (name, dataset), (picture, curve) in zip(found.items(), grid.T, strict=True):
+            limit = residual_limit(dataset["image"].values)
+            shown = picture.imshow(dataset["image"].values, cmap=DIVERGING, vmin=-limit, vmax=limit)
             picture.set_facecolor(FIELD)
             _bare(picture)
             picture.set_title(name, fontsize=8.5)
             colour_scale(figure, shown, picture, "residual along V [mm]", location="bottom", aspect=16)
-            middle, sigma = one["middle"].values.astype(float), one.attrs["sigma"]
-            curve.fill_between(middle, one["histogram"].values, step="mid", color=BLUE, alpha=0.4, lw=0)
+            middle, sigma = dataset["middle"].values.astype(float), dataset.attrs["sigma"]
+            curve.fill_between(middle, dataset["histogram"].values, step="mid", color=BLUE, alpha=0.4, lw=0)
             curve.plot(middle, stats.norm.pdf(middle, 0, sigma), color=INK, lw=1.2, label="normal")
-            if one.attrs["two"]:
-                both = TwoNormals(one.attrs["narrow"], one.attrs["wide"], one.attrs["share"])
+            if dataset.attrs["two"]:
+                both = TwoNormals(dataset.attrs["narrow"], dataset.attrs["wide"], dataset.attrs["share"])
                 curve.plot(middle, both.density(middle), "--", color=VERMILION, lw=1.2, label="sum of two")
-            kurtosis = f"{one.attrs['kurtosis']:+.2f}".replace("-", "−")
+            kurtosis = f"{dataset.attrs['kurtosis']:+.2f}".replace("-", "−")
             curve.set_title(f"σ {sigma:.2g} mm, kurtosis {kurtosis}", fontsize=8.5)
             curve.set(xlabel="residual [mm]", yticks=[])
             curve.legend(fontsize=7, loc="upper right", handlelength=1.2)
@@ -282,16 +282,18 @@ def validation_figure(clouds: xr.Dataset, cells: Sequence[tuple[str, float, xr.D
             axes[name].set_title(f"{shown} at {clouds.attrs['distance_mm']:g} mm: {name}", fontsize=8.5)
             _bare(axes[name])
         colour_scale(figure, picture, [axes["captured"], axes["drawn"]], "off the plane [mm]", location="bottom")
-        here = [one for name, distance, one in cells if name == shown and distance == clouds.attrs["distance_mm"]]
-        for one in here:
-            order = np.argsort(one["incidence"].values)
-            incidence = np.degrees(one["incidence"].values[order])
+        here = [
+            dataset for name, distance, dataset in cells if name == shown and distance == clouds.attrs["distance_mm"]
+        ]
+        for dataset in here:
+            order = np.argsort(dataset["incidence"].values)
+            incidence = np.degrees(dataset["incidence"].values[order])
             for key, name, label in (("F", "fraction", "F [1]"), ("sigma", "sigma", "σ [mm]")):
                 axes[key].plot(
-                    incidence, one[f"{name}_measured"].values[order], "o-", ms=4, color=BLUE, label="captured"
+                    incidence, dataset[f"{name}_measured"].values[order], "o-", ms=4, color=BLUE, label="captured"
                 )
                 axes[key].plot(
-                    incidence, one[f"{name}_predicted"].values[order], "x--", color=VERMILION, label="from the map"
+                    incidence, dataset[f"{name}_predicted"].values[order], "x--", color=VERMILION, label="from the map"
                 )
                 axes[key].set(xlabel="incidence [deg]", ylabel=label, ylim=(0, None))
         axes["F"].legend(loc="best")
@@ -304,7 +306,10 @@ def validation_figure(clouds: xr.Dataset, cells: Sequence[tuple[str, float, xr.D
         ):
             for number, distance in enumerate(distances):
                 values = [
-                    next((100 * float(one[name]) for n, d, one in cells if (n, d) == (sample, distance)), math.nan)
+                    next(
+                        (100 * float(dataset[name]) for n, d, dataset in cells if (n, d) == (sample, distance)),
+                        math.nan,
+                    )
                     for sample in names
                 ]
                 places = np.arange(len(names)) + (number - (len(distances) - 1) / 2) * width
@@ -322,10 +327,10 @@ def light_figure(found: Mapping[str, tuple[xr.Dataset, xr.Dataset]]) -> Figure:
         figure = Figure((2.1 * len(found) + 0.5, 2.9), layout="constrained")
         row = np.asarray(figure.subplots(1, len(found), squeeze=False, sharey=True))[0]
         for axes, (name, pair) in zip(row, found.items(), strict=True):
-            for one, mark, colour, words in zip(
+            for dataset, mark, colour, words in zip(
                 pair, "ox", (MUTED, VERMILION), ("direct light", "all light"), strict=True
             ):
-                expected, captured = fractions(one)
+                expected, captured = fractions(dataset)
                 axes.plot(expected, captured, mark, ms=4.5, color=colour, label=words)
             axes.plot([0, 1], [0, 1], color=INK, lw=0.6)
             axes.set(xlim=(-0.04, 1.04), ylim=(-0.04, 1.04), aspect="equal", xlabel="F from the map")
@@ -335,8 +340,8 @@ def light_figure(found: Mapping[str, tuple[xr.Dataset, xr.Dataset]]) -> Figure:
     return figure
 
 
-def fractions(one: xr.Dataset) -> tuple[Floats, Floats]:
+def fractions(dataset: xr.Dataset) -> tuple[Floats, Floats]:
     """Return expected and captured F of the features of some views, of those with 100 possible points or more."""
-    enough = one["possible"].values >= 100
-    possible = one["possible"].values[enough]
-    return one["expected"].values[enough] / possible, one["points"].values[enough] / possible
+    enough = dataset["possible"].values >= 100
+    possible = dataset["possible"].values[enough]
+    return dataset["expected"].values[enough] / possible, dataset["points"].values[enough] / possible

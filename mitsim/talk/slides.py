@@ -55,8 +55,8 @@ def verdict(holds: bool, in_part: bool = False) -> Verdict:
 def collected(results: Results, names: Mapping[str, str], slide: Slide) -> dict[str, xr.Dataset]:
     """Return the results of pieces by the keys of ``names``; missing ones are noted in the slide."""
     found = {key: results.get(name) for key, name in names.items()}
-    slide.missing.extend(names[key] for key, one in found.items() if one is None)
-    return {key: one for key, one in found.items() if one is not None}
+    slide.missing.extend(names[key] for key, dataset in found.items() if dataset is None)
+    return {key: dataset for key, dataset in found.items() if dataset is not None}
 
 
 def finite(values: ArrayLike) -> NDArray[np.float64]:

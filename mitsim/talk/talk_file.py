@@ -139,7 +139,7 @@ class Talk:
 
     def sample(self, name: str) -> ArtefactEntry:
         """Return the sample of a name."""
-        return next(one for one in self.file.samples if one.name == name)
+        return next(artefact_entry for artefact_entry in self.file.samples if artefact_entry.name == name)
 
 
 def read_talk(path: str | Path) -> Talk:
@@ -153,13 +153,15 @@ def read_talk(path: str | Path) -> Talk:
     path = Path(path)
     file = read_toml(path, TalkFile)
     for where, entries in (("samples", file.samples), ("finishes", file.finishes)):
-        keys = [one.key for one in entries]
+        keys = [entry.key for entry in entries]
         if twice := next((key for key in keys if keys.count(key) > 1), None):
             raise InputError(path, f"{where}.name", f"{twice}, more than once", "a name of its own for each")
-    names = [one.name for one in file.samples]
-    for one in (*file.examples, file.sphere):
-        if one.sample not in names:
-            raise InputError(path, "sample", repr(one.sample), ", ".join(names), "of an example or of the sphere")
+    names = [sample.name for sample in file.samples]
+    for example_entry in (*file.examples, file.sphere):
+        if example_entry.sample not in names:
+            raise InputError(
+                path, "sample", repr(example_entry.sample), ", ".join(names), "of an example or of the sphere"
+            )
     return Talk(path, file)
 
 

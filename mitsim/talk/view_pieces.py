@@ -48,9 +48,9 @@ def trimmed(scores: xr.Dataset, study: Study) -> xr.Dataset:
             kept[name] = kept[name].astype(np.float32)
     kept["possible"] = kept["possible"].astype(np.int8)
     outside = study.candidates.left_out
-    directions = np.array([one.direction for one in outside], float).reshape(-1, 3)
+    directions = np.array([out.direction for out in outside], float).reshape(-1, 3)
     kept["left_out"] = (("outside", "xyz"), directions)
-    kept["reason"] = ("outside", np.array([one.reason for one in outside] or [""], dtype=str)[: len(outside)])
+    kept["reason"] = ("outside", np.array([out.reason for out in outside] or [""], dtype=str)[: len(outside)])
     for name in ("measurement", "feature", "unit", "reason"):
         kept[name] = kept[name].astype(object)
     return kept.assign_attrs(standoff_mm=study.views[0].standoff, moved_out=study.candidates.moved_out)

@@ -238,11 +238,11 @@ def _sights(table: ViewsTable, sensor: Sensor, target: Floats) -> list[_Sight]:
     free = [_Sight(*one, partial(_free_pose, table, sensor, target, *one)) for one in asked]
     if stage is None:
         return free
-    turns = stage_from_sensor(sensor, 1.0).rotation @ np.stack([one.pose(1.0).rotation.T for one in free])
+    turns = stage_from_sensor(sensor, 1.0).rotation @ np.stack([sight.pose(1.0).rotation.T for sight in free])
     reach = reach_rotations(stage, turns)
     return [
-        replace(one, pose=partial(_stage_pose, stage, sensor, target, angles), angles=angles, reason=reason)
-        for one, angles, reason in zip(free, reach.angles, reach.reasons, strict=True)
+        replace(sight, pose=partial(_stage_pose, stage, sensor, target, angles), angles=angles, reason=reason)
+        for sight, angles, reason in zip(free, reach.angles, reach.reasons, strict=True)
     ]
 
 

@@ -60,7 +60,7 @@ def write_views(folder: str | Path, candidates: Candidates, table: ViewsTable, s
         files["stage.csv"] = _stage_csv(views, table)
     if left_out:
         head = ["direction_x", "direction_y", "direction_z", "roll_deg", "standoff_mm", "reason"]
-        rows = [[*_written([*one.direction, one.roll_deg, one.standoff]), one.reason] for one in left_out]
+        rows = [[*_written([*out.direction, out.roll_deg, out.standoff]), out.reason] for out in left_out]
         files["left_out.csv"] = _csv(head, rows)
     write_folder(folder, {name: text.encode("utf-8") for name, text in files.items()}, overwrite=True)
     if candidates.moved_out:

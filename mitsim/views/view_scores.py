@@ -151,7 +151,7 @@ def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above 
         pose = view.world_from_sensor
         whole = looking.surfaces(scene, pose)
         ideal, labels = looking.ideal(whole), looking.labels(scene, pose, whole)
-        n_only = np.array([_white_points(looking, one, pose) for one in alone])
+        n_only = np.array([_white_points(looking, characterised_scene, pose) for characterised_scene in alone])
         view_of = SceneView(scene, pose, whole, ideal)
         return _Cast(ideal, labels, n_only, together((effect(view_of) for effect in effects), len(ideal.pixel)))
 
@@ -163,19 +163,24 @@ def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above 
     by_place = dict[int, _ViewScore]()
     # the tracked scores come first, so that the last line of progress is printed when they end
     scoring = track(one_ahead([views[i] for i in order], cast, score), "score views", len(views))
-    for (_, one), place in zip(scoring, order, strict=False):
-        by_place[place] = one
+    for (_, view_score), place in zip(scoring, order, strict=False):
+        by_place[place] = view_score
         if limit is not None and limit.over() and len(by_place) >= FEWEST_VIEWS:
             break
     scored = [by_place.get(place) or _not_scored(by_place[order[0]]) for place in range(len(views))]
-    columns = (np.array([getattr(one, key) for one in scored]) for key in _STATISTICS)
+    columns = (np.array([getattr(view_score, key) for view_score in scored]) for key in _STATISTICS)
     statistics = view_statistics(names, *columns)
     scores = score_views(statistics, task, minimum_points)
     scores.attrs["views_scored"] = len(by_place)
     for name in ("mean_sigma", "n_white", "mean_sigma_white", "n_only_white"):
         scores[name] = statistics[name]
     uncertainty, chance = (
-        np.array([[getattr(one.measurements[m], name) for one in scored] for m in range(len(task.measurements))])
+        np.array(
+            [
+                [getattr(view_score.measurements[m], name) for view_score in scored]
+                for m in range(len(task.measurements))
+            ]
+        )
         for name in ("uncertainty", "chance")
     )
     possible = np.isfinite(uncertainty) & (chance >= LEAST_CHANCE)
@@ -202,7 +207,7 @@ def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above 
     tolerances = [math.nan if m.tolerance_size is None else m.tolerance_size for m in measurements]
     scores["tolerance"] = ("measurement", tolerances, {"units": "mm or deg"})
     scores["unit"] = ("measurement", [m.unit for m in measurements])
-    return with_poses(scores, views), [one.inputs for one in scored]
+    return with_poses(scores, views), [view_score.inputs for view_score in scored]
 
 
 def not_scored_in_words(scores: xr.Dataset) -> str:
@@ -235,8 +240,14 @@ def _not_scored(like: _ViewScore) -> _ViewScore:
     none, unknown = np.zeros_like(like.n), np.full_like(like.sigma, np.nan)
     missing = FitError("not scored, for lack of time")
     measurements = [
-        replace(one, uncertainty=math.nan, chance=0.0, reason=str(missing), contributions=(math.nan,) * len(one.inputs))
-        for one in like.measurements
+        replace(
+            measurement,
+            uncertainty=math.nan,
+            chance=0.0,
+            reason=str(missing),
+            contributions=(math.nan,) * len(measurement.inputs),
+        )
+        for measurement in like.measurements
     ]
     return _ViewScore(none, unknown, none, unknown, none, dict.fromkeys(like.inputs, missing), measurements)
 
@@ -310,17 +321,17 @@ def _limits(
     kinds = {name: one.kind for name, one in task.features.items()}
     share = scores["R_f"]
     for m in range(shape[0]):
-        for v, one in enumerate(scored):
-            predicted = one.measurements[m]
+        for v, score in enumerate(scored):
+            predicted = score.measurements[m]
             if not predicted.uncertainty > 0:
                 short = [name for name in predicted.reason.split(":")[0].split(", ") if name in kinds]
                 feature[m, v] = short[0] if short else ""
-        inputs = next((one.measurements[m].inputs for one in scored), ())
-        parts = np.array([one.measurements[m].contributions for one in scored])
+        inputs = next((score.measurements[m].inputs for score in scored), ())
+        parts = np.array([score.measurements[m].contributions for score in scored])
         noise, count = np.full((2, len(scored), len(inputs)), np.nan)
-        for v, one in enumerate(scored):
+        for v, score in enumerate(scored):
             for i, quantity in enumerate(inputs):
-                if isinstance(known := one.inputs[quantity], ExpectedInput):
+                if isinstance(known := score.inputs[quantity], ExpectedInput):
                     noise[v, i], count[v, i] = known.fit.noise, known.fit.count
         able = possible[m]
         if not able.any():

@@ -97,14 +97,16 @@ def map_in(data: bytes, where: Path, frame: int | None = None) -> NDArray[Any]:
     points = points_among(arrays)
     if points is not None and points.ndim == 3 and min(points.shape[:2]) > 1:
         return points
-    flat = {name: one[..., 0] if one.ndim == 3 and one.shape[2] == 1 else one for name, one in arrays.items()}
+    flat = {name: array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array for name, array in arrays.items()}
     depths = {name: one for name, one in flat.items() if one.ndim in (2, 3) and one.dtype.kind in "fiu"}
     if depths and all(map(is_disparity, depths)):
         raise disparities(where)
     depths = {name: one for name, one in depths.items() if not is_disparity(name)}
     named = {name: one for name, one in depths.items() if "depth" in name.lower()} or depths
     if len(named) != 1 or points is not None:
-        shapes = ", ".join(f"{name} {' x '.join(map(str, one.shape))}".strip() for name, one in arrays.items())[:300]
+        shapes = ", ".join(f"{name} {' x '.join(map(str, array.shape))}".strip() for name, array in arrays.items())[
+            :300
+        ]
         allowed = "points of rows x columns x 3, or depths of rows x columns"
         raise InputError(where, "shape", shapes or "no arrays", allowed)
     depth = next(iter(named.values()))
@@ -128,7 +130,11 @@ def points_among(arrays: dict[str, NDArray[Any]]) -> NDArray[Any] | None:
     Of several, one that is named so comes first, then the largest; colours and normals are none.
     """
     fields = {
-        name: one[name] for one in arrays.values() if one.dtype.names for name in one.dtype.names if name in "xyzXYZ"
+        name: array[name]
+        for array in arrays.values()
+        if array.dtype.names
+        for name in array.dtype.names
+        if name in "xyzXYZ"
     }
     real = {name: one for name, one in (arrays | fields).items() if one.dtype.kind in "fiu"}
     named = [next((one for name, one in real.items() if name.lower() == axis), None) for axis in "xyz"]

@@ -253,10 +253,10 @@ def _of_opencv(path: Path, size: tuple[int, int] | None) -> Calibrated:
     return Calibrated(Rig(found), sensor, notes=tuple(told), unrelated=len(found) > 1)
 
 
-def _sees_alike(one: Camera, other: Camera) -> bool:
+def _sees_alike(camera: Camera, other: Camera) -> bool:
     """Return whether two cameras have the same optics."""
-    return (one.width, one.height, one.model) == (other.width, other.height, other.model) and all(
-        np.array_equal(a, b) for a, b in ((one.matrix, other.matrix), (one.distortion, other.distortion))
+    return (camera.width, camera.height, camera.model) == (other.width, other.height, other.model) and all(
+        np.array_equal(a, b) for a, b in ((camera.matrix, other.matrix), (camera.distortion, other.distortion))
     )
 
 

@@ -188,6 +188,6 @@ def _has_decimal_commas(rows: list[bytes]) -> bool:
     """Return whether each field between other separators has at most one comma, inside it, and no row has a point."""
     if not any(b"," in row for row in rows) or any(b"." in row for row in rows):
         return False
-    fields = [[one for one in re.split(rb"[;\t ]+", row) if one] for row in rows]
+    fields = [[word for word in re.split(rb"[;\t ]+", row) if word] for row in rows]
     inside = all(re.fullmatch(rb"[^,]+(?:,[^,]+)?", one) for each in fields for one in each)
     return inside and max(map(len, fields)) >= 3

@@ -32,8 +32,10 @@ _WANTED = (
 #: messages of ROS in which a pose stands
 _MESSAGES = ("pose", "transform")
 
-#: names of a position, and endings of those of an orientation
-_PLACES, _TURNS = ("position", "translation"), ("orientation", "rotation", "quaternion", "xyzw", "wxyz")
+#: names of a position
+_PLACES = ("position", "translation")
+#: endings of the names of an orientation
+_TURNS = ("orientation", "rotation", "quaternion", "xyzw", "wxyz")
 
 
 def read_pose(file: str | Path) -> tuple[Transform, NDArray[np.float64] | None]:

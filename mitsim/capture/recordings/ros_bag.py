@@ -133,11 +133,14 @@ def _joined(path: Path, bags: list[RosBag]) -> RosBag:
 def _of_ros1(path: Path) -> RosBag:
     with _in_words(path), Reader(path) as reader:
         topics = {
-            one.topic: Topic(one.topic, one.msgtype, one.msgcount, True, one.digest or "") for one in reader.connections
+            connection.topic: Topic(
+                connection.topic, connection.msgtype, connection.msgcount, True, connection.digest or ""
+            )
+            for connection in reader.connections
         }
         counts: Counter[str] = Counter()
-        for one in reader.connections:
-            counts[one.topic] += one.msgcount
+        for connection in reader.connections:
+            counts[connection.topic] += connection.msgcount
 
     def message(name: str, number: int) -> bytes:
         with _in_words(path), Reader(path) as reader:
@@ -145,7 +148,7 @@ def _of_ros1(path: Path) -> RosBag:
                 place: chunk._replace(decompressor=_bounded_by(chunk.decompressor))
                 for place, chunk in reader.chunks.items()
             }
-            chosen = [one for one in reader.connections if one.topic == name]
+            chosen = [connection for connection in reader.connections if connection.topic == name]
             times = sorted(entry.time for one in chosen for entry in reader.indexes[one.id])
             start = times[number]
             found = reader.messages(chosen, start=start, stop=start + 1)

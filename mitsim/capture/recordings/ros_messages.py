@@ -165,7 +165,7 @@ def points_of(message: Any, where: str) -> NDArray[np.float32]:
     InputError
         If it has no x, y and z of floating point, or is damaged.
     """
-    fields = {str(one.name): (int(one.offset), _FIELDS.get(int(one.datatype), "")) for one in message.fields}
+    fields = {str(field.name): (int(field.offset), _FIELDS.get(int(field.datatype), "")) for field in message.fields}
     if not all(fields.get(axis, (0, ""))[1] in ("f4", "f8") for axis in "xyz"):
         raise InputError(where, "fields", ", ".join(fields)[:80] or "none", "x, y and z of floating point")
     shape, step, row = (int(message.height), int(message.width)), int(message.point_step), int(message.row_step)

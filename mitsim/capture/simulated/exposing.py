@@ -96,7 +96,7 @@ class UnitPatterns:
 def shifted_units(units: dict[str, UnitPatterns], seed: int) -> dict[str, UnitPatterns]:
     """Return the patterns of each camera, shifted by random rows and columns."""
     shifts = np.random.default_rng(seed).integers(1, 10_000, (len(units), 2))
-    return {name: one.shifted(*step) for (name, one), step in zip(units.items(), shifts, strict=True)}
+    return {name: unit.shifted(*step) for (name, unit), step in zip(units.items(), shifts, strict=True)}
 
 
 def brightest_images(sensor: Sensor, radiance: dict[str, NDArray[np.float32]]) -> NDArray[np.float32] | None:

@@ -67,4 +67,6 @@ def moved_images(images: NDArray[np.float32], motion: NDArray[np.float64] | None
     if motion is None or not images.size:
         return images
     size, flags = images.shape[:0:-1], cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return np.stack([cv2.warpAffine(one, motion, size, flags=flags, borderMode=cv2.BORDER_REPLICATE) for one in images])
+    return np.stack(
+        [cv2.warpAffine(image, motion, size, flags=flags, borderMode=cv2.BORDER_REPLICATE) for image in images]
+    )

@@ -102,8 +102,8 @@ def keep_light(
         for shape, finish in zip(scene.shapes, scene.finishes, strict=True)
         if finish is not None and finish.description is not None
     }
-    drawn = [number if one.id() in described else -1 for number, one in enumerate(bsdfs)]
-    sampled = [bsdf_of(broad(described[one.id()])) if one.id() in described else one for one in bsdfs]
+    drawn = [number if bsdf.id() in described else -1 for number, bsdf in enumerate(bsdfs)]
+    sampled = [bsdf_of(broad(described[bsdf.id()])) if bsdf.id() in described else bsdf for bsdf in bsdfs]
     turned = [any(is_turned(finish[number]) for finish in finishes) for number in range(len(bsdfs))]
     out = {}
     for index, (camera, roi) in enumerate(rois.items()):

@@ -136,7 +136,7 @@ def warn_above_limit(subject: str, residual: RenderResidual) -> RenderResidual:
 
 def largest_residual(residuals: Iterable[RenderResidual]) -> RenderResidual | None:
     """Return the residual with the largest error; None if nothing was lit in any."""
-    return max((one for one in residuals if one.worst >= 0), key=lambda one: one.worst, default=None)
+    return max((residual for residual in residuals if residual.worst >= 0), key=lambda one: one.worst, default=None)
 
 
 def temporal_noise(mean: NDArray[np.floating], imager: Imager) -> NDArray[np.float64]:

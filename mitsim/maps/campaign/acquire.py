@@ -273,9 +273,9 @@ def out_of_range(campaign: Campaign, found: dict[Path, Shot] | None = None) -> l
     sensor = campaign.sensor
     facing = np.array([0.0, 0.0, 1.0])
     planned = {
-        f"{one.sample.label()} at {one.distance:g} mm": campaign.shot(one, facing)
-        for one in campaign.series
-        if one.variant is None
+        f"{series.sample.label()} at {series.distance:g} mm": campaign.shot(series, facing)
+        for series in campaign.series
+        if series.variant is None
     }
     shown = planned if found is None else {str(place): shot for place, shot in found.items()}
     known = "by the plan" if found is None else "by its pose"

@@ -58,9 +58,9 @@ def cache_folder() -> Path:
     return root / "mitsim" / "finishes"
 
 
-def kept_finish(one: OneFinish, distance: float) -> PerformanceMap | None:
+def kept_finish(finish: OneFinish, distance: float) -> PerformanceMap | None:
     """Return the map of a finish at a distance [mm] from the cache, if it is valid; report a damaged file."""
-    digest = one.digest(distance)
+    digest = finish.digest(distance)
     path = cache_folder() / f"{digest}.nc"
     if not is_file(path):
         return None
@@ -75,7 +75,7 @@ def kept_finish(one: OneFinish, distance: float) -> PerformanceMap | None:
     return found
 
 
-def made_finish(one: OneFinish, simulated: SimulatedSensor, distance: float) -> PerformanceMap:
+def made_finish(finish: OneFinish, simulated: SimulatedSensor, distance: float) -> PerformanceMap:
     """Characterise a finish at a distance [mm] and keep the map.
 
     Raises
@@ -85,7 +85,7 @@ def made_finish(one: OneFinish, simulated: SimulatedSensor, distance: float) -> 
     MissingEnvironmentError
         If the disk is full.
     """
-    folder, digest = cache_folder(), one.digest(distance)
+    folder, digest = cache_folder(), finish.digest(distance)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for left in folder.glob("work-*"):
@@ -98,7 +98,7 @@ def made_finish(one: OneFinish, simulated: SimulatedSensor, distance: float) -> 
         ) from None
     began = time.monotonic()
     try:
-        made = characterise_finish(one, simulated, distance, work)
+        made = characterise_finish(finish, simulated, distance, work)
     finally:
         shutil.rmtree(work, ignore_errors=True)
     made.data.attrs |= {_DIGEST: digest, "seconds": round(time.monotonic() - began, 1)}
@@ -106,10 +106,10 @@ def made_finish(one: OneFinish, simulated: SimulatedSensor, distance: float) -> 
     return PerformanceMap.load(folder / f"{digest}.nc")  # read back, so that new and cached maps are equal
 
 
-def expected_seconds(one: OneFinish) -> float:
+def expected_seconds(finish: OneFinish) -> float:
     """Return the expected time of :func:`made_finish` [s], from earlier runs on this machine."""
-    usual = USUAL_CAPTURES / RATES.get(one.sensor.name, OTHER_RATE)
-    return _rates().get(one.sensor.name, usual) * len(one.turns)
+    usual = USUAL_CAPTURES / RATES.get(finish.sensor.name, OTHER_RATE)
+    return _rates().get(finish.sensor.name, usual) * len(finish.turns)
 
 
 def keep_rate(sensor: str, seconds: float) -> None:

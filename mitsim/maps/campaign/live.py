@@ -116,9 +116,9 @@ def _planned(path: Path, distances: list[float] | None, found: float) -> float:
     """Return the planned distance at which a stage was calibrated; without a plan, the distance of the calibration."""
     if not distances:
         return float(f"{found:.4g}")
-    nearest = min(distances, key=lambda one: abs(math.log(found / one)))
+    nearest = min(distances, key=lambda distance: abs(math.log(found / distance)))
     if abs(found / nearest - 1) > DISTANCE_SLACK:
-        planned = ", ".join(f"{one:g}" for one in distances)
+        planned = ", ".join(f"{distance:g}" for distance in distances)
         hint = "the stage was calibrated there"
         raise InputError(path, "distances_mm", planned, f"{found:.4g}, within 5 %", hint)
     return nearest

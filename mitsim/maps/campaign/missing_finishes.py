@@ -71,7 +71,7 @@ def unknown_finishes(known: Samples, finishes: dict[str, Finish]) -> dict[str, F
 
 def seen_finishes(scene: Scene) -> dict[str, Finish]:
     """Return the finishes of a scene's shapes, by shape name, where there is one."""
-    return {name: one for name, one in zip(scene.names, scene.finishes, strict=True) if one is not None}
+    return {name: finish for name, finish in zip(scene.names, scene.finishes, strict=True) if finish is not None}
 
 
 def map_with_finishes(
@@ -95,7 +95,7 @@ def map_with_finishes(
         screening alone.
     """
     others = {name for name in needed.finishes if needed.measured is not None and name not in needed.measured}
-    measured = {name: one for name, one in needed.finishes.items() if name not in others}
+    measured = {name: finish for name, finish in needed.finishes.items() if name not in others}
     missing = unknown_finishes(performance_map.known, measured)
     completed = _characterised(performance_map, needed, missing, ask) if missing else performance_map
     unseen = unknown_finishes(completed.known, {name: needed.finishes[name] for name in others})
@@ -132,7 +132,7 @@ def _characterised(
     distances = distances_about(performance_map, needed.between)
     largest = largest_incidence_deg(performance_map)
     ones = {name: OneFinish(finish, needed.sensor, largest) for name, finish in missing.items()}
-    kept = {(name, at): kept_finish(one, at) for name, one in ones.items() for at in distances}
+    kept = {(name, at): kept_finish(one_finish, at) for name, one_finish in ones.items() for at in distances}
     to_make = [key for key, found in kept.items() if found is None]
     if to_make:
         seconds = sum(expected_seconds(ones[name]) for name, _ in to_make)

@@ -153,12 +153,12 @@ def plan_of(largest_deg: float, seed: int = 1) -> CampaignFile:
     )
 
 
-def one_finish_campaign(one: OneFinish, distance: float, file: CampaignFile, lay_deg: float = 0.0) -> Campaign:
+def one_finish_campaign(finish: OneFinish, distance: float, file: CampaignFile, lay_deg: float = 0.0) -> Campaign:
     """Return the campaign of a finish at a distance [mm], with its u at a lay angle if it has a lay.
 
     Parameters
     ----------
-    one
+    finish
         The finish, and the sensor that characterises it.
     distance
         [mm].
@@ -171,22 +171,22 @@ def one_finish_campaign(one: OneFinish, distance: float, file: CampaignFile, lay
     --------
     characterise_finish : runs it
     """
-    half = half_size(one.sensor, distance, COUPON_PX if file.coupon_px is None else file.coupon_px)
-    recipe = CouponRecipe(one.finish.name, (), one.sensor.wavelength_nm)
-    scene = flat_coupon(one.finish, half)
-    sample = Sample(recipe, scene, 2 * half, 2 * half, one.label, one.finish.roughness, "", one.finish.light)
-    digest = one.digest(distance)
+    half = half_size(finish.sensor, distance, COUPON_PX if file.coupon_px is None else file.coupon_px)
+    recipe = CouponRecipe(finish.finish.name, (), finish.sensor.wavelength_nm)
+    scene = flat_coupon(finish.finish, half)
+    sample = Sample(recipe, scene, 2 * half, 2 * half, finish.label, finish.finish.roughness, "", finish.finish.light)
+    digest = finish.digest(distance)
     series = Series(sample, distance, None, f"{lay_deg:g}deg_{digest}", int(digest[:8], 16) ^ file.seed)
-    shown = lay_deg if len(one.turns) > 1 else None
-    return _RotatedCampaign(file, one.sensor, (distance,), (series,), (), shown)
+    shown = lay_deg if len(finish.turns) > 1 else None
+    return _RotatedCampaign(file, finish.sensor, (distance,), (series,), (), shown)
 
 
-def characterise_finish(one: OneFinish, simulated: SimulatedSensor, distance: float, folder: Path) -> PerformanceMap:
+def characterise_finish(finish: OneFinish, simulated: SimulatedSensor, distance: float, folder: Path) -> PerformanceMap:
     """Run the campaign of a finish at a distance [mm] in its own folder.
 
     Parameters
     ----------
-    one
+    finish
         The finish, and the sensor that characterises it.
     simulated
         The sensor on the device.
@@ -204,12 +204,12 @@ def characterise_finish(one: OneFinish, simulated: SimulatedSensor, distance: fl
     --------
     one_finish_campaign : the campaign alone
     """
-    file, made = plan_of(one.largest_deg, one.seed), []
-    for turn in one.turns:
-        campaign = one_finish_campaign(one, distance, file, turn)
+    file, made = plan_of(finish.largest_deg, finish.seed), []
+    for turn in finish.turns:
+        campaign = one_finish_campaign(finish, distance, file, turn)
         source = in_turn(simulated_source(simulated, file.samples_per_pixel), campaign)
         made.append(run_campaign(campaign, source, folder / f"{turn:g}"))
-    return made[0] if len(made) == 1 else with_directions(mean_over(made), made, mirror_mm(one.sensor))
+    return made[0] if len(made) == 1 else with_directions(mean_over(made), made, mirror_mm(finish.sensor))
 
 
 def largest_incidence_deg(performance_map: PerformanceMap) -> float:

@@ -175,7 +175,9 @@ class Campaign:
     @property
     def samples(self) -> list[Sample]:
         """Return the samples at the nearest distance, without their variants."""
-        return [one.sample for one in self.series if one.variant is None and one.distance == self.distances[0]]
+        return [
+            series.sample for series in self.series if series.variant is None and series.distance == self.distances[0]
+        ]
 
     def shot(self, series: Series, normal: NDArray[np.float64]) -> Shot:
         """Return a shot of the coupon of a series with a given normal."""

@@ -229,7 +229,9 @@ def _all_patches(tables: list[SampleTable]) -> xr.Dataset:
     numbers = [samples.index((table.finish, str(table.roughness))) for table in tables]
     sizes = [table.patches.sizes["patch"] for table in tables]
     patches = [table.patches.variables for table in tables]
-    columns = {str(name): np.concatenate([one[name].values for one in patches]) for name in tables[0].patches.data_vars}
+    columns = {
+        str(name): np.concatenate([patch[name].values for patch in patches]) for name in tables[0].patches.data_vars
+    }
     whole = patch_table(**columns, sample_number=np.repeat(np.array(numbers, np.int16), sizes))
     return whole.assign_coords(
         finish=("sample", [finish for finish, _ in samples]),

@@ -67,12 +67,12 @@ Effect = Callable[[SceneView], Perturbation]
 def together(perturbations: Iterable[Perturbation], count: int) -> Perturbation:
     """Combine all perturbations of the same ``count`` points."""
     out = Perturbation.none(count)
-    for one in perturbations:
+    for perturbation in perturbations:
         out = Perturbation(
-            out.kept * one.kept,
-            out.noisier * one.noisier,
-            out.displaced + one.displaced,
-            np.hypot(out.scattered, one.scattered),
-            np.concatenate([out.shared, one.shared], axis=1),
+            out.kept * perturbation.kept,
+            out.noisier * perturbation.noisier,
+            out.displaced + perturbation.displaced,
+            np.hypot(out.scattered, perturbation.scattered),
+            np.concatenate([out.shared, perturbation.shared], axis=1),
         )
     return out

@@ -41,7 +41,7 @@ class SharedErrors:
         with np.errstate(invalid="ignore", divide="ignore"):
             weight = normal / (normal * ray).sum(1, keepdims=True)
         known = terms(points)
-        moved = [((known @ one) * weight).sum(1) for one in self.coefficients]
+        moved = [((known @ coefficient) * weight).sum(1) for coefficient in self.coefficients]
         return np.stack(moved, axis=1) if moved else np.zeros((len(points), 0))
 
 

@@ -174,7 +174,7 @@ def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train
         first, objects = scenes[finishes[0]]
         _write_models(partial / "models", objects)
         _write_json(partial / "camera.json", camera)
-        _write_json(partial / "statuses.json", {str(one.value): one.name.lower() for one in Status})
+        _write_json(partial / "statuses.json", {str(status.value): status.name.lower() for status in Status})
         _write_json(partial / "features.json", {str(k): name for k, name in enumerate(first.names, 1)})
         _write_json(partial / "finishes.json", {f"{k:06d}": name for k, name in enumerate(finishes, 1)})
         described = _about(sources, finishes, split, [one.names for one in objects])
@@ -310,8 +310,8 @@ def _write_models(folder: Path, objects: Sequence[Scene]) -> None:
     """Write the triangles of each object [mm], part frame, with normals of its faces; and its box and diameter."""
     folder.mkdir(parents=True)
     table: dict[str, Any] = {}
-    for number, one in enumerate(objects, 1):
-        corners = triangles(one)
+    for number, scene in enumerate(objects, 1):
+        corners = triangles(scene)
         mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
         written = trimesh.exchange.ply.export_ply(mesh, encoding="ascii", vertex_normal=True)
         (folder / f"obj_{number:06d}.ply").write_bytes(written)

@@ -103,8 +103,8 @@ def dcc_document(found: RunResults, declared: Declaration, issuer: Issuer) -> El
     _text(equipment, "name", f"3D vision sensor {found.sensor}, simulated")
     _identified(_add(equipment, "identifications"), "owner", issuer.serial, "serial number")
     results = _add(result, "results")
-    for one in found.results:
-        _result(results, one)
+    for expected_result in found.results:
+        _result(results, expected_result)
     return root
 
 
@@ -164,47 +164,59 @@ def _software(to: Element) -> None:
     _add(one, "release", __version__)
 
 
-def _result(to: Element, one: ExpectedResult) -> None:
+def _result(to: Element, expected_result: ExpectedResult) -> None:
     result = _add(to, "result")
-    _text(result, "name", one.measurement)
-    _text(result, "description", f"{one.kind.replace('_', ' ')} of {', '.join(one.features)}, from view {one.view}")
+    _text(result, "name", expected_result.measurement)
+    _text(
+        result,
+        "description",
+        f"{expected_result.kind.replace('_', ' ')} of {', '.join(expected_result.features)}, "
+        f"from view {expected_result.view}",
+    )
     table = _add(_add(result, "data"), "list")
-    unit = _UNITS[one.unit]
-    _real(_quantity(table, "nominal value", "basic_nominalValue"), one.nominal, unit)
-    low, high = one.error_low, one.error_high
-    if one.bias is not None and one.uncertainty is not None and low is not None and high is not None:
-        error = _real(_quantity(table, "error, measured less true", "basic_measurementError"), one.bias, unit)
+    unit = _UNITS[expected_result.unit]
+    _real(_quantity(table, "nominal value", "basic_nominalValue"), expected_result.nominal, unit)
+    low, high = expected_result.error_low, expected_result.error_high
+    if (
+        expected_result.bias is not None
+        and expected_result.uncertainty is not None
+        and low is not None
+        and high is not None
+    ):
+        error = _real(
+            _quantity(table, "error, measured less true", "basic_measurementError"), expected_result.bias, unit
+        )
         interval = _si(error, "coverageInterval")
-        _si(interval, "standardUnc", _number(one.uncertainty))
+        _si(interval, "standardUnc", _number(expected_result.uncertainty))
         _si(interval, "intervalMin", _number(low))
         _si(interval, "intervalMax", _number(high))
         _si(interval, "coverageProbability", "0.95")
-        largest = max(one.bias - low, high - one.bias)
-        if one.expected is not None:
-            part = "nominal part" if one.errors_of == ANY_PART else one.errors_of
+        largest = max(expected_result.bias - low, high - expected_result.bias)
+        if expected_result.expected is not None:
+            part = "nominal part" if expected_result.errors_of == ANY_PART else expected_result.errors_of
             reading = _real(
-                _quantity(table, f"expected reading of a {part}", "basic_measuredValue"), one.expected, unit
+                _quantity(table, f"expected reading of a {part}", "basic_measuredValue"), expected_result.expected, unit
             )
-            if largest >= one.uncertainty > 0:  # D-SI has no coverage factor below 1
+            if largest >= expected_result.uncertainty > 0:  # D-SI has no coverage factor below 1
                 expanded = _si(reading, "expandedUnc")
                 _si(expanded, "uncertainty", _number(largest))
-                _si(expanded, "coverageFactor", f"{largest / one.uncertainty:.4f}")
+                _si(expanded, "coverageFactor", f"{largest / expected_result.uncertainty:.4f}")
                 _si(expanded, "coverageProbability", "0.95")
-    for name, value in zip(("lower deviation", "upper deviation"), _limits(one), strict=True):
+    for name, value in zip(("lower deviation", "upper deviation"), _limits(expected_result), strict=True):
         if value is not None:
             _real(_quantity(table, f"tolerance, {name}"), value, unit)
-    _real(_quantity(table, "number of virtual measurements"), float(one.trials), r"\one")
-    _real(_quantity(table, "share without a value"), one.without_value, r"\one")
-    _text(_quantity(table, "verdict on the measurement, not on a part"), "noQuantity", one.verdict)
+    _real(_quantity(table, "number of virtual measurements"), float(expected_result.trials), r"\one")
+    _real(_quantity(table, "share without a value"), expected_result.without_value, r"\one")
+    _text(_quantity(table, "verdict on the measurement, not on a part"), "noQuantity", expected_result.verdict)
 
 
-def _limits(one: ExpectedResult) -> tuple[float | None, float | None]:
+def _limits(result: ExpectedResult) -> tuple[float | None, float | None]:
     """Return the lower and upper deviation that the tolerance allows, None where it has no limit."""
-    if isinstance(one.tolerance, tuple):
-        return one.tolerance
-    if one.tolerance is None:
+    if isinstance(result.tolerance, tuple):
+        return result.tolerance
+    if result.tolerance is None:
         return None, None
-    return (None if one.nominal - one.tolerance <= 0 else -one.tolerance), one.tolerance
+    return (None if result.nominal - result.tolerance <= 0 else -result.tolerance), result.tolerance
 
 
 def _quantity(to: Element, name: str, reference: str = "") -> Element:

@@ -215,26 +215,26 @@ def _results(ids: Ids, found: RunResults) -> Element:
     return element("MeasurementResults", content, id=number)
 
 
-def _measurement(ids: Ids, found: RunResults, one: ExpectedResult) -> Element:
-    kind = characteristic(found.task, found.task.measurements[one.measurement])
+def _measurement(ids: Ids, found: RunResults, result: ExpectedResult) -> Element:
+    kind = characteristic(found.task, found.task.measurements[result.measurement])
     numbers = {
-        "bias": one.bias,
-        "bias_uncertainty": one.bias_uncertainty,
-        "low_95": one.low,
-        "high_95": one.high,
-        "view": one.view,
-        "trials": one.trials,
-        "without_value": float(one.without_value),
+        "bias": result.bias,
+        "bias_uncertainty": result.bias_uncertainty,
+        "low_95": result.low,
+        "high_95": result.high,
+        "view": result.view,
+        "trials": result.trials,
+        "without_value": float(result.without_value),
     }
     known: dict[str, str | float | int] = {name: value for name, value in numbers.items() if value is not None}
     content = {
-        "Attributes": attributes(known | {"verdict": one.verdict, "errors_of": one.errors_of}),
+        "Attributes": attributes(known | {"verdict": result.verdict, "errors_of": result.errors_of}),
         "Status": {"CharacteristicStatusEnum": "NOT_ANALYZED"},
-        "CharacteristicItemId": ids.of("characteristic", one.measurement),
+        "CharacteristicItemId": ids.of("characteristic", result.measurement),
         "MeasurementDeviceIds": references([ids.of("device")]),
     }
-    out = element(f"{kind}CharacteristicMeasurement", content, id=ids.new("measurement", one.measurement))
-    if one.expected is not None and one.uncertainty is not None and one.bias is not None:
-        errors = {"combinedUncertainty": decimal(one.uncertainty), "meanError": decimal(abs(one.bias))}
-        out.append(element("Value", float(one.expected), **errors))
+    out = element(f"{kind}CharacteristicMeasurement", content, id=ids.new("measurement", result.measurement))
+    if result.expected is not None and result.uncertainty is not None and result.bias is not None:
+        errors = {"combinedUncertainty": decimal(result.uncertainty), "meanError": decimal(abs(result.bias))}
+        out.append(element("Value", float(result.expected), **errors))
     return out

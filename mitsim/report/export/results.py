@@ -127,7 +127,7 @@ def write_results_json(found: RunResults, path: str | Path) -> None:
         {"view": number, "part_from_sensor": pose.matrix().tolist(), "measurements": list(names)}
         for number, pose, names in found.plan
     ]
-    results = [asdict(one) for one in found.results]
+    results = [asdict(result) for result in found.results]
     write_json(
         path,
         {

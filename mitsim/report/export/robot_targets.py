@@ -117,10 +117,10 @@ def rapid_module(targets: Sequence[RobotTarget], tool: str) -> str:
         "  ! [[x, y, z], [q1 = w, q2 = x, q3 = y, q4 = z], configuration, external axes]",
     ]
     unused = ", ".join(["9E+09"] * 6)
-    for one in targets:
-        x, y, z, w = quaternion(one.part_from_tool)
-        pose = f"[{_listed(one.part_from_tool.translation, 4)}], [{_listed((w, x, y, z), 9)}]"
-        lines.append(f"  CONST robtarget {one.name} := [{pose}, [0, 0, 0, 0], [{unused}]];")
+    for target in targets:
+        x, y, z, w = quaternion(target.part_from_tool)
+        pose = f"[{_listed(target.part_from_tool.translation, 4)}], [{_listed((w, x, y, z), 9)}]"
+        lines.append(f"  CONST robtarget {target.name} := [{pose}, [0, 0, 0, 0], [{unused}]];")
     return "\n".join([*lines, "ENDMODULE", ""])
 
 
@@ -131,10 +131,10 @@ def krl_data(targets: Sequence[RobotTarget], tool: str) -> str:
         f"; poses of the {tool} in the part frame, which must be the BASE; mm, deg",
         "; A about z, B about the new y, C about the new x: R = Rz(A) Ry(B) Rx(C)",
     ]
-    for one in targets:
-        numbers = zip(("X", "Y", "Z", "A", "B", "C"), kuka_numbers(one.part_from_tool), strict=True)
+    for target in targets:
+        numbers = zip(("X", "Y", "Z", "A", "B", "C"), kuka_numbers(target.part_from_tool), strict=True)
         said = ", ".join(f"{axis} {_number(value, 6)}" for axis, value in numbers)
-        lines.append(f"DECL GLOBAL FRAME {one.name}={{{said}}}")
+        lines.append(f"DECL GLOBAL FRAME {target.name}={{{said}}}")
     return "\n".join([*lines, "ENDDAT", ""])
 
 
@@ -144,21 +144,21 @@ def urscript(targets: Sequence[RobotTarget], tool: str) -> str:
         f"# poses of the {tool} in the part frame; m, rotation vector in rad",
         "# move there: movej(pose_trans(part, view_...)), with part the pose of the part frame in the base",
     ]
-    for one in targets:
-        turn = Rotation.from_matrix(one.part_from_tool.rotation).as_rotvec()
-        lines.append(f"{one.name} = p[{_listed([*(one.part_from_tool.translation / 1000), *turn], 9)}]")
+    for target in targets:
+        turn = Rotation.from_matrix(target.part_from_tool.rotation).as_rotvec()
+        lines.append(f"{target.name} = p[{_listed([*(target.part_from_tool.translation / 1000), *turn], 9)}]")
     return "\n".join([*lines, ""])
 
 
 def moveit_poses(targets: Sequence[RobotTarget], tool: str) -> str:
     """Return YAML of ``PoseStamped`` by name, in the frame ``part``; no exponents, which YAML 1.1 reads as text."""
     lines = [f"# poses of the {tool} in the part frame; m, quaternion x y z w", f"tool: {tool}", "poses:"]
-    for one in targets:
-        origin, turn = one.part_from_tool.translation / 1000, quaternion(one.part_from_tool)
+    for target in targets:
+        origin, turn = target.part_from_tool.translation / 1000, quaternion(target.part_from_tool)
         position = ", ".join(f"{k}: {_number(v, 9)}" for k, v in zip("xyz", origin, strict=True))
         orientation = ", ".join(f"{k}: {_number(v, 12)}" for k, v in zip("xyzw", turn, strict=True))
         lines += [
-            f"  {one.name}:",
+            f"  {target.name}:",
             "    header: {frame_id: part}",
             f"    pose: {{position: {{{position}}}, orientation: {{{orientation}}}}}",
         ]

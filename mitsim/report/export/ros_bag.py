@@ -52,12 +52,12 @@ def write_mcap(clouds: Sequence[Stamped], path: str | Path) -> None:
                 channel = writer.add_connection(topic, kind, typestore=store, offered_qos_profiles=quality)
                 writer.write(channel, second * _SECOND, store.serialize_cdr(message, kind))
 
-            known = {one.frame: one.pose for one in clouds if one.pose is not None}
+            known = {cloud.frame: cloud.pose for cloud in clouds if cloud.pose is not None}
             if known:
                 transforms = [_transform(store, name, pose) for name, pose in known.items()]
                 write("/tf_static", _message(store, "tf2_msgs/msg/TFMessage", transforms), 1, _latched(interfaces))
-            for second, one in enumerate(clouds, 1):
-                write(one.topic, cloud_message(store, one.points.in_metres(), one.frame, second), second)
+            for second, cloud in enumerate(clouds, 1):
+                write(cloud.topic, cloud_message(store, cloud.points.in_metres(), cloud.frame, second), second)
         (bag / f"{bag.name}.mcap").replace(file)
 
 

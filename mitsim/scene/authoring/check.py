@@ -102,7 +102,7 @@ def findings(
         found += _facing(shape, number, visible)
         if posed:
             found += _placed(shape, number, sensor, pose, visible)
-    found += _whole(facts, sensor, sum(len(one) for one in borders))
+    found += _whole(facts, sensor, sum(len(border) for border in borders))
     if task:
         found += task_findings(facts, task)
     order = ("error", "warning", "note")
@@ -179,7 +179,8 @@ def open_borders(facts: SceneFacts) -> list[NDArray[np.float64]]:
     edges meet within a CAD program's tolerance, not vertex by vertex.
     """
     borders = [
-        np.empty((0, 2, 3)) if one.mesh is None or one.emitter else one.mesh.open_edge_ends for one in facts.shapes
+        np.empty((0, 2, 3)) if shape.mesh is None or shape.emitter else shape.mesh.open_edge_ends
+        for shape in facts.shapes
     ]
     every = np.concatenate(borders) if borders else np.empty((0, 2, 3))
     if len(every) < 2:
@@ -193,8 +194,8 @@ def open_borders(facts: SceneFacts) -> list[NDArray[np.float64]]:
     apart = np.linalg.norm(foot - middles[:, None], axis=-1)
     apart[near == np.arange(len(every))[:, None]] = np.inf
     still = apart.min(axis=1) > limit
-    ends = np.cumsum([0, *(len(one) for one in borders)])
-    return [one[still[a:b]] for one, a, b in zip(borders, ends, ends[1:], strict=False)]
+    ends = np.cumsum([0, *(len(border) for border in borders)])
+    return [border[still[a:b]] for border, a, b in zip(borders, ends, ends[1:], strict=False)]
 
 
 def _holes(mesh: MeshFacts, border: NDArray[np.float64]) -> int:

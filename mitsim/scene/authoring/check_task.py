@@ -50,9 +50,9 @@ class TaskFeatures(Document):
 
     def measured_shapes(self) -> tuple[str, ...]:
         """Return the names of the shapes of the scene that measurements depend on, each once."""
-        named = [self.features[name] for one in self.measurements.values() for name in one.features]
+        named = [self.features[name] for measurement in self.measurements.values() for name in measurement.features]
         of = (parent for feature in named for parent in feature.of or ())
-        all_names = [*(name for one in self.measurements.values() for name in one.features), *of]
+        all_names = [*(name for measurement in self.measurements.values() for name in measurement.features), *of]
         return tuple(dict.fromkeys(name for name in all_names if self.features[name].shaped))
 
 
@@ -95,10 +95,10 @@ def task_findings(facts: SceneFacts, task: TaskFeatures) -> Iterator[SceneFindin
 
 def report_geometry(task: Task, scene: Scene) -> None:
     """Report nominal geometry that does not lie on the shapes of the scene: errors are counted from there."""
-    shapes = {one.name: one for one in shape_facts(scene, set(task.shapes))}
+    shapes = {shape_fact.name: shape_fact for shape_fact in shape_facts(scene, set(task.shapes))}
     for name, feature in task.features.items():
-        for one in _geometry(shapes, name, feature):
-            say(f"warning: {name}: {one.what}. {one.advice}")
+        for finding in _geometry(shapes, name, feature):
+            say(f"warning: {name}: {finding.what}. {finding.advice}")
 
 
 def _geometry(shapes: dict[str, ShapeFacts], name: str, feature: Feature) -> Iterator[SceneFinding]:
@@ -185,7 +185,7 @@ def _bore(shape: ShapeFacts, feature: Feature, task: TaskFeatures) -> Iterator[S
     """Yield a note if a measurement uses the wall of a bore whose rim is no feature: a camera sees little of it."""
     if feature.kind != "cylinder" or not len(shape.points):
         return
-    if shape.name not in {name for one in task.measurements.values() for name in one.features}:
+    if shape.name not in {name for measurement in task.measurements.values() for name in measurement.features}:
         return
     surface = feature.nominal()
     assert isinstance(surface, Cylinder)

@@ -177,10 +177,10 @@ class _TaskBuilder:
             )
         return None
 
-    def _sizes(self, one: Dimension, faces: list[Face]) -> list[tuple[str, str, tuple[Face, ...], float]]:
+    def _sizes(self, dimension: Dimension, faces: list[Face]) -> list[tuple[str, str, tuple[Face, ...], float]]:
         """Return the sizes of faces: of each round face, or the distance or angle of two planes."""
         planes = [face for face in faces if isinstance(face.surface, Plane)]
-        if one.angular:
+        if dimension.angular:
             cones = [f for f in faces if isinstance(f.surface, Cone)]
             if cones and len(cones) == len(faces):
                 return [(f"{f.name}_angle", "cone_angle", (f,), 2 * _half_angle(f)) for f in cones]
@@ -188,47 +188,53 @@ class _TaskBuilder:
             kind, value = _between(faces[0], faces[1], False)
             return [(f"{faces[0].name}_to_{faces[1].name}_distance", kind, (faces[0], faces[1]), value)] if kind else []
         elif all(isinstance(face.surface, Cylinder | Sphere) for face in faces):
-            kind = "radius" if "radius" in one.kind else "diameter" if "diameter" in one.kind else ""
+            kind = "radius" if "radius" in dimension.kind else "diameter" if "diameter" in dimension.kind else ""
             if kind:
                 scale = 1 if kind == "radius" else 2
                 return [(f"{f.name}_{kind}", kind, (f,), scale * _radius(f)) for f in faces]
-        if one.angular and len(planes) == len(faces) == 2:
+        if dimension.angular and len(planes) == len(faces) == 2:
             kind, value = _between(faces[0], faces[1], True)
             return [(f"{faces[0].name}_to_{faces[1].name}_angle", kind, (faces[0], faces[1]), value)]
         return []
 
-    def tolerance(self, one: GeometricTolerance) -> None:
+    def tolerance(self, geometric_tolerance: GeometricTolerance) -> None:
         """Convert a geometric tolerance."""
-        faces = self.faces(one.target)
-        frame = f" |{'|'.join(one.datums)}" if one.datums else ""
-        described = f"#{one.number} {one.kind}{f' {one.zone:g}' if one.zone is not None else ''}{frame}"
+        faces = self.faces(geometric_tolerance.target)
+        frame = f" |{'|'.join(geometric_tolerance.datums)}" if geometric_tolerance.datums else ""
+        size = f" {geometric_tolerance.zone:g}" if geometric_tolerance.zone is not None else ""
+        described = f"#{geometric_tolerance.number} {geometric_tolerance.kind}{size}{frame}"
         on = f" of {', '.join(f.name for f in faces)}" if faces else ""
-        if one.zone is None or one.zone <= 0:
+        if geometric_tolerance.zone is None or geometric_tolerance.zone <= 0:
             self.task.left_out.append(f"{described}{on}: it has no zone in the file")
             return
         if not faces:
-            self.task.left_out.append(f"{described}{on}: it is {_what(one.target)}")
+            self.task.left_out.append(f"{described}{on}: it is {_what(geometric_tolerance.target)}")
             return
         datums = {letter: [self.by_name[name] for name in names] for letter, names in self.task.datums.items()}
-        made = zones(one, faces, datums)
+        made = zones(geometric_tolerance, faces, datums)
         for zone in made.found:
             for side in (zone.of, *zone.datums):
                 if side.derived:
                     self.task.middles[side.name] = side
             features = (zone.of.name, *(datum.name for datum in zone.datums))
-            said = (*one.notes, *zone.remarks)
+            said = (*geometric_tolerance.notes, *zone.remarks)
             name = f"{zone.of.name}_{zone.kind}"
-            self.add(name, DrawnMeasurement(zone.kind, features, 0.0, "mm", one.zone, one.number, said))
-            told = (*(note for note in one.notes if not note.startswith("zone:")), *zone.remarks)
+            self.add(
+                name,
+                DrawnMeasurement(
+                    zone.kind, features, 0.0, "mm", geometric_tolerance.zone, geometric_tolerance.number, said
+                ),
+            )
+            told = (*(note for note in geometric_tolerance.notes if not note.startswith("zone:")), *zone.remarks)
             self.task.in_part += [f"{described} of {zone.of.name}: {remark}" for remark in told]
         self.task.left_out += [f"{described}{f' of {name}' if name else on}: {why}" for name, why in made.left_out]
 
 
-def _deviations(one: Dimension) -> float | tuple[float, float] | None:
+def _deviations(dimension: Dimension) -> float | tuple[float, float] | None:
     """Return the tolerance of a task: one number if both deviations are equal, else the lower and the upper one."""
-    if one.limits is None or one.nominal is None:
+    if dimension.limits is None or dimension.nominal is None:
         return None
-    low, high = one.limits[0] - one.nominal, one.limits[1] - one.nominal
+    low, high = dimension.limits[0] - dimension.nominal, dimension.limits[1] - dimension.nominal
     if not low < high:
         return None
     alike = abs(high + low) <= 1e-9 * max(abs(high), abs(low), 1.0)

@@ -66,20 +66,20 @@ def middle(faces: Sequence[Face]) -> Side | None:
     return Side(f"middle_of_{faces[0].name}", mid_plane(first, second), tuple(faces))
 
 
-def zones(one: GeometricTolerance, faces: Sequence[Face], datum_faces: Mapping[str, Sequence[Face]]) -> Zones:
+def zones(tolerance: GeometricTolerance, faces: Sequence[Face], datum_faces: Mapping[str, Sequence[Face]]) -> Zones:
     """Return the zones of a tolerance on ``faces``; ``datum_faces`` by the letter of their datum."""
     out = Zones()
-    datums = [_side(datum_faces.get(letter, ())) for letter in one.datums]
-    both = middle(faces) if one.kind in ("position", "symmetry") else None
+    datums = [_side(datum_faces.get(letter, ())) for letter in tolerance.datums]
+    both = middle(faces) if tolerance.kind in ("position", "symmetry") else None
     held = [both] if both is not None else [_side([face]) or face for face in faces]
-    if one.kind == "surface profile" and one.datums and len(faces) > 1 and "all around" in one.notes:
+    if tolerance.kind == "surface profile" and tolerance.datums and len(faces) > 1 and "all around" in tolerance.notes:
         out.left_out.append(("", "all around: it applies to its faces together, and a task has zones of single faces"))
         return out
     for side in held:
         if isinstance(side, Face):
             out.left_out.append((side.name, "a task has no such tolerance for such a face"))
             continue
-        zone = _zone(one, side, datums)
+        zone = _zone(tolerance, side, datums)
         if isinstance(zone, Zone):
             out.found.append(zone)
         else:
@@ -94,69 +94,75 @@ def _side(faces: Sequence[Face]) -> Side | None:
     return middle(faces)
 
 
-def _zone(one: GeometricTolerance, side: Side, datums: Sequence[Side | None]) -> Zone | str:
+def _zone(tolerance: GeometricTolerance, side: Side, datums: Sequence[Side | None]) -> Zone | str:
     """Return the zone of one side, or the reason why a task has none."""
     surface = side.surface
     flat, axis = isinstance(surface, Plane), isinstance(surface, Cylinder | Cone)
-    if UNEQUAL in one.notes:
+    if UNEQUAL in tolerance.notes:
         return f"{UNEQUAL}, and those of a task lie equally about it"
-    if axis and one.kind != "symmetry" and any(note.startswith("zone:") and "plane" in note for note in one.notes):
+    if (
+        axis
+        and tolerance.kind != "symmetry"
+        and any(note.startswith("zone:") and "plane" in note for note in tolerance.notes)
+    ):
         return "its zone lies between two planes, and those of an axis in a task are cylinders"
-    match one.kind:
+    match tolerance.kind:
         case "flatness" if flat:
             return Zone("flatness", side)
         case "cylindricity" if isinstance(surface, Cylinder):
             return Zone("cylindricity", side)
-        case "surface profile" if flat and not one.datums:
+        case "surface profile" if flat and not tolerance.datums:
             return Zone("flatness", side, (), ("a profile of a plane without datums is its flatness (ISO 1660)",))
         case "surface profile" if flat:
-            frame = _frame(one, datums)
+            frame = _frame(tolerance, datums)
             if isinstance(frame, str):
                 return f"a profile needs a complete datum frame: {frame}"
             return Zone("position", side, frame, ("a profile of a plane in a datum frame is its position",))
         case "parallelism" | "perpendicularity" if flat or axis:
-            return _oriented(one, one.kind, side, datums)
+            return _oriented(tolerance, tolerance.kind, side, datums)
         case "angularity" if flat:
-            return _oriented(one, "angularity", side, datums)
+            return _oriented(tolerance, "angularity", side, datums)
         case "coaxiality" | "concentricity" if axis:
-            found = _oriented(one, "coaxiality", side, datums)
+            found = _oriented(tolerance, "coaxiality", side, datums)
             if isinstance(found, Zone) and isinstance(found.datums[0].surface, Plane):
                 return f"its datum {found.datums[0].name} has no axis"
             return found
         case "symmetry" if side.derived or axis:
-            found = _oriented(one, "symmetry", side, datums)
+            found = _oriented(tolerance, "symmetry", side, datums)
             if isinstance(found, Zone) and not isinstance(found.datums[0].surface, Plane):
                 return f"its datum {found.datums[0].name} is not a plane"
             return found
         case "position":
-            frame = _frame(one, datums)
+            frame = _frame(tolerance, datums)
             if not isinstance(frame, str):
                 return Zone("position", side, frame)
-            if not one.datums:
+            if not tolerance.datums:
                 return Zone("position", side, (), ("without datums: relative to the pose of the part",))
-            said = f"{'|'.join(one.datums)} are not a datum frame of a task ({frame}): relative to the pose of the part"
+            said = (
+                f"{'|'.join(tolerance.datums)} are no datum frame of a task ({frame}): relative to the pose of the part"
+            )
             return Zone("position", side, (), (said,))
     return "a task has no such tolerance for such a face"
 
 
-def _oriented(one: GeometricTolerance, kind: str, side: Side, datums: Sequence[Side | None]) -> Zone | str:
+def _oriented(tolerance: GeometricTolerance, kind: str, side: Side, datums: Sequence[Side | None]) -> Zone | str:
     """Return a zone with one datum, a plane or an axis."""
     datum = datums[0] if datums else None
     if datum is None:
-        return f"its datum {'|'.join(one.datums)} is not one face"
+        return f"its datum {'|'.join(tolerance.datums)} is not one face"
     if isinstance(datum.surface, Sphere):
         return f"its datum {datum.name} is neither a plane nor has an axis"
     if datum.name == side.name:
         return f"its datum {datum.name} is the face itself"
-    more = (f"only its first datum {one.datums[0]} is used",) if len(datums) > 1 else ()
+    more = (f"only its first datum {tolerance.datums[0]} is used",) if len(datums) > 1 else ()
     return Zone(kind, side, (datum,), more)
 
 
-def _frame(one: GeometricTolerance, datums: Sequence[Side | None]) -> tuple[Side, ...] | str:
+def _frame(tolerance: GeometricTolerance, datums: Sequence[Side | None]) -> tuple[Side, ...] | str:
     """Return three datums that define a frame, or the condition that is not met."""
     known = [datum for datum in datums if datum is not None]
     surfaces: list[Datum] = [datum.surface for datum in known if not isinstance(datum.surface, Sphere)]
-    if len(one.datums) != 3 or len(surfaces) != 3 or len({datum.name for datum in known}) != 3:
+    if len(tolerance.datums) != 3 or len(surfaces) != 3 or len({datum.name for datum in known}) != 3:
         return "three datums that are planes or axes"
     return frame_fault(surfaces) or tuple(known)
 

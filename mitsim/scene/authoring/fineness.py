@@ -52,7 +52,7 @@ def sensor_sigma_mm(name: str) -> float:
         sigma = data["ray_noise_std"].isel(middle).values[data["finish"].values == "matt_white"]
         if np.isfinite(sigma).any():
             return float(np.nanmin(sigma))
-    published = [sigma for one in sensor.published_noise for sigma in one.sigma_mm]
+    published = [sigma for noise in sensor.published_noise for sigma in noise.sigma_mm]
     if not published:
         hint = "give --chord in mm, or add [[published_noise]] to its file"
         raise InputError("--sensor", "", f"{name}, whose noise is unknown", "a sensor with a map", hint)

@@ -94,7 +94,7 @@ def _unique(names: dict[int, str], faces: Sequence[Face]) -> list[str]:
 
 def _in_order(faces: list[Face]) -> list[Face]:
     kinds = ("plane", "cylinder", "cone", "sphere", "torus", "face")
-    return sorted(faces, key=lambda one: (kinds.index(one.kind), -round(one.area, 4), one.name))
+    return sorted(faces, key=lambda face: (kinds.index(face.kind), -round(face.area, 4), face.name))
 
 
 def _given(face: Face) -> str:
@@ -102,7 +102,7 @@ def _given(face: Face) -> str:
     name = face.drawn_name
     letters = "".join(one for one in name if not _is_mark(one))
     # an ideograph or a syllable is a word; a single letter of an alphabet is not
-    word = re.search(r"[^\W\d_]{2}", letters) or any(unicodedata.category(one) == "Lo" for one in letters)
+    word = re.search(r"[^\W\d_]{2}", letters) or any(unicodedata.category(letter) == "Lo" for letter in letters)
     return identifier(name) if word and not _NO_NAME.fullmatch(letters) else ""
 
 
@@ -240,7 +240,7 @@ def _distinguished(faces: list[Face], extent: Floats) -> list[str]:
     for number, suffix in enumerate(suffixes):
         groups[suffix].append(number)
     for suffix, members in groups.items():
-        order = sorted(members, key=lambda one: (places[one].round(3) + 0.0).tolist()[::-1])
+        order = sorted(members, key=lambda member: (places[member].round(3) + 0.0).tolist()[::-1])
         for count, number in enumerate(order, 1):
             out[number] = suffix if len(members) == 1 else f"{suffix}_{count}"
     return [out[number] for number in range(len(faces))]

@@ -60,7 +60,7 @@ class Finishing:
             if value is None:
                 continue
             if key not in usual:
-                has = ", ".join(name for name, one in NAMED_FINISHES.items() if key in one.properties)
+                has = ", ".join(name for name, finish in NAMED_FINISHES.items() if key in finish.properties)
                 raise InputError(f"--{key}", "", f"{value:g}", f"together with one of these --finish: {has}")
             if not limits[0] <= value <= limits[1]:
                 raise InputError(f"--{key}", "", f"{value:g}", f"{limits[0]:g} to {limits[1]:g}")

@@ -24,8 +24,8 @@ def check_placements(path: Path, text: StepText) -> None:
     InputError
         For the first that is not, with its number in the file.
     """
-    for one in text.all(_BOTH[1]):
-        *_, first, second, _, scale, third = (None,) * 5 + sum((one.of(kind) or () for kind in _BOTH), ())
+    for entity in text.all(_BOTH[1]):
+        *_, first, second, _, scale, third = (None,) * 5 + sum((entity.of(kind) or () for kind in _BOTH), ())
         axes = np.eye(3)
         for number, way in enumerate((first, second, third)):
             found = text.follow(way)
@@ -36,4 +36,4 @@ def check_placements(path: Path, text: StepText) -> None:
         if mirrored or (isinstance(scale, float) and not math.isclose(scale, 1.0)):
             what = "mirrored" if mirrored else f"scaled by {scale:g}"
             hint = "save it as one part, or with a part of its own for each hand and size"
-            raise InputError(path, f"#{one.number}", f"a component that is placed {what}", "rigid placements", hint)
+            raise InputError(path, f"#{entity.number}", f"a component that is placed {what}", "rigid placements", hint)

@@ -59,8 +59,8 @@ _DEEPEST = 20
 def read_product_information(text: StepText) -> ProductInformation:
     """Read dimensions, tolerances and datums of a STEP file."""
     reader = _Reader(text)
-    dimensions = [reader.dimension(one) for one in text.all(*_SIZES, *_LOCATIONS)]
-    tolerances = [reader.tolerance(one) for one in text.all(*TOLERANCES)]
+    dimensions = [reader.dimension(entity) for entity in text.all(*_SIZES, *_LOCATIONS)]
+    tolerances = [reader.tolerance(entity) for entity in text.all(*TOLERANCES)]
     return ProductInformation(dimensions, tolerances, reader.datums(), reader.unread())
 
 
@@ -234,7 +234,7 @@ class _Reader:
             return ()
         if isinstance(value, tuple):
             references = [self.text.follow(one) for one in value]
-            old = [one for one in references if one is not None and one.has("DATUM_REFERENCE")]
+            old = [reference for reference in references if reference is not None and reference.has("DATUM_REFERENCE")]
             if old and len(old) == len(references):  # older editions number datums instead of using datum systems
                 given = [one.of("DATUM_REFERENCE") or (0.0, None) for one in old]
                 ordered = sorted(given, key=lambda values: float(values[0] or 0.0))
@@ -265,8 +265,8 @@ class _Reader:
             if not values or not isinstance(values[-1], str):
                 continue
             targets = [self.target(Reference(owner)) for owner in self.owners.get(datum.number, ())]
-            faces = tuple(dict.fromkeys(face for one in targets for face in one.faces))
-            others = tuple(dict.fromkeys(other for one in targets for other in one.others))
+            faces = tuple(dict.fromkeys(face for target in targets for face in target.faces))
+            others = tuple(dict.fromkeys(other for target in targets for other in target.others))
             out[values[-1]] = DrawnTarget(faces, others)
         return out
 
@@ -279,7 +279,7 @@ class _Reader:
         textures = sum(1 for _ in self.text.all(*_TEXTURES))
         if textures:
             out.append(f"{textures} surface textures: give Ra in the scene")
-        known = {one.number for one in self.text.all(*_SIZES, *_LOCATIONS, *TOLERANCES, "DATUM_FEATURE", "DATUM")}
+        known = {entity.number for entity in self.text.all(*_SIZES, *_LOCATIONS, *TOLERANCES, "DATUM_FEATURE", "DATUM")}
         tied: set[int] = set()
         for link in self.text.all("DRAUGHTING_MODEL_ITEM_ASSOCIATION"):
             values = link.of("DRAUGHTING_MODEL_ITEM_ASSOCIATION") or ()
@@ -287,7 +287,7 @@ class _Reader:
                 continue
             if values[2].number in known:
                 tied.add(values[4].number)
-        callouts = {one.number for one in self.text.all("DRAUGHTING_CALLOUT")}
+        callouts = {entity.number for entity in self.text.all("DRAUGHTING_CALLOUT")}
         if callouts - tied:
             out.append(f"{len(callouts - tied)} annotations as graphics only: notes, or dimensions without values")
         return out

@@ -322,9 +322,9 @@ def _as_one(members: list[Face]) -> Face:
     """Join the parts of one surface to one face."""
     if len(members) == 1:
         return members[0]
-    start = np.cumsum([0, *(len(one.vertices) for one in members)])
-    vertices = np.concatenate([one.vertices for one in members])
-    triangles = np.concatenate([one.triangles + at for one, at in zip(members, start, strict=False)])
+    start = np.cumsum([0, *(len(member.vertices) for member in members)])
+    vertices = np.concatenate([member.vertices for member in members])
+    triangles = np.concatenate([member.triangles + at for member, at in zip(members, start, strict=False)])
     surface = members[0].surface
     assert surface is not None  # only faces with a surface are joined
     if isinstance(surface, Cylinder):
@@ -334,7 +334,7 @@ def _as_one(members: list[Face]) -> Face:
         middle = vertices.mean(axis=0)
         surface = Plane(middle - ((middle - surface.point) @ surface.normal) * surface.normal, surface.normal)
     deviation, sag = _distances(surface, vertices, triangles)
-    normals = np.concatenate([one.normals for one in members if one.normals is not None])
+    normals = np.concatenate([member.normals for member in members if member.normals is not None])
     return replace(
         members[0],
         vertices=vertices,
@@ -343,8 +343,8 @@ def _as_one(members: list[Face]) -> Face:
         deviation=deviation,
         sag=sag,
         normals=normals,
-        entities=tuple(sorted(number for one in members for number in one.entities)),
-        colour=next((one.colour for one in members if one.colour), None),
-        drawn_name=next((one.drawn_name for one in members if one.drawn_name), ""),
-        edges=frozenset().union(*(one.edges for one in members)),
+        entities=tuple(sorted(number for member in members for number in member.entities)),
+        colour=next((member.colour for member in members if member.colour), None),
+        drawn_name=next((member.drawn_name for member in members if member.drawn_name), ""),
+        edges=frozenset().union(*(member.edges for member in members)),
     )

@@ -273,8 +273,10 @@ def convert(  # noqa: PLR0913 - the arguments of the command
     for name, shape, part_colour in there:
         edges = TopTools_IndexedMapOfShape()
         TopExp.MapShapes_s(shape, TopAbs_EDGE, edges)
-        groups = [(one, subshapes(one, TopAbs_FACE)) for one in subshapes(shape, TopAbs_SOLID)]
-        groups += [(one, subshapes(one, TopAbs_FACE)) for one in subshapes(shape, TopAbs_SHELL, TopAbs_SOLID)]
+        groups = [(subshape, subshapes(subshape, TopAbs_FACE)) for subshape in subshapes(shape, TopAbs_SOLID)]
+        groups += [
+            (subshape, subshapes(subshape, TopAbs_FACE)) for subshape in subshapes(shape, TopAbs_SHELL, TopAbs_SOLID)
+        ]
         groups.append((shape, subshapes(shape, TopAbs_FACE, TopAbs_SHELL)))
         closed = not subshapes(shape, TopAbs_FACE, TopAbs_SOLID)
         for solid, members in groups:

@@ -88,8 +88,13 @@ def task_toml(faces: Sequence[Face], name: str, drawing: DrawnTask | None = None
         spread = middle_outline(side, outline(side.of[0]))
         keys = {"kind": "mid_plane", "of": [face.name for face in side.of], "outline_mm": [numbers(p) for p in spread]}
         lines += [f"[features.{_key(title)}]", *toml_lines(keys), ""]
-    for title, one in measured.items():
-        lines += [f"[measurements.{_key(title)}]", *(f"# {line}" for line in one.remarks), *toml_lines(one.keys()), ""]
+    for title, measurement in measured.items():
+        lines += [
+            f"[measurements.{_key(title)}]",
+            *(f"# {line}" for line in measurement.remarks),
+            *toml_lines(measurement.keys()),
+            "",
+        ]
     return "\n".join(lines)
 
 

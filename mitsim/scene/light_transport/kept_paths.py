@@ -85,11 +85,11 @@ class CandidatePaths:
                 np.empty(0, np.int32), nothing[:, 0, 0], nothing[:, 0, :3], np.empty((0, surfaces), np.int8), nothing
             )
         return cls(
-            np.concatenate([one.pixel for one in parts]),
-            np.concatenate([one.weight for one in parts]),
-            np.concatenate([one.code for one in parts]),
-            np.concatenate([wide(one.material, -1) for one in parts]),
-            np.concatenate([wide(one.toward, 0) for one in parts]),
+            np.concatenate([part.pixel for part in parts]),
+            np.concatenate([part.weight for part in parts]),
+            np.concatenate([part.code for part in parts]),
+            np.concatenate([wide(part.material, -1) for part in parts]),
+            np.concatenate([wide(part.toward, 0) for part in parts]),
         )
 
 

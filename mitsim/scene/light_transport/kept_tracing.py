@@ -80,42 +80,42 @@ def camera_paths(
 
 
 def _records(
-    one: Tracer, walk: Walk | None, step: Callable[[Tracer, Walk, int], tuple[Walk | None, CandidatePaths | None]]
+    tracer: Tracer, walk: Walk | None, step: Callable[[Tracer, Walk, int], tuple[Walk | None, CandidatePaths | None]]
 ) -> Iterator[CandidatePaths]:
     """Yield the records of paths from surface to surface; none start where the projector emits nothing."""
-    for number in range(1, one.tracing.depth + 1):
+    for number in range(1, tracer.tracing.depth + 1):
         if walk is None or not dr.width(walk.lane):
             return
-        walk, record = step(one, walk, number)
+        walk, record = step(tracer, walk, number)
         if record is not None:
             yield record
 
 
-def _camera_start(one: Tracer, pixels: Any, first: int, count: int) -> Walk:
-    rays, tracing = one.rays, one.tracing
+def _camera_start(tracer: Tracer, pixels: Any, first: int, count: int) -> Walk:
+    rays, tracing = tracer.rays, tracer.tracing
     lanes = dr.arange(mi.UInt32, dr.width(pixels) * count)
     in_row = opaque_index(dr.width(pixels))
     sample = lanes // in_row + opaque_index(first)
     pixel = dr.gather(mi.UInt32, pixels, lanes % in_row)
-    column, row = place_of(pixel, one.roi)
+    column, row = place_of(pixel, tracer.roi)
     x, y = rays.corners(column, row)
     lane = pixel * opaque_index(tracing.samples) + sample
     side = opaque_index(round(np.sqrt(tracing.samples)))
-    inside = one.random(lane, 0)
+    inside = tracer.random(lane, 0)
     per_cell = 1.0 / mi.Float(side)
     a, b = (mi.Float(sample % side) + inside.x) * per_cell, (mi.Float(sample // side) + inside.y) * per_cell
     local = mi.Vector3f(bilinear(x, a, b), bilinear(y, a, b), 1.0)
-    origin = one.camera.position
-    if one.has_aperture:
-        in_lens = one.disc(lane, 1) * one.aperture
-        origin = origin + one.camera.axes[0] * in_lens.x + one.camera.axes[1] * in_lens.y
-        local -= mi.Vector3f(in_lens.x, in_lens.y, 0.0) * one.inverse_focus
+    origin = tracer.camera.position
+    if tracer.has_aperture:
+        in_lens = tracer.disc(lane, 1) * tracer.aperture
+        origin = origin + tracer.camera.axes[0] * in_lens.x + tracer.camera.axes[1] * in_lens.y
+        local -= mi.Vector3f(in_lens.x, in_lens.y, 0.0) * tracer.inverse_focus
     width = len(lanes)
     return Walk(
         lane,
         pixel,
         mi.Point3f(origin + dr.zeros(mi.Point3f, width)),
-        one.camera.to_world(dr.normalize(local)),
+        tracer.camera.to_world(dr.normalize(local)),
         dr.ones(mi.Float, width),
         pixel_area(x, y),  # until the first surface
         dr.zeros(mi.Float, width),
@@ -123,43 +123,43 @@ def _camera_start(one: Tracer, pixels: Any, first: int, count: int) -> Walk:
     )
 
 
-def _camera_step(one: Tracer, walk: Walk, number: int) -> tuple[Walk | None, CandidatePaths | None]:
+def _camera_step(tracer: Tracer, walk: Walk, number: int) -> tuple[Walk | None, CandidatePaths | None]:
     """Meet surface ``number`` of each path: return the paths that go on, and the records of those that are lit."""
-    tracing, context = one.tracing, mi.BSDFContext()
-    surface = one.scene.mitsuba.ray_intersect(mi.Ray3f(walk.origin, walk.direction))
+    tracing, context = tracer.tracing, mi.BSDFContext()
+    surface = tracer.scene.mitsuba.ray_intersect(mi.Ray3f(walk.origin, walk.direction))
     hit = surface.is_valid()
     length = walk.length + dr.select(hit, surface.t, 0.0)
-    bsdf, material = one.bsdfs.at(surface), one.material(surface, hit)
+    bsdf, material = tracer.bsdfs.at(surface), tracer.material(surface, hit)
     toward_camera = mi.Vector3f(surface.wi)
     cosine_in = dr.maximum(dr.abs(dr.dot(surface.n, walk.direction)), 1e-9)
     if number == 1:
-        cosine = dr.dot(walk.direction, one.camera.axes[2])
-        footprint = one.photons_per_sample * walk.ratio * dr.square(cosine) * cosine * dr.square(surface.t)
+        cosine = dr.dot(walk.direction, tracer.camera.axes[2])
+        footprint = tracer.photons_per_sample * walk.ratio * dr.square(cosine) * cosine * dr.square(surface.t)
         ratio = footprint / cosine_in
     else:
         ratio = walk.ratio / cosine_in
     lit, record = mi.Bool(False), None
     if number > 1:
-        lens = one.disc(walk.lane, 4 * number) if one.projector.has_aperture else None
-        toward, irradiance, uv, distance = one.projector.light(
-            one.scene.mitsuba, surface, walk.direction, lens, None, hit
+        lens = tracer.disc(walk.lane, 4 * number) if tracer.projector.has_aperture else None
+        toward, irradiance, uv, distance = tracer.projector.light(
+            tracer.scene.mitsuba, surface, walk.direction, lens, None, hit
         )
         toward_projector = surface.to_local(toward)
         value, density = value_and_density(bsdf, surface, toward_projector, toward_camera, hit & (irradiance > 0))
-        density *= one.projector.density(toward, distance) * dr.abs(dr.dot(surface.n, toward))
+        density *= tracer.projector.density(toward, distance) * dr.abs(dr.dot(surface.n, toward))
         # the finish that was sampled with bounds all that may be drawn: what it does not reflect, none does
         lit = hit & (irradiance > 0) & (value > 0)
-        weight = walk.weight * irradiance * one.factor(material, value) / (1.0 + ratio * density)
+        weight = walk.weight * irradiance * tracer.factor(material, value) / (1.0 + ratio * density)
         weight *= opaque(1.0 / tracing.samples)
-        record = weight, uv, length + distance, *one.kept(surface, material, toward_camera, toward_projector)
+        record = weight, uv, length + distance, *tracer.kept(surface, material, toward_camera, toward_projector)
     goes_on = mi.Bool(False)
     follower = None
     if number < tracing.depth:
-        even1, even2 = one.random(walk.lane, 4 * number + 1).x, one.random(walk.lane, 4 * number + 2)
+        even1, even2 = tracer.random(walk.lane, 4 * number + 1).x, tracer.random(walk.lane, 4 * number + 2)
         if number == 1:
             samples = opaque_index(tracing.samples)
-            first = z_order(*place_of(walk.pixel, one.roi)) * samples
-            even1, even2 = r3_point(first + walk.lane % samples, one.seed, 0)
+            first = z_order(*place_of(walk.pixel, tracer.roi)) * samples
+            even1, even2 = r3_point(first + walk.lane % samples, tracer.seed, 0)
         sampled, bsdf_weight = bsdf.sample(context, surface, even1, even2, hit)
         goes_on = hit & (bsdf_weight[0] > 0)
         ray = surface.spawn_ray(surface.to_world(sampled.wo))
@@ -170,7 +170,7 @@ def _camera_step(one: Tracer, walk: Walk, number: int) -> tuple[Walk | None, Can
         is_delta = mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Delta)
         ratio = dr.minimum(dr.select(is_delta, 0.0, ratio * reverse * cosine_out / sampled.pdf), _LARGEST_RATIO)
         factor = 1.0 / sampled.pdf
-        if not one.all_drawn:
+        if not tracer.all_drawn:
             factor = dr.select(material < 0, bsdf_weight[0], factor)
         follower = Walk(
             walk.lane,
@@ -181,7 +181,7 @@ def _camera_step(one: Tracer, walk: Walk, number: int) -> tuple[Walk | None, Can
             ratio,
             length,
             walk.code,
-            [*walk.surfaces, one.kept(surface, material, toward_camera, sampled.wo)],
+            [*walk.surfaces, tracer.kept(surface, material, toward_camera, sampled.wo)],
         )
     return split_walk(walk, lit, record, goes_on, follower)
 
@@ -209,19 +209,19 @@ def photon_paths(
         yield from _records(one, _photon_start(one, first, min(_AT_ONCE, tracing.photons - first)), _photon_step)
 
 
-def _photon_start(one: Tracer, first: int, count: int) -> Walk:
+def _photon_start(tracer: Tracer, first: int, count: int) -> Walk:
     lane = dr.arange(mi.UInt32, count) + opaque_index(first)
-    side = opaque_index(round(np.sqrt(one.tracing.photons)))
-    in_cell = one.random(lane + opaque_index(_PHOTONS_FROM), 0)
+    side = opaque_index(round(np.sqrt(tracer.tracing.photons)))
+    in_cell = tracer.random(lane + opaque_index(_PHOTONS_FROM), 0)
     point = (mi.Point2f(lane % side, lane // side) + in_cell) / mi.Float(side)
-    lens = one.disc(lane + opaque_index(_PHOTONS_FROM), 1) if one.projector.has_aperture else None
-    origin, direction, flux, uv = one.projector.emit_photon(point, lens)
+    lens = tracer.disc(lane + opaque_index(_PHOTONS_FROM), 1) if tracer.projector.has_aperture else None
+    origin, direction, flux, uv = tracer.projector.emit_photon(point, lens)
     walk = Walk(
         lane,
         lane,
         mi.Point3f(origin + dr.zeros(mi.Point3f, count)),
         direction,
-        flux / opaque(one.tracing.photons),
+        flux / opaque(tracer.tracing.photons),
         dr.ones(mi.Float, count),
         dr.zeros(mi.Float, count),
         uv,
@@ -229,25 +229,25 @@ def _photon_start(one: Tracer, first: int, count: int) -> Walk:
     return walk.at(dr.compress(flux > 0))
 
 
-def _photon_step(one: Tracer, walk: Walk, number: int) -> tuple[Walk | None, CandidatePaths | None]:
+def _photon_step(tracer: Tracer, walk: Walk, number: int) -> tuple[Walk | None, CandidatePaths | None]:
     """Meet surface ``number`` of each photon: return the photons that go on, and records of those the camera sees."""
-    tracing, context, camera, rays = one.tracing, mi.BSDFContext(), one.camera, one.rays
+    tracing, context, camera, rays = tracer.tracing, mi.BSDFContext(), tracer.camera, tracer.rays
     chance = walk.lane + opaque_index(_PHOTONS_FROM)
-    surface = one.scene.mitsuba.ray_intersect(mi.Ray3f(walk.origin, walk.direction))
+    surface = tracer.scene.mitsuba.ray_intersect(mi.Ray3f(walk.origin, walk.direction))
     hit = surface.is_valid()
     length = walk.length + dr.select(hit, surface.t, 0.0)
-    bsdf, material = one.bsdfs.at(surface), one.material(surface, hit)
+    bsdf, material = tracer.bsdfs.at(surface), tracer.material(surface, hit)
     toward_projector = mi.Vector3f(surface.wi)
     cosine_in = dr.maximum(dr.abs(dr.dot(surface.n, walk.direction)), 1e-9)
     ratio = walk.ratio
     if number == 1:
-        ratio = one.samples_per_photon / one.projector.density(-walk.direction, surface.t)
+        ratio = tracer.samples_per_photon / tracer.projector.density(-walk.direction, surface.t)
     ratio = ratio / cosine_in
     lit, record = mi.Bool(False), None
     if number > 1:
         lens_point = camera.position
-        if one.has_aperture:
-            in_lens = one.disc(chance, 4 * number) * one.aperture
+        if tracer.has_aperture:
+            in_lens = tracer.disc(chance, 4 * number) * tracer.aperture
             lens_point = lens_point + camera.axes[0] * in_lens.x + camera.axes[1] * in_lens.y
         to_camera = lens_point - surface.p
         distance = dr.norm(to_camera)
@@ -256,31 +256,33 @@ def _photon_step(one: Tracer, walk: Walk, number: int) -> tuple[Walk | None, Can
         in_front = hit & (local.z > 0)
         cosine = dr.select(in_front, local.z, 1.0)
         x, y = local.x / cosine, local.y / cosine
-        if one.has_aperture:
-            x += in_lens.x * one.inverse_focus
-            y += in_lens.y * one.inverse_focus
+        if tracer.has_aperture:
+            x += in_lens.x * tracer.inverse_focus
+            y += in_lens.y * tracer.inverse_focus
         u, v, seen = rays.distortion.image(x, y, in_front)
         column, row = mi.UInt32(dr.select(seen, u + 0.5, 0.0)), mi.UInt32(dr.select(seen, v + 0.5, 0.0))
-        left, top, width, height = (opaque_index(n) for n in (one.roi.left, one.roi.top, one.roi.width, one.roi.height))
+        left, top, width, height = (
+            opaque_index(n) for n in (tracer.roi.left, tracer.roi.top, tracer.roi.width, tracer.roi.height)
+        )
         seen &= (column - left < width) & (row - top < height)  # unsigned: differences below 0 become very large
-        seen &= ~one.scene.mitsuba.ray_test(shadow_ray(surface, toward, distance), seen)
+        seen &= ~tracer.scene.mitsuba.ray_test(shadow_ray(surface, toward, distance), seen)
         toward_camera = surface.to_local(toward)
         value, density = value_and_density(bsdf, surface, toward_projector, toward_camera, seen, camera=True)
         importance = dr.abs(dr.dot(surface.n, toward)) / (
             pixel_area(*rays.corners(column, row)) * dr.square(cosine) * cosine * dr.square(distance)
         )
         lit = seen & (value > 0)
-        weight = walk.weight * one.factor(material, value) * importance / cosine_in
+        weight = walk.weight * tracer.factor(material, value) * importance / cosine_in
         weight /= 1.0 + ratio * density * importance
         walk.pixel = (row - top) * width + column - left
-        record = weight, walk.code, length + distance, *one.kept(surface, material, toward_camera, toward_projector)
+        record = weight, walk.code, length + distance, *tracer.kept(surface, material, toward_camera, toward_projector)
     goes_on = mi.Bool(False)
     follower = None
     if number < tracing.depth:
-        even1, even2 = one.random(chance, 4 * number + 1).x, one.random(chance, 4 * number + 2)
+        even1, even2 = tracer.random(chance, 4 * number + 1).x, tracer.random(chance, 4 * number + 2)
         if number == 1:
             side = opaque_index(round(np.sqrt(tracing.photons)))
-            even1, even2 = r3_point(z_order(walk.lane % side, walk.lane // side), one.seed, 1)
+            even1, even2 = r3_point(z_order(walk.lane % side, walk.lane // side), tracer.seed, 1)
         sampled, _ = bsdf.sample(context, surface, even1, even2, hit)
         goes_on = hit & (sampled.pdf > 0) & ~mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Delta)
         outgoing = surface.to_world(sampled.wo)
@@ -296,10 +298,10 @@ def _photon_step(one: Tracer, walk: Walk, number: int) -> tuple[Walk | None, Can
             walk.pixel,
             ray.o,
             ray.d,
-            walk.weight * one.factor(material, value) * cosine_out / (sampled.pdf * cosine_in),
+            walk.weight * tracer.factor(material, value) * cosine_out / (sampled.pdf * cosine_in),
             ratio,
             length,
             walk.code,
-            [*walk.surfaces, one.kept(surface, material, sampled.wo, toward_projector)],
+            [*walk.surfaces, tracer.kept(surface, material, sampled.wo, toward_projector)],
         )
     return split_walk(walk, lit, record, goes_on, follower)

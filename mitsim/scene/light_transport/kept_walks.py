@@ -123,7 +123,9 @@ class Tracer:
         directions = [mi.Vector3f(toward_camera), mi.Vector3f(toward_projector)]
         if any(self.tracing.turned):
             turned = dr.gather(mi.Bool, self.turned, mi.UInt32(dr.maximum(material, 0)), material >= 0)
-            directions = [dr.select(turned, from_z_axis(surface.sh_frame, one), one) for one in directions]
+            directions = [
+                dr.select(turned, from_z_axis(surface.sh_frame, direction), direction) for direction in directions
+            ]
         return [material, *directions]
 
     def factor(self, material: Any, value: Any) -> Any:
@@ -172,9 +174,12 @@ def _candidates(walk: Walk, record: Any, index: Any) -> CandidatePaths:
 
     surfaces = [*walk.surfaces, last]
     code = np.stack([np.asarray(some(one)) for one in (uv.x, uv.y, length)], axis=-1)
-    material = np.stack([np.asarray(some(one[0])).astype(np.int8) for one in surfaces], axis=-1)
+    material = np.stack([np.asarray(some(surface[0])).astype(np.int8) for surface in surfaces], axis=-1)
     toward = np.stack(
-        [np.concatenate([vectors_to_host(some(one[1])), vectors_to_host(some(one[2]))], axis=1) for one in surfaces],
+        [
+            np.concatenate([vectors_to_host(some(surface[1])), vectors_to_host(some(surface[2]))], axis=1)
+            for surface in surfaces
+        ],
         axis=1,
     )
     return CandidatePaths(

@@ -101,8 +101,8 @@ def _unit_slopes(
     radius = np.sqrt(-np.log1p(-share)) if distribution == "beckmann" else np.sqrt(share / (1 - share))
     turn = 2 * np.pi * (np.arange(azimuths // 2 if half else azimuths) + 0.5) / azimuths
     slopes = radius[:, None] * np.cos(turn), radius[:, None] * np.sin(turn)
-    for one in slopes:
-        one.setflags(write=False)
+    for slope in slopes:
+        slope.setflags(write=False)
     return slopes
 
 

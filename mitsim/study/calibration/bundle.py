@@ -113,7 +113,7 @@ def eye_start(
 
 def second_eye(first: Sequence[Transform], second: Sequence[Transform]) -> Transform:
     """Return the pose of an eye in the frame of a first one: their mean over poses of the board in both frames."""
-    apart = [one @ other.inverse() for one, other in zip(first, second, strict=True)]
+    apart = [transform @ other.inverse() for transform, other in zip(first, second, strict=True)]
     turn = Rotation.from_matrix([each.rotation for each in apart]).mean().as_matrix()
     return Transform(turn, np.median([each.translation for each in apart], axis=0))
 

@@ -122,12 +122,12 @@ def calibrate_checked(
     return CheckedCalibration(replace(whole, covariance=widened), factor, name, float(standard[worst]), tilt)
 
 
-def _difference(one: RecordedCalibration, other: RecordedCalibration) -> tuple[Floats, Floats]:
+def _difference(calibration: RecordedCalibration, other: RecordedCalibration) -> tuple[Floats, Floats]:
     """Return the difference (p,) of two calibrations with one board, and its covariance (p, p)."""
-    names = one.covariance.names
-    shared = one.board_effect - other.board_effect
-    noise = (each.covariance.covariance - each.board_effect @ each.board_effect.T for each in (one, other))
-    return np.asarray(parameter_differences(one.rig, other.rig, names)), sum(noise) + shared @ shared.T
+    names = calibration.covariance.names
+    shared = calibration.board_effect - other.board_effect
+    noise = (each.covariance.covariance - each.board_effect @ each.board_effect.T for each in (calibration, other))
+    return np.asarray(parameter_differences(calibration.rig, other.rig, names)), sum(noise) + shared @ shared.T
 
 
 def in_words(checked: CheckedCalibration) -> str:

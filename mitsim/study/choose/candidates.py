@@ -70,7 +70,7 @@ def read_candidates(
         if isinstance(opened, Excluded):
             excluded.append(opened)
             continue
-        if opened.name in {one.name for one in candidates}:
+        if opened.name in {candidate.name for candidate in candidates}:
             raise InputError("--sensors", "", f"{opened.name} twice", "sensors of different names")
         candidates.append(opened)
     if not candidates:
@@ -82,7 +82,7 @@ def read_candidates(
 
 def _each(sensors: Sequence[str]) -> list[str]:
     out = list[str]()
-    for given in (part.strip() for one in sensors for part in one.split(",")):
+    for given in (part.strip() for sensor in sensors for part in sensor.split(",")):
         out += presets() if given == ALL_PRESETS else [given] if given else []
     if not out:
         raise InputError("--sensors", "", "nothing", f"{ALL_PRESETS}, or a list of {', '.join(presets())} and files")

@@ -48,12 +48,12 @@ _RACE_SHARE = 0.4
 _MORE = 40
 
 
-def state_by_screening(one: SensorResult, count: int, limit: TimeLimit, whole: TimeLimit) -> None:
+def state_by_screening(result: SensorResult, count: int, limit: TimeLimit, whole: TimeLimit) -> None:
     """State a sensor from ``count`` trials of the view that screening finds best for all measurements.
 
     Parameters
     ----------
-    one
+    result
         Results of the sensor so far, which get the statement.
     count
         Number of trials.
@@ -67,43 +67,43 @@ def state_by_screening(one: SensorResult, count: int, limit: TimeLimit, whole: T
     --------
     race_and_state : from the best view by a race
     """
-    for view in shortlist(one.scores, 1):
-        _state(one, view, count, limit)
-        if view not in one.stated:
-            _state(one, view, min(_FEWEST, count), whole)
-        if view in one.stated:
-            _finish(one, view)
+    for view in shortlist(result.scores, 1):
+        _state(result, view, count, limit)
+        if view not in result.stated:
+            _state(result, view, min(_FEWEST, count), whole)
+        if view in result.stated:
+            _finish(result, view)
 
 
-def race_and_state(one: SensorResult, count: int, limit: TimeLimit) -> None:
+def race_and_state(result: SensorResult, count: int, limit: TimeLimit) -> None:
     """Race the views of a sensor, unless they were raced, and state it from ``count`` trials of the best view.
 
     A race that had little time may name a poor view. The view of an earlier statement stays the best one, unless the
     statement of the view that won the race is better.
     """
-    before = next(iter(one.stated), None)
-    if one.raced is None:
-        table = one.session.study.file.race
+    before = next(iter(result.stated), None)
+    if result.raced is None:
+        table = result.session.study.file.race
         most = min(RACE_TRIALS, table.trials)
         rules = RaceRules(min(SHORTLIST, table.shortlist), most, table.margin, table.loss, each=True)
-        one.raced = one.session.race(one.scores, rules, limit.part(_RACE_SHARE))
-        view = one.raced.leader(ALL) if len(one.raced.views) else before
+        result.raced = result.session.race(result.scores, rules, limit.part(_RACE_SHARE))
+        view = result.raced.leader(ALL) if len(result.raced.views) else before
     else:
         view = before
     if view is None:  # no view can measure
         return
-    _state(one, view, count, limit)
-    known = [number for number in dict.fromkeys((before, view)) if number in one.stated]
+    _state(result, view, count, limit)
+    known = [number for number in dict.fromkeys((before, view)) if number in result.stated]
     if not known:  # time was over
         return
-    view = _better(one, known)
-    own = _own_views(one, view)
+    view = _better(result, known)
+    own = _own_views(result, view)
     for number in own:
         if limit.over():
             break
-        _state(one, number, count, limit)
-    one.stated = {number: one.stated[number] for number in (view, *own) if number in one.stated}
-    _finish(one, view)
+        _state(result, number, count, limit)
+    result.stated = {number: result.stated[number] for number in (view, *own) if number in result.stated}
+    _finish(result, view)
 
 
 def refine_leader(leader: SensorResult, limit: TimeLimit) -> None:
@@ -134,71 +134,73 @@ def able_to_win(found: Sequence[SensorResult], rivals: Sequence[SensorResult]) -
     A sensor that was not raced may have a better view. It can win if it lacks a measurement, or with a demand that is
     larger by the factor that a race is expected to gain.
     """
-    stated = [one for one in ordered(found) if one.stated]
-    keys = rank_keys([one.demands() for one in stated], stated[0].has_tolerance, [True] * len(stated))
+    stated = [result for result in ordered(found) if result.stated]
+    keys = rank_keys([result.demands() for result in stated], stated[0].has_tolerance, [True] * len(stated))
     first = keys[0]
     highest = max(first[1], default=math.inf) * math.exp(_STANDARD_ERRORS * _relative_error(stated[0]))
     out = []
-    for one, key in zip(stated, keys, strict=True):
-        if not any(one is rival for rival in rivals):
+    for result, key in zip(stated, keys, strict=True):
+        if not any(result is rival for rival in rivals):
             continue
-        lowest = max(key[1], default=math.inf) * math.exp(-_STANDARD_ERRORS * _relative_error(one))
-        if one.raced is None:
+        lowest = max(key[1], default=math.inf) * math.exp(-_STANDARD_ERRORS * _relative_error(result))
+        if result.raced is None:
             able = key[0] > first[0] or lowest <= _RACE_GAIN * highest
         else:
-            able = key[0] <= first[0] and lowest <= highest and one.trials < one.session.study.file.statement.trials
+            able = (
+                key[0] <= first[0] and lowest <= highest and result.trials < result.session.study.file.statement.trials
+            )
         if able:
-            out.append(one)
+            out.append(result)
     return out
 
 
-def race_as_stated(one: SensorResult) -> Raced:
+def race_as_stated(result: SensorResult) -> Raced:
     """Return the race of a sensor, or of its stated views alone if there was no time for one."""
-    if one.raced is not None:
-        return one.raced
-    table, numbers = one.session.study.file.race, list(one.stated)
+    if result.raced is not None:
+        return result.raced
+    table, numbers = result.session.study.file.race, list(result.stated)
     rules = RaceRules(len(numbers), 0, table.margin, table.loss)
     trials = dict.fromkeys(numbers, 0)
-    return standings(one.scores.sel(view=numbers), numbers, one.session.race_trials, trials, rules)
+    return standings(result.scores.sel(view=numbers), numbers, result.session.race_trials, trials, rules)
 
 
-def _relative_error(one: SensorResult) -> float:
+def _relative_error(result: SensorResult) -> float:
     """Return the relative standard error of a demand from the sensor's trials."""
-    return math.sqrt(EXCESS / (4 * max(one.trials, 1)))
+    return math.sqrt(EXCESS / (4 * max(result.trials, 1)))
 
 
-def _state(one: SensorResult, view: int, count: int, limit: TimeLimit) -> None:
+def _state(result: SensorResult, view: int, count: int, limit: TimeLimit) -> None:
     """State a view from ``count`` trials, at most those of the study, or from those within the limit."""
-    study = one.session.study
+    study = result.session.study
     count = min(count, study.file.statement.trials)
-    stated = one.session.state(study.view(view), StatementTable(trials=count), limit)
+    stated = result.session.state(study.view(view), StatementTable(trials=count), limit)
     if stated.statements and stated.statements[0].trials >= min(_FEWEST, count):
-        one.stated[view] = stated
+        result.stated[view] = stated
 
 
-def _finish(one: SensorResult, view: int) -> None:
+def _finish(result: SensorResult, view: int) -> None:
     """Write the statement of a view, and free the memory of the sensor."""
-    write_json(one.session.folder / "statement.json", statement_document(one.session, one.stated[view]))
-    one.session.release()
+    write_json(result.session.folder / "statement.json", statement_document(result.session, result.stated[view]))
+    result.session.release()
     gc.collect()
 
 
-def _better(one: SensorResult, views: Sequence[int]) -> int:
+def _better(result: SensorResult, views: Sequence[int]) -> int:
     """Return the stated view that makes more measurements, or else has the less demanding ones."""
-    demands = [[stated_demand(each) for each in one.stated[view].statements] for view in views]
-    keys = rank_keys(demands, one.has_tolerance, [True] * len(views))
+    demands = [[stated_demand(each) for each in result.stated[view].statements] for view in views]
+    keys = rank_keys(demands, result.has_tolerance, [True] * len(views))
     return views[min(range(len(views)), key=keys.__getitem__)]
 
 
-def _own_views(one: SensorResult, view: int) -> list[int]:
+def _own_views(result: SensorResult, view: int) -> list[int]:
     """Return best views of measurements that do not fit, or have no value, from the common view and may elsewhere."""
-    assert one.raced is not None
+    assert result.raced is not None
     out = list[int]()
-    place = int(np.flatnonzero(one.raced.views == view)[0])
-    for name, known in zip(one.session.study.task.measurements, one.stated[view].statements, strict=True):
-        standing = one.raced.standings[name]
+    place = int(np.flatnonzero(result.raced.views == view)[0])
+    for name, known in zip(result.session.study.task.measurements, result.stated[view].statements, strict=True):
+        standing = result.raced.standings[name]
         better = standing.risk[standing.leader] < _WORTH_STATING * standing.risk[place]
         lost = not math.isfinite(stated_demand(known)) and standing.leader != place
         if lost or (known.verdict not in ("fits", "no tolerance") and better):
-            out.append(one.raced.leader(name))
+            out.append(result.raced.leader(name))
     return [number for number in dict.fromkeys(out) if number != view]

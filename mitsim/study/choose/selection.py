@@ -102,7 +102,7 @@ def _measure_in_rounds(
     raced = len(rivals) == 1
     for turn in range(_ROUNDS):
         work = limit.part(_ROUND_SHARE if len(rivals) > 1 else 1.0, _reserve(limit))
-        for place, one in enumerate(rivals):
+        for place, rival in enumerate(rivals):
             if limit.over() and (place or turn):
                 unmeasured = sum(not each.stated for each in rivals)
                 if unmeasured:
@@ -110,12 +110,12 @@ def _measure_in_rounds(
                 break
             share = work.part(1 / (len(rivals) - place))
             if raced:
-                race_and_state(one, count, share)
+                race_and_state(rival, count, share)
             else:
-                state_by_screening(one, count, share, limit)
+                state_by_screening(rival, count, share, limit)
             _say(found, f"round {turn + 1}: {place + 1} of {len(rivals)} sensors measured", limit)
             report_results(ordered(found), False)
-        if any(one.stated for one in found):
+        if any(result.stated for result in found):
             rivals, count, raced = able_to_win(found, rivals), GROWTH * count, True
         else:  # every share was too short for a statement: the first rival, best by screening, gets what is left
             rivals = rivals[:1]
@@ -141,9 +141,9 @@ def _complete(winner: SensorResult) -> None:
 
 def _promising(found: list[SensorResult]) -> list[SensorResult]:
     """Return the sensors worth a virtual measurement, best first: at least one if any sensor can measure at all."""
-    keys = rank_keys([one.screened for one in found], found[0].has_tolerance, [True] * len(found))
-    for one, reason in zip(found, unpromising(keys, any(found[0].has_tolerance)), strict=True):
-        one.unpromising = reason
+    keys = rank_keys([result.screened for result in found], found[0].has_tolerance, [True] * len(found))
+    for result, reason in zip(found, unpromising(keys, any(found[0].has_tolerance)), strict=True):
+        result.unpromising = reason
     order = sorted(range(len(found)), key=keys.__getitem__)
     return [found[i] for i in order if not found[i].unpromising]
 

@@ -50,7 +50,7 @@ class SensorResult:
     @property
     def has_tolerance(self) -> list[bool]:
         """Return whether each measurement of the task has a tolerance."""
-        return [one.tolerance is not None for one in self.session.study.task.measurements.values()]
+        return [measurement.tolerance is not None for measurement in self.session.study.task.measurements.values()]
 
     @property
     def trials(self) -> int:
@@ -67,23 +67,23 @@ class SensorResult:
         """Return view, demand and statement of least demand for each measurement; None without a value."""
         out = list[tuple[int, float, Statement] | None]()
         for m in range(len(self.screened)):
-            statements = {view: one.statements[m] for view, one in self.stated.items()}
-            rows = [(view, stated_demand(one), one) for view, one in statements.items()]
+            statements = {view: stated_view.statements[m] for view, stated_view in self.stated.items()}
+            rows = [(view, stated_demand(statement), statement) for view, statement in statements.items()]
             rows = [row for row in rows if math.isfinite(row[1])]
             out.append(min(rows, key=lambda row: row[1]) if rows else None)
         return out
 
 
-def stated_demand(one: Statement) -> float:
+def stated_demand(statement: Statement) -> float:
     """Return the demand of the decision rule; without a tolerance the root mean square error."""
-    value = one.root_mean_square if one.decided is None else one.decided.demand
+    value = statement.root_mean_square if statement.decided is None else statement.decided.demand
     return value if math.isfinite(value) else math.inf
 
 
 def ordered(found: Sequence[SensorResult]) -> list[SensorResult]:
     """Return measured sensors before screened ones, each by their impossible and then their worst measurements."""
-    stated = [bool(one.stated) for one in found]
+    stated = [bool(result.stated) for result in found]
     known = stated if any(stated) else [True] * len(found)
-    keys = rank_keys([one.demands() for one in found], found[0].has_tolerance, known)
+    keys = rank_keys([result.demands() for result in found], found[0].has_tolerance, known)
     order = sorted(range(len(found)), key=lambda i: (not stated[i], keys[i]))
     return [found[i] for i in order]

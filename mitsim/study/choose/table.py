@@ -62,19 +62,19 @@ def document(
     task = study.task
     named_measurements = {
         name: ComparedMeasurement(
-            unit=one.unit,
-            nominal=one.nominal,
-            tolerance=one.tolerance,
-            features=list(one.features),
-            kind=one.kind,
-            rule="" if one.tolerance is None else task.decision_of(name).in_words,
+            unit=measurement.unit,
+            nominal=measurement.nominal,
+            tolerance=measurement.tolerance,
+            features=list(measurement.features),
+            kind=measurement.kind,
+            rule="" if measurement.tolerance is None else task.decision_of(name).in_words,
         )
-        for name, one in task.measurements.items()
+        for name, measurement in task.measurements.items()
     }
-    sensors = [_sensor(one) for one in found]
-    if all(one.tolerance is None for one in named_measurements.values()):
+    sensors = [_sensor(result) for result in found]
+    if all(named_measurement.tolerance is None for named_measurement in named_measurements.values()):
         sensors = _relative(sensors)
-    sensors = [one.model_copy(update={"words": words(one, named_measurements)}) for one in sensors]
+    sensors = [sensor.model_copy(update={"words": words(sensor, named_measurements)}) for sensor in sensors]
     sensors += [
         SensorEntry(
             name=one.name, given=one.given, status="excluded", why=one.reason, ratio=None, fits=0, words=one.reason
@@ -97,38 +97,48 @@ def document(
 
 def sentence(sensors: Sequence[SensorEntry]) -> str:
     """Return one line: the best sensor, and its result."""
-    able = [one for one in sensors if one.status != "excluded"]
+    able = [sensor for sensor in sensors if sensor.status != "excluded"]
     if not able or not able[0].measurements:
         return "no sensor can measure this"
     best = able[0]
     if len(best.impossible) == len(best.measurements):
         return f"no sensor can measure this: {_reasons(best)}"
-    others = sum(one.fits_all and one.status == "stated" for one in able[1:])
+    others = sum(sensor_entry.fits_all and sensor_entry.status == "stated" for sensor_entry in able[1:])
     more = f"; so do{'es' if others == 1 else ''} {others} other{'' if others == 1 else 's'}" if others else ""
     toleranced = any(cell.verdict != "no tolerance" for cell in best.measurements.values())
     return f"{best.name}: {best.words}" + (more if toleranced and best.fits_all else "")
 
 
-def words(one: SensorEntry, named_measurements: dict[str, ComparedMeasurement]) -> str:
+def words(sensor_entry: SensorEntry, named_measurements: dict[str, ComparedMeasurement]) -> str:
     """Return the result of a sensor in one line."""
-    if len(one.impossible) == len(one.measurements):
-        return f"no measurement is possible: {_reasons(one)}"
-    verdicts = [replace(each, unit=named_measurements[each.name].unit) for each in judged(one)]
+    if len(sensor_entry.impossible) == len(sensor_entry.measurements):
+        return f"no measurement is possible: {_reasons(sensor_entry)}"
+    verdicts = [replace(each, unit=named_measurements[each.name].unit) for each in judged(sensor_entry)]
     toleranced = {each.name for each in verdicts if each.verdict != "no tolerance"}
     if toleranced:
-        result = result_in_words(verdicts) if one.status == "stated" else _expected_in_words(one, named_measurements)
-    elif one.ratio is not None and one.ratio > 1:
-        result = f"{two_digits(one.ratio)} times the least uncertainty of all sensors at worst"
+        result = (
+            result_in_words(verdicts)
+            if sensor_entry.status == "stated"
+            else _expected_in_words(sensor_entry, named_measurements)
+        )
+    elif sensor_entry.ratio is not None and sensor_entry.ratio > 1:
+        result = f"{two_digits(sensor_entry.ratio)} times the least uncertainty of all sensors at worst"
     else:
-        result = "the least uncertainty of all sensors in every " + "possible " * bool(one.impossible) + "measurement"
-    result = "by screening alone: " * (one.status == "screened") + result
-    return "; ".join(filter(None, [result, one.possible_in_words, _reasons(one, toleranced), one.lacks]))
+        result = (
+            "the least uncertainty of all sensors in every "
+            + "possible " * bool(sensor_entry.impossible)
+            + "measurement"
+        )
+    result = "by screening alone: " * (sensor_entry.status == "screened") + result
+    return "; ".join(
+        filter(None, [result, sensor_entry.possible_in_words, _reasons(sensor_entry, toleranced), sensor_entry.lacks])
+    )
 
 
-def _expected_in_words(one: SensorEntry, named_measurements: dict[str, ComparedMeasurement]) -> str:
+def _expected_in_words(sensor_entry: SensorEntry, named_measurements: dict[str, ComparedMeasurement]) -> str:
     """Return how many tolerances a sensor is expected to fit by screening, and its largest demand."""
-    cells = {name: cell for name, cell in one.measurements.items() if cell.verdict != "no tolerance"}
-    text = f"{one.expected_fits} of {len(cells)} tolerances are expected to fit"
+    cells = {name: cell for name, cell in sensor_entry.measurements.items() if cell.verdict != "no tolerance"}
+    text = f"{sensor_entry.expected_fits} of {len(cells)} tolerances are expected to fit"
     known = {name: cell for name, cell in cells.items() if cell.demand is not None and cell.uncertainty is not None}
     if not known:
         return text
@@ -138,11 +148,11 @@ def _expected_in_words(one: SensorEntry, named_measurements: dict[str, ComparedM
     return f"{text}; the hardest is {name}: standard uncertainty {two_digits(or_nan(u))} {unit}{limit}"
 
 
-def _reasons(one: SensorEntry, but: Collection[str] = ()) -> str:
+def _reasons(sensor_entry: SensorEntry, but: Collection[str] = ()) -> str:
     """Return the reasons of impossible measurements, measurements of one reason together, ``but`` some."""
     by_reason = dict[str, list[str]]()
-    for name, why in one.impossible.items():
-        if name not in but or one.status == "screened":
+    for name, why in sensor_entry.impossible.items():
+        if name not in but or sensor_entry.status == "screened":
             by_reason.setdefault(why, []).append(name)
     return "; ".join(f"{', '.join(names)} impossible ({why})" for why, names in by_reason.items())
 
@@ -151,17 +161,17 @@ def as_text(choice: ChoiceDocument) -> str:
     """Return the table of sensors and measurements, with a legend."""
     names = list(choice.measurements)
     rows: list[tuple[str, ...]] = [("sensor", "fits", "worst", "capture", *names)]
-    for one in choice.sensors:
-        if one.status == "excluded":
+    for sensor in choice.sensors:
+        if sensor.status == "excluded":
             continue
         toleranced = choice.toleranced
         rows.append(
             (
-                one.name + ("" if one.status == "stated" else " *"),
-                _fits(one, toleranced),
-                "-" if one.ratio is None else two_digits(one.ratio),
-                "-" if one.capture is None else f"{1e3 * one.capture.seconds:.0f} ms",
-                *(_cell(one.measurements[name], choice.measurements[name]) for name in names),
+                sensor.name + ("" if sensor.status == "stated" else " *"),
+                _fits(sensor, toleranced),
+                "-" if sensor.ratio is None else two_digits(sensor.ratio),
+                "-" if sensor.capture is None else f"{1e3 * sensor.capture.seconds:.0f} ms",
+                *(_cell(sensor.measurements[name], choice.measurements[name]) for name in names),
             )
         )
     legend = (
@@ -169,29 +179,29 @@ def as_text(choice: ChoiceDocument) -> str:
         "order: sensors with virtual measurements, then the most possible measurements, then the smallest worst"
     )
     lines = [*aligned(rows), "", legend, *choice.fit_more]
-    if any(one.status == "screened" for one in choice.sensors):
+    if any(sensor.status == "screened" for sensor in choice.sensors):
         least = "" if choice.toleranced else " times the best"
         reasons = f"fewer measurements are possible there, its demand there is above {LARGEST_DEMAND:g}{least}"
         lines.append(f"* by screening alone, (n of m) expected to fit: {reasons}, or time was over")
     lines += [
-        f"{one.name}: {one.possible_in_words}; {_reasons(one)}"
-        for one in choice.sensors
-        if one.status != "excluded" and one.impossible
+        f"{sensor.name}: {sensor.possible_in_words}; {_reasons(sensor)}"
+        for sensor in choice.sensors
+        if sensor.status != "excluded" and sensor.impossible
     ]
-    if lacking := [f"{one.name} {one.lacks.partition(' views')[0]}" for one in choice.sensors if one.lacks]:
+    if lacking := [f"{sensor.name} {sensor.lacks.partition(' views')[0]}" for sensor in choice.sensors if sensor.lacks]:
         lines.append(f"not all views were screened, for lack of time: {', '.join(lacking)}")
-    lines += [f"{one.name} is excluded: {one.why}" for one in choice.sensors if one.status == "excluded"]
+    lines += [f"{sensor.name} is excluded: {sensor.why}" for sensor in choice.sensors if sensor.status == "excluded"]
     return "\n".join(lines)
 
 
 _SIGNS = {"fits": "fits", "does not fit": "no", "undecidable": "undecidable", "not decided": "?", "no tolerance": ""}
 
 
-def _fits(one: SensorEntry, toleranced: int) -> str:
+def _fits(sensor_entry: SensorEntry, toleranced: int) -> str:
     if not toleranced:
         return "-"
-    known = one.status == "stated"
-    return f"{one.fits} of {toleranced}" if known else f"({one.expected_fits} of {toleranced})"
+    known = sensor_entry.status == "stated"
+    return f"{sensor_entry.fits} of {toleranced}" if known else f"({sensor_entry.expected_fits} of {toleranced})"
 
 
 def _cell(cell: CellEntry, measurement: ComparedMeasurement) -> str:
@@ -200,41 +210,41 @@ def _cell(cell: CellEntry, measurement: ComparedMeasurement) -> str:
     return f"{two_digits(cell.uncertainty)} {measurement.unit} ({cell.view}) {_SIGNS[cell.verdict]}".rstrip()
 
 
-def _sensor(one: SensorResult) -> SensorEntry:
-    study = one.candidate.study
+def _sensor(result: SensorResult) -> SensorEntry:
+    study = result.candidate.study
     names = list(study.task.measurements)
-    rows = one.best() if one.stated else [None] * len(names)
-    cells = {name: _cell_of(one, m, name, rows[m]) for m, name in enumerate(names)}
-    views = list(dict.fromkeys([*one.stated, *(cell.view for cell in cells.values() if cell.view is not None)]))
+    rows = result.best() if result.stated else [None] * len(names)
+    cells = {name: _cell_of(result, m, name, rows[m]) for m, name in enumerate(names)}
+    views = list(dict.fromkeys([*result.stated, *(cell.view for cell in cells.values() if cell.view is not None)]))
     used = {cell.view for cell in cells.values()}
     return SensorEntry(
-        name=one.candidate.name,
-        given=one.candidate.given,
-        status="stated" if one.stated else "screened",
-        why="" if one.stated else one.unpromising or "time was over",
-        ratio=json_values(one.ratio),
+        name=result.candidate.name,
+        given=result.candidate.given,
+        status="stated" if result.stated else "screened",
+        why="" if result.stated else result.unpromising or "time was over",
+        ratio=json_values(result.ratio),
         words="",
         fits=sum(cell.verdict == "fits" and cell.by == "statement" for cell in cells.values()),
-        poses=[_pose(study, number) for number in views if number in used or number == next(iter(one.stated), None)],
-        capture=capture_entry(study.sensor, next(iter(stated.planned for stated in one.stated.values()), None)),
+        poses=[_pose(study, number) for number in views if number in used or number == next(iter(result.stated), None)],
+        capture=capture_entry(study.sensor, next(iter(stated.planned for stated in result.stated.values()), None)),
         measurements=cells,
         map_digest=map_digest(study),
-        lacks=not_scored_in_words(one.scores),
+        lacks=not_scored_in_words(result.scores),
     )
 
 
-def _cell_of(one: SensorResult, m: int, name: str, row: tuple[int, float, Statement] | None) -> CellEntry:
-    if not one.stated:
-        return _screened(one, m, name)
-    return _impossible(one, m, name) if row is None else _stated(row)
+def _cell_of(result: SensorResult, m: int, name: str, row: tuple[int, float, Statement] | None) -> CellEntry:
+    if not result.stated:
+        return _screened(result, m, name)
+    return _impossible(result, m, name) if row is None else _stated(row)
 
 
-def _impossible(one: SensorResult, m: int, name: str) -> CellEntry:
+def _impossible(result: SensorResult, m: int, name: str) -> CellEntry:
     """Return a cell of virtual measurements that gave too few values, of all stated views together."""
-    statements = [stated.statements[m] for stated in one.stated.values()]
+    statements = [stated.statements[m] for stated in result.stated.values()]
     trials = sum(each.trials for each in statements)
     lost = sum(each.trials * each.without_value for each in statements) / trials
-    toleranced = tolerance_of(one.candidate.study.task, name) is not None
+    toleranced = tolerance_of(result.candidate.study.task, name) is not None
     reasons = [loss for each in statements for loss in each.losses]
     lost_verdict: Verdict = "undecidable" if mostly_lost(trials) else "not decided"
     return CellEntry(
@@ -296,17 +306,20 @@ def _screened(found: SensorResult, m: int, name: str) -> CellEntry:
 
 def _relative(sensors: Sequence[SensorEntry]) -> list[SensorEntry]:
     """Express demands as multiples of the least demand of all measured sensors, for tasks without tolerances."""
-    known = [one.status == "stated" for one in sensors]
-    rows = [[math.inf if cell.demand is None else cell.demand for cell in one.measurements.values()] for one in sensors]
+    known = [sensor.status == "stated" for sensor in sensors]
+    rows = [
+        [math.inf if cell.demand is None else cell.demand for cell in sensor.measurements.values()]
+        for sensor in sensors
+    ]
     relative = relative_to_least(rows, known if any(known) else [True] * len(known))
     out = list[SensorEntry]()
-    for one, demands in zip(sensors, relative.tolist(), strict=True):
+    for sensor, demands in zip(sensors, relative.tolist(), strict=True):
         cells = {
             name: cell.model_copy(update={"demand": json_values(demand)})
-            for (name, cell), demand in zip(one.measurements.items(), demands, strict=True)
+            for (name, cell), demand in zip(sensor.measurements.items(), demands, strict=True)
         }
         worst = max((demand for demand in demands if math.isfinite(demand)), default=math.nan)
-        out.append(one.model_copy(update={"measurements": cells, "ratio": json_values(worst)}))
+        out.append(sensor.model_copy(update={"measurements": cells, "ratio": json_values(worst)}))
     return out
 
 

@@ -131,11 +131,11 @@ def plan_exposures(
     search, decision, report = (_Results(evaluate, noise) for noise in (SEARCH, DECISION, REPORT))
     singles = _sweep(search, own, limits_s, dimmable)
     names = list(singles[0].features)
-    full_power = [one for one in singles if one.exposure.power == 1.0]
+    full_power = [single for single in singles if single.exposure.power == 1.0]
     # with half of the exposures, the greedy search finds other sets
     sets = [_greedy_sets(search, start, names, rules.most) for start in (full_power, full_power[::2])]
     first_limits = _measurable(_limits(list(search.known.values()), names))
-    for exposure in {own, *(one.exposure for one in _nearest(singles, first_limits)), *sets[0], *sets[1]}:
+    for exposure in {own, *(result.exposure for result in _nearest(singles, first_limits)), *sets[0], *sets[1]}:
         decision(exposure)
     limits = _measurable(_limits(list(decision.known.values()), names))
     chosen, reached = (
@@ -150,7 +150,7 @@ def plan_exposures(
     )
 
 
-def shortfall(one: ExposureResult, limits: dict[str, FeatureResult]) -> float:
+def shortfall(result: ExposureResult, limits: dict[str, FeatureResult]) -> float:
     """Return by which share a result misses its limits, 0 if it reaches them all.
 
     It is the largest value, over all features, of n_limit / n - 1 and of u / (u_limit (1 + 2 e)) - 1. Here n is the
@@ -158,7 +158,7 @@ def shortfall(one: ExposureResult, limits: dict[str, FeatureResult]) -> float:
     """
     worst = 0.0
     for name, limit in limits.items():
-        known = one.features[name]
+        known = result.features[name]
         missing_points = limit.points / known.points - 1 if known.points > 0 else math.inf
         allowance = 2 * math.hypot(known.error, limit.error)
         worst = max(worst, missing_points, known.u / limit.u / (1 + allowance) - 1)
@@ -174,10 +174,10 @@ def _sweep(
     best: dict[str, float] = {}
     found = [search(PlannedExposure((middle,)))]
 
-    def is_useful(one: ExposureResult) -> bool:
-        for name, known in one.features.items():
+    def is_useful(result: ExposureResult) -> bool:
+        for name, known in result.features.items():
             best[name] = max(best.get(name, 0.0), known.points if math.isfinite(known.u) else 0.0)
-        return any(known.points > STOP_SHARE * best[name] > 0 for name, known in one.features.items())
+        return any(known.points > STOP_SHARE * best[name] > 0 for name, known in result.features.items())
 
     is_useful(found[0])
     steps = math.floor(math.log(LARGEST_RATIO) / math.log(STEP))
@@ -194,7 +194,7 @@ def _sweep(
                 break
             if exposure.exposures_s[0] >= longest:
                 break
-    unique = {one.exposure: one for one in found}
+    unique = {result.exposure: result for result in found}
     return sorted(unique.values(), key=lambda one: one.exposure.seconds * one.exposure.power)
 
 
@@ -217,11 +217,11 @@ def _greedy_sets(
     recovered = [name for name in names if possible[name] > 0]
     for size in range(1, min(most, len(singles)) + 1):
 
-        def least_share(one: ExposureResult) -> float:
-            shares = (_union([*chosen, one], name).sum() / possible[name] for name in recovered)
+        def least_share(result: ExposureResult) -> float:
+            shares = (_union([*chosen, result], name).sum() / possible[name] for name in recovered)
             return float(min(shares, default=0.0))
 
-        chosen.append(max((one for one in singles if one not in chosen), key=least_share))
+        chosen.append(max((single for single in singles if single not in chosen), key=least_share))
         if size > 1:
             sets.append(_merged_set(chosen))
             search(sets[-1])
@@ -230,19 +230,19 @@ def _greedy_sets(
 
 def _union(results: Sequence[ExposureResult], name: str) -> NDArray[np.bool_]:
     """Return the mask of the possible points of a feature that any of the results recovered."""
-    return np.asarray(np.any([one.recovered[name] for one in results], axis=0))
+    return np.asarray(np.any([result.recovered[name] for result in results], axis=0))
 
 
 def _merged_set(results: Sequence[ExposureResult]) -> PlannedExposure:
     """Return the set of several single exposures at full power."""
-    return PlannedExposure(tuple(sorted(one.exposure.exposures_s[0] for one in results)))
+    return PlannedExposure(tuple(sorted(result.exposure.exposures_s[0] for result in results)))
 
 
 def _limits(results: Sequence[ExposureResult], names: Sequence[str]) -> dict[str, FeatureResult]:
     """Return the most points and the smallest u of every feature, which may be of different results."""
     out = {}
     for name in names:
-        rows = [one.features[name] for one in results]
+        rows = [result.features[name] for result in results]
         most = max(rows, key=lambda row: row.points)
         least = min(rows, key=lambda row: row.u)
         out[name] = FeatureResult(most.points, most.fraction, least.u, least.scatter, least.error)
@@ -251,12 +251,12 @@ def _limits(results: Sequence[ExposureResult], names: Sequence[str]) -> dict[str
 
 def _measurable(limits: dict[str, FeatureResult]) -> dict[str, FeatureResult]:
     """Return the limits of those features that can be measured at some exposure."""
-    return {name: one for name, one in limits.items() if math.isfinite(one.u)}
+    return {name: limit for name, limit in limits.items() if math.isfinite(limit.u)}
 
 
 def _nearest(results: Sequence[ExposureResult], limits: dict[str, FeatureResult]) -> list[ExposureResult]:
     """Return the :data:`FINALISTS` results with the smallest shortfall."""
-    return sorted(results, key=lambda one: (shortfall(one, limits), one.exposure.seconds))[:FINALISTS]
+    return sorted(results, key=lambda result: (shortfall(result, limits), result.exposure.seconds))[:FINALISTS]
 
 
 def _fewest_exposures(
@@ -270,17 +270,17 @@ def _fewest_exposures(
     for size in range(1, rules.most + 1):
         if size > 1:
             candidates = [search(exposure) for exposure in _candidate_sets(full_power, size, limits, rules.within)]
-            for one in _nearest(candidates, limits):
-                decision(one.exposure)
+            for result in _nearest(candidates, limits):
+                decision(result.exposure)
         sufficient = [
-            one
-            for one in decision.known.values()
-            if len(one.exposure.exposures_s) == size and shortfall(one, limits) <= rules.within
+            result
+            for result in decision.known.values()
+            if len(result.exposure.exposures_s) == size and shortfall(result, limits) <= rules.within
         ]
         if sufficient:
             return min(sufficient, key=lambda one: one.exposure.seconds), True
-    least = min(shortfall(one, limits) for one in decision.known.values())
-    near = [one for one in decision.known.values() if shortfall(one, limits) <= least + rules.within]
+    least = min(shortfall(result, limits) for result in decision.known.values())
+    near = [result for result in decision.known.values() if shortfall(result, limits) <= least + rules.within]
     return min(near, key=lambda one: (len(one.exposure.exposures_s), one.exposure.seconds)), False
 
 
@@ -291,7 +291,7 @@ def _candidate_sets(
     sets = list[tuple[float, float, PlannedExposure]]()
     for results in combinations(full_power, size):
         share = min(float(_union(results, name).sum()) / limit.points for name, limit in limits.items())
-        sets.append((share, sum(one.exposure.seconds for one in results), _merged_set(results)))
+        sets.append((share, sum(result.exposure.seconds for result in results), _merged_set(results)))
     sufficient = sorted((one for one in sets if one[0] >= 1 / (1 + within)), key=lambda one: one[1])
     if len(sufficient) < TRIED:  # too few sets are predicted to: add those that come closest
         sufficient += sorted((one for one in sets if one[0] < 1 / (1 + within)), key=lambda one: -one[0])

@@ -176,7 +176,7 @@ def feature_result(
 
 def needed_shapes(task: Task) -> list[str]:
     """Return the names of all shapes that the measurements of a task need, each once."""
-    return list(dict.fromkeys(name for one in task.measurements for name in task.shapes_for(one)))
+    return list(dict.fromkeys(name for measurement in task.measurements for name in task.shapes_for(measurement)))
 
 
 def _possible_points(renderer: RenderedMeasurements, view: View) -> dict[str, _PossiblePoints]:
@@ -201,12 +201,12 @@ def _possible_points(renderer: RenderedMeasurements, view: View) -> dict[str, _P
 
 def _mean_result(samples: Sequence[FeatureResult]) -> FeatureResult:
     """Return the mean result of one feature over noise samples: means, and for u the root mean square."""
-    scatter = [one.scatter for one in samples if math.isfinite(one.scatter)]
-    u = np.array([one.u for one in samples])
+    scatter = [sample.scatter for sample in samples if math.isfinite(sample.scatter)]
+    u = np.array([sample.u for sample in samples])
     error = float(u.std(ddof=1) / u.mean() / math.sqrt(len(u))) if len(u) > 1 and np.isfinite(u).all() else 0.0
     return FeatureResult(
-        float(np.mean([one.points for one in samples])),
-        float(np.mean([one.fraction for one in samples])),
+        float(np.mean([sample.points for sample in samples])),
+        float(np.mean([sample.fraction for sample in samples])),
         float(np.sqrt(np.mean(u**2))),
         float(np.mean(scatter)) if scatter else math.nan,
         error,

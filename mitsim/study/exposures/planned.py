@@ -173,8 +173,8 @@ def plan_document(study: Study, plan: ExposurePlan) -> dict[str, Any]:
         "sets_tried": plan.sets_tried,
         "unseen": list(plan.unseen),
         "limits": {
-            name: {"points": one.points, "fraction": one.fraction, "u_mm": _number(one.u)}
-            for name, one in plan.limits.items()
+            name: {"points": limit.points, "fraction": limit.fraction, "u_mm": _number(limit.u)}
+            for name, limit in plan.limits.items()
         },
         "own": _result_values(plan.own),
         "added": [{"exposure_s": seconds} | _result_values(result) for seconds, result in plan.added],
@@ -185,8 +185,12 @@ def _result_values(result: ExposureResult) -> dict[str, Any]:
     return {
         "exposures_s": list(result.exposure.exposures_s),
         "features": {
-            name: {"points": round(one.points, 1), "fraction": round(one.fraction, 4), "u_mm": _number(one.u)}
-            for name, one in result.features.items()
+            name: {
+                "points": round(feature.points, 1),
+                "fraction": round(feature.fraction, 4),
+                "u_mm": _number(feature.u),
+            }
+            for name, feature in result.features.items()
         },
     }
 
@@ -215,12 +219,14 @@ def plan_table(plan: ExposurePlan) -> str:
 def write_plan_csv(path: Path, plan: ExposurePlan) -> None:
     """Write a plan as a CSV file, with one row for each feature of each step."""
     lines, power = ["step,exposure_ms,power,feature,points,fraction,u_mm"], plan.exposure.power
-    steps = [("own", ";".join(f"{1e3 * one:.4g}" for one in plan.own.exposure.exposures_s), plan.own, 1.0)]
+    steps = [
+        ("own", ";".join(f"{1e3 * exposure_s:.4g}" for exposure_s in plan.own.exposure.exposures_s), plan.own, 1.0)
+    ]
     steps += [(str(k), f"{1e3 * seconds:.4g}", result, power) for k, (seconds, result) in enumerate(plan.added, 1)]
     for step, exposure, result, power in steps:
-        for name, one in result.features.items():
-            u = f"{one.u:.4g}" if math.isfinite(one.u) else ""
-            lines.append(f"{step},{exposure},{power:g},{name},{one.points:.1f},{one.fraction:.4f},{u}")
+        for name, feature in result.features.items():
+            u = f"{feature.u:.4g}" if math.isfinite(feature.u) else ""
+            lines.append(f"{step},{exposure},{power:g},{name},{feature.points:.1f},{feature.fraction:.4f},{u}")
     write_text(path, "\n".join(lines) + "\n")
 
 
@@ -246,6 +252,6 @@ def plan_in_words(plan: ExposurePlan) -> str:
     return text + (f"; too few points from this view at any exposure: {', '.join(plan.unseen)}" if plan.unseen else "")
 
 
-def _feature_text(one: FeatureResult) -> str:
-    u = f"{1e3 * one.u:.1f}" if math.isfinite(one.u) else "-"
-    return f"{one.points:.0f}  {one.fraction:.2f}  {u}"
+def _feature_text(result: FeatureResult) -> str:
+    u = f"{1e3 * result.u:.1f}" if math.isfinite(result.u) else "-"
+    return f"{result.points:.0f}  {result.fraction:.2f}  {u}"

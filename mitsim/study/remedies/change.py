@@ -68,7 +68,7 @@ class Shortfall:
 
 def missed_by(stated: StatedView) -> dict[str, Statement]:
     """Return the statements of a view's measurements that do not fit, by name."""
-    return {one.measurement: one for one in stated.statements if one.verdict in MISSED}
+    return {statement.measurement: statement for statement in stated.statements if statement.verdict in MISSED}
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ def reopened(study: Study, keys: Mapping[str, Any]) -> Study:
 
 def possible(now: Shortfall, effect: Effect) -> dict[str, float]:
     """Return the least uncertainty after a change, of the measurements that can fit with it."""
-    least = {name: least_uncertainty(one, effect) for name, one in now.missed.items()}
+    least = {name: least_uncertainty(statement, effect) for name, statement in now.missed.items()}
     return {name: u for name, u in least.items() if can_fit(now.missed[name], u, effect.unbiased)}
 
 

@@ -79,7 +79,7 @@ def changes(now: Shortfall) -> Iterator[Change]:
         _decoder,
     )
     for propose in proposals:
-        yield from (one for one in propose(now) if one.expected)
+        yield from (change for change in propose(now) if change.expected)
 
 
 def _of_study(
@@ -94,20 +94,26 @@ def _of_study(
 
 
 def _bias(now: Shortfall) -> Iterator[Change]:
-    able = {name: one for name, one in now.missed.items() if one.decided is not None and one.decided.fits_corrected}
+    able = {
+        name: statement
+        for name, statement in now.missed.items()
+        if statement.decided is not None and statement.decided.fits_corrected
+    }
     if not able:
         return
     task = now.study.task
     decision = task.decision.model_copy(update={"subtract_bias": True})
     measurements = {
-        name: one
-        if one.decision is None
-        else one.model_copy(update={"decision": one.decision.model_copy(update={"subtract_bias": True})})
-        for name, one in task.measurements.items()
+        name: measurement
+        if measurement.decision is None
+        else measurement.model_copy(
+            update={"decision": measurement.decision.model_copy(update={"subtract_bias": True})}
+        )
+        for name, measurement in task.measurements.items()
     }
     corrected = task.model_copy(update={"decision": decision, "measurements": measurements})
     session, number = now.session, now.stated.view.number
-    most = max(one.trials for one in now.stated.statements)
+    most = max(statement.trials for statement in now.stated.statements)
 
     def state(_: int, limit: TimeLimit) -> list[Statement]:
         # the trials of the statement itself
@@ -115,7 +121,7 @@ def _bias(now: Shortfall) -> Iterator[Change]:
         return again.state(again.study.view(number), StatementTable(trials=most), limit).statements
 
     words = "with its bias subtracted"
-    expected = {name: one.standard_uncertainty for name, one in able.items()}
+    expected = {name: statement.standard_uncertainty for name, statement in able.items()}
     yield Change("bias", words, {"decision": {"subtract_bias": True}}, (number,), expected, state)
 
 
@@ -125,7 +131,7 @@ def _views(now: Shortfall) -> Iterator[Change]:
     risk = screening_risk(now.scores)
     numbers = now.scores["view"].values.tolist()
     names = [str(name) for name in now.scores["measurement"].values]
-    for name, one in now.missed.items():
+    for name, statement in now.missed.items():
         ratios: dict[int, float] = {}
         screened = np.exp(risk[names.index(name)])
         if np.isfinite(screened).any():
@@ -138,8 +144,8 @@ def _views(now: Shortfall) -> Iterator[Change]:
             leader = now.raced.leader(name)
             ratios[leader] = risks[leader] / risks[stated]
         for number, ratio in ratios.items():
-            u = ratio * one.standard_uncertainty / SCREENING_FACTOR
-            if number != stated and ratio < 1 and can_fit(one, u, unbiased=True):
+            u = ratio * statement.standard_uncertainty / SCREENING_FACTOR
+            if number != stated and ratio < 1 and can_fit(statement, u, unbiased=True):
                 found.setdefault(number, {})[name] = u
     for number, expected in sorted(found.items(), key=lambda row: -len(row[1]))[:_MOST_OTHER_VIEWS]:
 
@@ -164,9 +170,9 @@ def _nearer(now: Shortfall) -> Iterator[Change]:
         return
     ratio = (standoff / view.standoff) ** 2 / SCREENING_FACTOR
     expected = {
-        name: ratio * one.standard_uncertainty
-        for name, one in now.missed.items()
-        if can_fit(one, ratio * one.standard_uncertainty, unbiased=True)
+        name: ratio * statement.standard_uncertainty
+        for name, statement in now.missed.items()
+        if can_fit(statement, ratio * statement.standard_uncertainty, unbiased=True)
     }
     target = [round(float(value), 3) for value in (low + high) / 2]
     keys = {"views": {"target_mm": target, "standoff_mm": standoff}}
@@ -187,11 +193,12 @@ def _repeats(now: Shortfall) -> Iterator[Change]:
     left = dict(now.missed)
     for captures in _CAPTURES:
         expected = {
-            name: one.after_repeats(captures)
-            for name, one in left.items()
-            if math.isfinite(one.repeatability) and can_fit(one, one.after_repeats(captures), unbiased=False)
+            name: statement.after_repeats(captures)
+            for name, statement in left.items()
+            if math.isfinite(statement.repeatability)
+            and can_fit(statement, statement.after_repeats(captures), unbiased=False)
         }
-        left = {name: one for name, one in left.items() if name not in expected}
+        left = {name: statement for name, statement in left.items() if name not in expected}
         state = partial(state_mean, now.session, now.stated.view, captures)
         words, view = f"as the mean of {captures} captures", now.stated.view.number
         yield Change("repeats", words, {}, (view,), expected, state, captures=captures)
@@ -233,10 +240,10 @@ def _temperature(now: Shortfall) -> Iterator[Change]:
 def _by_share(now: Shortfall, group: str) -> dict[float, dict[str, float]]:
     """Return the measurements that can fit, by the largest share of the errors of a group that suffices."""
     out: dict[float, dict[str, float]] = {}
-    for name, one in now.missed.items():
-        share = least_shares(one, group, _SHARES)
-        if share is not None and one.budget:
-            out.setdefault(share, {})[name] = least_uncertainty(one, Effect({group: share}))
+    for name, statement in now.missed.items():
+        share = least_shares(statement, group, _SHARES)
+        if share is not None and statement.budget:
+            out.setdefault(share, {})[name] = least_uncertainty(statement, Effect({group: share}))
     return dict(sorted(out.items(), reverse=True))
 
 
@@ -247,11 +254,11 @@ def _several_views(now: Shortfall) -> Iterator[Change]:
         return
     here = now.scores["predicted_uncertainty"].sel(view=now.stated.view.number)
     limits, needed = dict[str, float](), dict[str, float]()
-    for name, one in now.missed.items():
+    for name, statement in now.missed.items():
         predicted = float(here.values[names.index(name)])
-        if one.decided is not None and math.isfinite(one.decided.needed) and one.root_mean_square > 0:
-            optimism = min(1.0, predicted / one.root_mean_square) if math.isfinite(predicted) else 1.0
-            needed[name], limits[name] = one.decided.needed, one.decided.needed * optimism
+        if statement.decided is not None and math.isfinite(statement.decided.needed) and statement.root_mean_square > 0:
+            optimism = min(1.0, predicted / statement.root_mean_square) if math.isfinite(predicted) else 1.0
+            needed[name], limits[name] = statement.decided.needed, statement.decided.needed * optimism
     if not limits:
         return
     table = SetTable(limits=limits, seconds=_SEARCH_S)
@@ -279,7 +286,9 @@ def _several_views(now: Shortfall) -> Iterator[Change]:
 
 def _spray(now: Shortfall) -> Iterator[Change]:
     study, view = now.study, now.stated.view
-    white = all(one is not None and one.name == MATT_WHITE.name for one in finishes_of_features(study).values())
+    white = all(
+        finish is not None and finish.name == MATT_WHITE.name for finish in finishes_of_features(study).values()
+    )
     if white or study.file.sprayed:
         return
     keys = {"sprayed": True}

@@ -49,12 +49,12 @@ class TriedChange:
     @property
     def trials(self) -> int:
         """Return the number of virtual measurements."""
-        return max((one.trials for one in self.stated.values()), default=0)
+        return max((statement.trials for statement in self.stated.values()), default=0)
 
     @property
     def fits(self) -> list[str]:
         """Return the measurements that fit."""
-        return [name for name, one in self.stated.items() if one.verdict == "fits"]
+        return [name for name, statement in self.stated.items() if statement.verdict == "fits"]
 
 
 @dataclass
@@ -73,7 +73,7 @@ class Remedies:
     @property
     def open(self) -> list[str]:
         """Return the measurements that no change makes fit so far."""
-        solved = {name for one in self.tried for name in one.fits}
+        solved = {name for change in self.tried for name in change.fits}
         return [name for name in self.missed if name not in solved]
 
 
@@ -101,7 +101,10 @@ def find_remedies(
     """
     known = Remedies(missed) if before is None else before
     found, limit = Remedies(missed, list(known.tried), list(known.failed)), limit or TimeLimit()
-    done = {change.words for change in (*(one.change for one in known.tried), *(one for one, _ in known.failed))}
+    done = {
+        change.words
+        for change in (*(tried_change.change for tried_change in known.tried), *(one for one, _ in known.failed))
+    }
     kinds = set[str]()
     for change in proposed:
         kinds.add(change.kind)
@@ -166,21 +169,23 @@ def _stated(change: Change, wanted: list[str], trials: int, limit: TimeLimit) ->
     """Return the statements under a change, from more trials while a wanted verdict is open and may become good."""
     stated: dict[str, Statement] = {}
     for share in _STEPS:
-        stated = {one.measurement: one for one in change.state(max(_FEWEST, round(share * trials)), limit)}
+        stated = {
+            statement.measurement: statement for statement in change.state(max(_FEWEST, round(share * trials)), limit)
+        }
         asked = [stated[name] for name in wanted]
-        if limit.over() or not any(_deserves_more(one, share < 1) for one in asked):
+        if limit.over() or not any(_deserves_more(statement, share < 1) for statement in asked):
             break
     return stated
 
 
-def _deserves_more(one: Statement, first: bool) -> bool:
+def _deserves_more(statement: Statement, first: bool) -> bool:
     """Return whether a verdict deserves more trials: one that may become *fits*, or does so by the first few alone.
 
     After the first few, one standard deviation of the logarithm of the demand may be missing, later nothing.
     """
-    if one.decided is None or one.verdict != "not decided":
-        return one.verdict == "fits" and first
-    demand, high = one.decided.demand, one.decided.demand_interval[1]
+    if statement.decided is None or statement.verdict != "not decided":
+        return statement.verdict == "fits" and first
+    demand, high = statement.decided.demand, statement.decided.demand_interval[1]
     return demand <= 1 or (first and demand**2 <= high / demand)
 
 
@@ -189,16 +194,16 @@ def remedies_document(found: Remedies) -> dict[str, Any]:
     return {
         "measurements": {
             name: {
-                "unit": one.unit,
-                "standard_uncertainty": json_values(one.standard_uncertainty),
-                "needed": None if one.decided is None else json_values(one.decided.needed),
-                "demand": None if one.decided is None else json_values(one.decided.demand),
+                "unit": statement.unit,
+                "standard_uncertainty": json_values(statement.standard_uncertainty),
+                "needed": None if statement.decided is None else json_values(statement.decided.needed),
+                "demand": None if statement.decided is None else json_values(statement.decided.demand),
                 "fits_by": next((i for i, tried in enumerate(found.tried) if name in tried.fits), None),
             }
-            for name, one in found.missed.items()
+            for name, statement in found.missed.items()
         },
-        "tried": [_entry(one, found.missed) for one in found.tried],
-        "impossible": [{"words": one.words, "reason": why} for one, why in found.failed],
+        "tried": [_entry(change, found.missed) for change in found.tried],
+        "impossible": [{"words": change.words, "reason": why} for change, why in found.failed],
         "untried": list(found.untried),
     }
 
@@ -217,14 +222,14 @@ def _entry(tried: TriedChange, missed: Iterable[str]) -> dict[str, Any]:
     }
 
 
-def _measured(one: Statement, change: Change) -> dict[str, Any]:
-    decided = one.decided
+def _measured(statement: Statement, change: Change) -> dict[str, Any]:
+    decided = statement.decided
     return {
-        "expected": json_values(change.expected.get(one.measurement)),
-        "bias": json_values(one.bias),
-        "standard_uncertainty": json_values(one.standard_uncertainty),
-        "without_value": one.without_value,
+        "expected": json_values(change.expected.get(statement.measurement)),
+        "bias": json_values(statement.bias),
+        "standard_uncertainty": json_values(statement.standard_uncertainty),
+        "without_value": statement.without_value,
         "demand": None if decided is None else json_values(decided.demand),
         "demand_interval": None if decided is None else json_values(list(decided.demand_interval)),
-        "verdict": one.verdict,
+        "verdict": statement.verdict,
     }

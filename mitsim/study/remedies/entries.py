@@ -60,18 +60,18 @@ def remedies_in_words(found: RemediesEntry | None) -> list[str]:
         return []
     lines = list[str]()
     for index, tried in enumerate(found.tried):
-        names = [name for name, one in found.measurements.items() if one.fits_by == index]
+        names = [name for name, measurement in found.measurements.items() if measurement.fits_by == index]
         if names:
             changed = [_changed(name, found.measurements[name], tried.measurements[name]) for name in names]
             verb = "fits" if len(names) == 1 else "fit"
             lines.append(f"{tried.words}: {listed(changed)} {verb} ({tried.trials} virtual measurements)")
     unsolved: dict[str, list[str]] = {}
-    for name, one in found.measurements.items():
-        if one.fits_by is None:
+    for name, measurement in found.measurements.items():
+        if measurement.fits_by is None:
             told, why = _unsolved(found, name)
             unsolved.setdefault(why, []).append(told)
     lines += [f"{listed(told)}: {why}" for why, told in unsolved.items()]
-    if found.untried and any(one.fits_by is None for one in found.measurements.values()):
+    if found.untried and any(measurement.fits_by is None for measurement in found.measurements.values()):
         lines.append(f"not tried for lack of time: {'; '.join(found.untried)}")
     return lines
 

@@ -35,8 +35,8 @@ Mending = Callable[[StatedView, Remedies | None, TimeLimit, bool], Remedies | No
 
 def seeks_remedies(study: Study) -> bool:
     """Return whether a run looks for changes that make measurements fit: the study allows it, and has tolerances."""
-    tolerances = (one.tolerance for one in study.task.measurements.values())
-    return study.file.remedies.minutes > 0 and any(one is not None for one in tolerances)
+    tolerances = (measurement.tolerance for measurement in study.task.measurements.values())
+    return study.file.remedies.minutes > 0 and any(tolerance is not None for tolerance in tolerances)
 
 
 def state_and_mend(
@@ -102,4 +102,4 @@ def in_turn(stated: StatedView, state: Stating, mend: Mending, rest: TimeLimit) 
 
 
 def _decided(stated: StatedView) -> bool:
-    return all(one.verdict != "not decided" for one in stated.statements)
+    return all(statement.verdict != "not decided" for statement in stated.statements)

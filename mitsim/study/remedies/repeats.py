@@ -59,7 +59,7 @@ def _mean(captures: list[np.ndarray | OneSidedErrors]) -> np.ndarray | OneSidedE
     """Return the mean errors (n,) of days from those of each capture."""
     first = captures[0]
     if isinstance(first, OneSidedErrors):
-        vectors = np.array([one.vectors for one in captures if isinstance(one, OneSidedErrors)])
+        vectors = np.array([capture.vectors for capture in captures if isinstance(capture, OneSidedErrors)])
         return replace(first, vectors=_known_mean(vectors))
     return _known_mean(np.array(captures))
 

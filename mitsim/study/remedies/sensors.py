@@ -45,7 +45,7 @@ def other_sensors(now: Shortfall, limit: TimeLimit) -> Iterator[Change]:
     own = _risks(now.scores, names)[:, now.scores["view"].values.tolist().index(stated)]
     found = list[tuple[int, float, Change]]()
     # fringes first: time may not suffice for all
-    for name in sorted(presets(), key=lambda one: named_sensor(one)[1] != "structured_light"):
+    for name in sorted(presets(), key=lambda preset: named_sensor(preset)[1] != "structured_light"):
         if name == now.study.sensor.name or name not in shipped_maps():
             continue
         if limit.over():
@@ -58,11 +58,11 @@ def other_sensors(now: Shortfall, limit: TimeLimit) -> Iterator[Change]:
         risks = _risks(scores, names)
         least = risks.min(axis=1)
         expected = {}
-        for one, risk, before in zip(now.missed.values(), least, own, strict=True):
+        for statement, risk, before in zip(now.missed.values(), least, own, strict=True):
             ratio = float(risk / before)  # 0 where the map sees no way for the first sensor
-            u = ratio * one.standard_uncertainty / SCREENING_FACTOR
-            if math.isfinite(risk) and can_fit(one, u, unbiased=True):
-                expected[one.measurement] = u
+            u = ratio * statement.standard_uncertainty / SCREENING_FACTOR
+            if math.isfinite(risk) and can_fit(statement, u, unbiased=True):
+                expected[statement.measurement] = u
         if expected:
             able = np.isfinite(least)
             best = int(np.argmin((risks[able] / least[able, None]).max(axis=0)))

@@ -124,7 +124,7 @@ def _next_set(
             limits[name] = math.sqrt(limits[name] * before[name])
         if lost or not chosen.views:
             continue
-        if all(set(one.chosen.views) != set(chosen.views) for one in tried):
+        if all(set(tried_set.chosen.views) != set(chosen.views) for tried_set in tried):
             return chosen, limits
         for name in missed:
             limits[name] *= _TIGHTENING
@@ -187,15 +187,15 @@ def tried_entries(tried: Sequence[TriedSet], limits: dict[str, float]) -> list[d
     """Return views, expected uncertainty and root mean square error of every measured set as JSON values."""
     return [
         {
-            "views": list(one.chosen.views),
-            "excess": json_values(one.excess(limits)),
-            "searched": one.searched,
-            "expected": dict(zip(limits, one.chosen.uncertainty.tolist(), strict=True)),
+            "views": list(tried_set.chosen.views),
+            "excess": json_values(tried_set.excess(limits)),
+            "searched": tried_set.searched,
+            "expected": dict(zip(limits, tried_set.chosen.uncertainty.tolist(), strict=True)),
             "found": json_values(
-                {each.measurement: each.root_mean_square for each in one.stated if each.measurement in limits}
+                {each.measurement: each.root_mean_square for each in tried_set.stated if each.measurement in limits}
             ),
         }
-        for one in tried
+        for tried_set in tried
     ]
 
 

@@ -101,12 +101,12 @@ class JoinedMeasurements:
         if self.table.joining == "best_fit":
             task = self.renderer.study.task
             shapes = {name: task.features[name].nominal() for name in task.shapes}
-            motions = best_fit([one.points for one in measured], shapes, self.centre, self.known, day)
+            motions = best_fit([view.points for view in measured], shapes, self.centre, self.known, day)
         return {
             name: np.concatenate(
                 [
-                    one.points[name] @ motion[:3, :3].T + motion[:3, 3]
-                    for one, motion in zip(measured, motions, strict=True)
+                    view.points[name] @ motion[:3, :3].T + motion[:3, 3]
+                    for view, motion in zip(measured, motions, strict=True)
                 ]
             )
             for name in measured[0].points

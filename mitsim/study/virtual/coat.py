@@ -72,7 +72,7 @@ def coated_shapes(scene: Scene, table: CoatUnknowns) -> list[int]:
     """Return the indices of the shapes of a scene that are sprayed; none if the coat has no thickness."""
     if not table.thickness_um[1] > 0:
         return []
-    return [index for index, one in enumerate(scene.finishes) if one is not None and one.name == SPRAY]
+    return [index for index, finish in enumerate(scene.finishes) if finish is not None and finish.name == SPRAY]
 
 
 def coated(

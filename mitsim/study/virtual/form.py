@@ -52,7 +52,7 @@ def drawn_form(task: Task, given: Mapping[str, float]) -> dict[str, float]:
 
 def form_measurements(task: Task) -> list[str]:
     """Return the names of the measurements of form: flatness and cylindricity."""
-    return [name for name, one in task.measurements.items() if DEFINITIONS[one.kind].of == "form"]
+    return [name for name, measurement in task.measurements.items() if DEFINITIONS[measurement.kind].of == "form"]
 
 
 def measured_with_form(

@@ -177,7 +177,7 @@ def trial_digest(
     }
     folded = folded_values(study.task)
     if folded:
-        content["deviations"] = {name: one.shape for name, one in folded.items()}
+        content["deviations"] = {name: folded_value.shape for name, folded_value in folded.items()}
     if named := named_digests(Path(study.scene.where), {name: str(value) for name, value in file.parameters.items()}):
         content["files"] = named
     if file.sprayed:
@@ -201,7 +201,7 @@ def study_digest(study: Study, trials: str) -> str:
         "trials": trials,
         "file": study.file.model_dump(mode="json"),
         "task": study.task.model_dump(mode="json"),
-        "series": [] if study.campaign is None else [one.name for one in study.campaign.series],
+        "series": [] if study.campaign is None else [series.name for series in study.campaign.series],
         "campaign": None if study.campaign is None else study.campaign.file.model_dump(mode="json"),
         "map": map_digest(study),
     }

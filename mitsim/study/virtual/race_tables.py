@@ -47,7 +47,7 @@ def raced_errors(raced: Raced, task: Task) -> xr.Dataset:
     tried = ~np.isinf(raced.errors[:, order])
     errors = np.where(tried, raced.errors[:, order], np.nan)
     dims = ("measurement", "view", "repeat")
-    nominal = np.array([one.nominal for one in task.measurements.values()])[:, None, None]
+    nominal = np.array([measurement.nominal for measurement in task.measurements.values()])[:, None, None]
     return xr.Dataset(
         {
             "error": (dims, errors, {"units": "mm or deg"}),

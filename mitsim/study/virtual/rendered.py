@@ -194,8 +194,8 @@ class RenderedMeasurements:
         assert how is not None  # rendering_of a study
         indirect = IndirectImages(images, shared.rois, how, self.rendering.depth)
         room = {}
-        for name, one in shared.seen.items():
-            image = moved_images(one.room_radiance(albedos)[None], motions.get(name))[0]
+        for name, surfaces in shared.seen.items():
+            image = moved_images(surfaces.room_radiance(albedos)[None], motions.get(name))[0]
             room[name] = sensor.apply_lens(image, name, shared.rois[name])
         light = sensor.light(scene, true, seed=drawn.seed, rendering=replace(self.rendering, indirect=indirect))
         if self.study.sensor.room is None:

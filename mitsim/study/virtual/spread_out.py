@@ -77,7 +77,7 @@ class SpreadMeasurements:
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, Outcome]]:
         """Yield the outcome of every virtual measurement, job by job as they arrive."""
         orders = [replace(self._order, jobs=some) for some in self._rows(jobs)]
-        for order, results in self.workers.distribute(orders, lambda one: one, make_trials, _light_of):
+        for order, results in self.workers.distribute(orders, lambda trial_order: trial_order, make_trials, _light_of):
             yield from zip(order.jobs, results, strict=True)
 
     def _rows(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, ...]]:

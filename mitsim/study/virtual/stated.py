@@ -170,7 +170,7 @@ def compared(study: Study, trials: TrialFolder, view: int, other: int) -> float 
             return None
         stated = _statements(study, trials, study.view(number), made)
         figures.append(np.array([one.root_mean_square for one in stated]))
-    sizes = np.array([one.tolerance_size or math.nan for one in task.measurements.values()])
+    sizes = np.array([measurement.tolerance_size or math.nan for measurement in task.measurements.values()])
     first, second = (each / sizes if np.isfinite(sizes).all() else each for each in figures)
     if not (np.isfinite(first) & np.isfinite(second) & (first > 0) & (second > 0)).all():
         return None
@@ -219,8 +219,8 @@ def least_trials(study: Study, share: float) -> int:
 
     Its relative variance is (k - 1) / 4 n for n errors of kurtosis k.
     """
-    scatters = [one.scatter for one in finishes_of_features(study).values() if one is not None]
-    bare = any(one is not None and not one.depolarising for one in scatters)
+    scatters = [finish.scatter for finish in finishes_of_features(study).values() if finish is not None]
+    bare = any(scatter is not None and not scatter.depolarising for scatter in scatters)
     return math.ceil((_METAL_TAIL if bare else _NORMAL_TAIL) / (4 * share**2))
 
 
@@ -264,7 +264,7 @@ def statement_table(stated: Sequence[Statement]) -> str:
             )
         )
     lost = lost_features((one.measurement, one.trials, one.losses) for one in stated)
-    lines = [f"no value in {one.in_words()}" for one in lost]
+    lines = [f"no value in {feature.in_words()}" for feature in lost]
     lines += dependences_in_words(
         (one.measurement, one.unit, one.size_depends_on, None if one.decided is None else one.decided.needed)
         for one in stated

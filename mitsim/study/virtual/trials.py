@@ -51,9 +51,13 @@ class Outcome:
     def of(cls, measured: Mapping[str, Result]) -> Outcome:
         """Return the errors of a cloud's measurements, and the reasons of those without a value."""
         return cls(
-            {name: float(one.error) for name, one in measured.items()},
-            {name: one.reason for name, one in measured.items() if not one.possible},
-            {name: one.deviations.ravel().tolist() for name, one in measured.items() if one.deviations is not None},
+            {name: float(result.error) for name, result in measured.items()},
+            {name: result.reason for name, result in measured.items() if not result.possible},
+            {
+                name: result.deviations.ravel().tolist()
+                for name, result in measured.items()
+                if result.deviations is not None
+            },
         )
 
 
@@ -90,7 +94,7 @@ class TrialFolder:
     def of(cls, folder: str | Path, digest: str, task: Task) -> TrialFolder:
         """Return the trials of a task in a folder."""
         folded = folded_values(task)
-        counts = {name: math.prod(one.shape) for name, one in folded.items()}
+        counts = {name: math.prod(value.shape) for name, value in folded.items()}
         return cls(folder, digest, list(task.measurements), counts, folded)
 
     def known(self, view: int) -> dict[Trial, Outcome]:
@@ -151,7 +155,7 @@ class TrialFolder:
         Those of a value that folds are at the limit of its tolerance.
         """
         errors = self.errors_of_parts(view, trials)
-        return np.array([stated_errors(one) for one in errors], float).reshape(len(errors), len(trials))
+        return np.array([stated_errors(error) for error in errors], float).reshape(len(errors), len(trials))
 
     def _one_sided(self, folded: FoldedValue, view: int, trials: Sequence[Trial]) -> OneSidedErrors:
         vectors = self.deviations(view, trials, folded.name).reshape(len(trials), *folded.shape)
@@ -162,7 +166,7 @@ class TrialFolder:
         """Return the known reasons why a measurement has no value in finished trials of a view."""
         known = self.known(view)
         reasons = [known[trial].reasons for trial in trials if trial in known]
-        return [one[measurement] for one in reasons if measurement in one]
+        return [reason[measurement] for reason in reasons if measurement in reason]
 
     def _head(self) -> dict[str, Any]:
         return {"schema_version": 1, "digest": self.digest, "measurements": list(self.measurements)}

@@ -44,8 +44,8 @@ class ViewLight:
     @property
     def bytes(self) -> int:
         """Memory that it needs."""
-        return sum(one.bytes for one in self.kept.values()) + sum(
-            one.shape.nbytes + one.cosine.nbytes for one in self.seen.values()
+        return sum(light.bytes for light in self.kept.values()) + sum(
+            surfaces.shape.nbytes + surfaces.cosine.nbytes for surfaces in self.seen.values()
         )
 
 
@@ -89,9 +89,9 @@ class LightOfViews:
         """Return the light of a view, made on first use."""
         if number not in self._views:
             made = make()
-            kept = sum(one.bytes for one in self._views.values())
+            kept = sum(view.bytes for view in self._views.values())
             allowed = min(max(_LEAST_KEPT, kept + int(_KEPT_SHARE * available_memory())), _MOST_KEPT)
-            while self._views and made.bytes + sum(one.bytes for one in self._views.values()) > allowed:
+            while self._views and made.bytes + sum(view.bytes for view in self._views.values()) > allowed:
                 self._views.pop(next(iter(self._views)))
             self._views[number] = made
         used = self._views.pop(number)

@@ -98,7 +98,7 @@ def sensor_of(capture: Capture, name: str | None, where: str | Path) -> Sensor:
     """
     if name is None and capture.sensor not in presets():
         found = f"none, and {where} comes from {capture.sensor}, which is not a preset"
-        types = {one: one.partition("-")[2] for one in presets()}  # the name without its maker
+        types = {preset: preset.partition("-")[2] for preset in presets()}  # the name without its maker
         alike = [one for one, of_type in types.items() if of_type and of_type in capture.sensor.casefold()]
         hint = f"its type may be {' or '.join(alike)}" if alike else ""
         raise InputError("--sensor", "", found, f"one of {', '.join(presets())}, or the path of a .toml file", hint)

@@ -144,7 +144,7 @@ class CouponFit:
                 "residual_rms_dn": self.rms_dn,
                 "residual_rms_in_noise": self.rms_in_noise,
                 "unknowns_finish": None if self.posterior is None else {self.posterior.name: self.posterior.entries()},
-                "dots": [asdict(one) for one in self.dots],
+                "dots": [asdict(dot) for dot in self.dots],
                 "views": [_view_numbers(residual) for residual in fit.residuals],
             }
         )

@@ -89,12 +89,14 @@ def combined(values: Sequence[float], uncertainties: Sequence[float]) -> tuple[f
 def pooled(estimates: Sequence[FittedKey]) -> list[FittedKey]:
     """Combine estimates of the same key, in the order in which the keys first occur."""
     out = []
-    for key in dict.fromkeys(one.key for one in estimates):
-        own = [one for one in estimates if one.key == key]
+    for key in dict.fromkeys(estimate.key for estimate in estimates):
+        own = [estimate for estimate in estimates if estimate.key == key]
         first = own[0]
-        if len(own) > 1 and all(one.uncertainty > 0 for one in own):
-            middle, spread = combined([scaled(one.value, first.scale) for one in own], [one.uncertainty for one in own])
-            names = tuple(name for one in own for name in one.captures)
+        if len(own) > 1 and all(fitted_key.uncertainty > 0 for fitted_key in own):
+            middle, spread = combined(
+                [scaled(fitted_key.value, first.scale) for fitted_key in own], [one.uncertainty for one in own]
+            )
+            names = tuple(name for fitted_key in own for name in fitted_key.captures)
             first = replace(first, value=unscaled(middle, first.scale), uncertainty=spread, captures=names)
         out.append(first)
     return out

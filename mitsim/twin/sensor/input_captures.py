@@ -106,13 +106,13 @@ def repeats(input_captures: Sequence[InputCapture]) -> list[list[InputCapture]]:
     return groups
 
 
-def _same_light(one: InputCapture, other: InputCapture) -> bool:
+def _same_light(capture: InputCapture, other: InputCapture) -> bool:
     """Return whether the first images of two captures differ by noise alone."""
-    if one.image.shape != other.image.shape or one.capture.bits != other.capture.bits:
+    if capture.image.shape != other.image.shape or capture.capture.bits != other.capture.bits:
         return False
-    if one.capture.decoding.exposure_s != other.capture.decoding.exposure_s:
+    if capture.capture.decoding.exposure_s != other.capture.decoding.exposure_s:
         return False
-    off = one.image.astype(float) - other.image.astype(float)
+    off = capture.image.astype(float) - other.image.astype(float)
     noise = float(np.abs(finest_detail(off)).mean()) * np.sqrt(np.pi / 2)
     smooth = float(np.sqrt(np.mean(uniform_filter(off, _MEAN_PX) ** 2)))
     return bool(smooth < _FACTOR * noise / _MEAN_PX + _ROUNDING_DN)

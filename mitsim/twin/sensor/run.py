@@ -208,7 +208,7 @@ def _combined_estimates(
             method = "figures of the dots over the field"
             estimates.append(FittedKey(parameter.key, value, spread, parameter.unit, (name,), method, parameter.scale))
         parameters |= {parameter.key: parameter for parameter in (*fit.parameters, *fit.undetermined)}
-    known = {one.key for one in estimates}
+    known = {estimate.key for estimate in estimates}
     undetermined += [
         Undetermined(p.key, p.read(base), p.determined_by) for p in parameters.values() if p.key not in known
     ]

@@ -122,12 +122,12 @@ class SpecimenSimulator:
         lit, gain = self._kept[key]
         return lit, gain
 
-    def _of(self, one: Sensor) -> SimulatedSensor:
+    def _of(self, sensor: Sensor) -> SimulatedSensor:
         """Return the simulated sensor; its rays are cached, and only the pattern is new."""
         if self._device is None:
-            self._device = SimulatedSensor(one)
+            self._device = SimulatedSensor(sensor)
             return self._device
         other = copy.copy(self._device)
-        other.sensor = one
-        other.patterns = ProjectedPatterns(one.patterns(), one.projector)
+        other.sensor = sensor
+        other.patterns = ProjectedPatterns(sensor.patterns(), sensor.projector)
         return other

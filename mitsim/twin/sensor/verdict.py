@@ -77,7 +77,7 @@ def verdict_of(agreements: tuple[DotAgreement, ...]) -> Verdict:
     """Return the verdict of a fit: that of the capture which agrees least."""
     if not agreements:
         return Verdict("not tested", "no capture shows dots, so nothing tests the fitted numbers against an image")
-    worst = max(agreements, key=lambda one: (("good", "fair", "bad").index(one.word), one.reduced))
+    worst = max(agreements, key=lambda agreement: (("good", "fair", "bad").index(agreement.word), agreement.reduced))
     numbers = f"chi-square {worst.chi_square:.1f} of {worst.freedom} for {worst.capture}"
     most = f"{worst.feature} by {percent(math.expm1(worst.misfit))}"
     why = {

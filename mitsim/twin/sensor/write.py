@@ -63,30 +63,35 @@ def write_sensor(fit: SensorFit, sensor: str | Path, output: Path) -> None:
 def fit_table(fit: SensorFit) -> str:
     """Return a Markdown table of the estimates and the undetermined numbers."""
     lines = ["| number | value | 95 % interval | unit | captures | how |", "| --- | --- | --- | --- | --- | --- |"]
-    for one in fit.estimates:
-        low, high = one.interval()
+    for estimate in fit.estimates:
+        low, high = estimate.interval()
         lines.append(
-            f"| {one.key} | {one.value:.4g} | {low:.4g} to {high:.4g} | {one.unit} | "
-            f"{', '.join(one.captures)} | {one.method} |"
+            f"| {estimate.key} | {estimate.value:.4g} | {low:.4g} to {high:.4g} | {estimate.unit} | "
+            f"{', '.join(estimate.captures)} | {estimate.method} |"
         )
     if fit.undetermined:
         lines += ["", "| not determined, kept | value | a capture that would determine it |", "| --- | --- | --- |"]
-        lines += [f"| {one.key} | {one.value:.4g} | {one.determined_by} |" for one in fit.undetermined]
+        lines += [
+            f"| {undetermined.key} | {undetermined.value:.4g} | {undetermined.determined_by} |"
+            for undetermined in fit.undetermined
+        ]
     return "\n".join(lines) + "\n"
 
 
 def _entries(fit: SensorFit) -> dict[str, Entry]:
     entries: dict[str, Entry] = {}
     arrays: dict[str, dict[int, FittedKey]] = {}
-    for one in fit.estimates:
-        match = _ARRAY.match(one.key)
-        if one.key == "imager.companding_dn":
+    for estimate in fit.estimates:
+        match = _ARRAY.match(estimate.key)
+        if estimate.key == "imager.companding_dn":
             knees = ", ".join(numbers(knee, 6) for knee in fit.sensor.imager.companding)
-            entries[one.key] = Entry(f"[{knees}]", _comment(one) + "; unknown beyond the brightest level seen")
+            entries[estimate.key] = Entry(
+                f"[{knees}]", _comment(estimate) + "; unknown beyond the brightest level seen"
+            )
         elif match:
-            arrays.setdefault(match[1], {})[int(match[2])] = one
+            arrays.setdefault(match[1], {})[int(match[2])] = estimate
         else:
-            entries[one.key] = Entry(number(one.value), _comment(one))
+            entries[estimate.key] = Entry(number(estimate.value), _comment(estimate))
     for key, parts in arrays.items():
         count, limit = (3, 200.0) if key == "room.curvature" else (2, 20.0)
         values = [parts[index].value if index in parts else 0.0 for index in range(count)]
@@ -100,16 +105,16 @@ def _entries(fit: SensorFit) -> dict[str, Entry]:
     if "misalignment.row_mrad" in entries:
         row, roll = (next(e for e in fit.estimates if e.key == f"misalignment.{key}_mrad") for key in ("row", "roll"))
         comment = "rotation of one unit's second camera off its calibration, assumed for the next unit too"
-        for key, one in (("row", row), ("roll", roll)):
-            size = float(np.hypot(one.value, one.uncertainty))
+        for key, fitted_key in (("row", row), ("roll", roll)):
+            size = float(np.hypot(fitted_key.value, fitted_key.uncertainty))
             entries[f"unknowns.calibration.{key}_mrad"] = Entry(number(size), comment)
     return entries
 
 
-def _comment(one: FittedKey) -> str:
-    low, high = one.interval()
-    found = f"fitted: {one.value:.4g} {one.unit}, 95 % interval {low:.4g} to {high:.4g}"
-    return f"{found}; {one.method}; {', '.join(one.captures)}"
+def _comment(key: FittedKey) -> str:
+    low, high = key.interval()
+    found = f"fitted: {key.value:.4g} {key.unit}, 95 % interval {low:.4g} to {high:.4g}"
+    return f"{found}; {key.method}; {', '.join(key.captures)}"
 
 
 @dataclass(frozen=True)
@@ -255,7 +260,7 @@ def _replaced(lines: list[str], index: int, new: str) -> list[str]:
     """Return the lines in place of the value that begins in a line: it stays as a comment."""
     end = _end_of_value(lines, index)
     if end > index:  # an array over several lines
-        return [*(f"# before: {one.strip()}" for one in lines[index : end + 1]), new]
+        return [*(f"# before: {line.strip()}" for line in lines[index : end + 1]), new]
     match = _KEY.match(lines[index])
     before, remark = _value_and_remark(match[3] if match else "")
     return [f"{new}  # before: {before}" + f"; {remark}" * bool(remark)]
