@@ -159,9 +159,8 @@ def form_modes(surface: Plane | Cylinder, points: Array, rays: Array | None) -> 
     _, jacobian, _ = surface.linearised(np.zeros(surface.parameter_count), points, rays)
     at = surface.meet(points, rays)
     u, v = (_scaled(coordinate) for coordinate in _coordinates(surface, at.foot))
-    products = legvander(u, DEGREE)[:, :, None] * legvander(v, DEGREE)[:, None, :]
     first, second = np.nonzero(np.add.outer(np.arange(DEGREE + 1), np.arange(DEGREE + 1)) <= DEGREE)
-    smooth = products[:, first, second] / at.slope[:, None]
+    smooth = legvander(u, DEGREE)[:, first] * legvander(v, DEGREE)[:, second] / at.slope[:, None]
     if len(points) <= jacobian.shape[1] + smooth.shape[1]:
         needed = jacobian.shape[1] + smooth.shape[1] + 1
         raise FitError(f"{len(points)} points, the form of a {surface.kind} needs at least {needed}")

@@ -54,7 +54,7 @@ class _Selected:
 def _fits(
     cloud: PointCloud, task: Task, sensor_from_part: ArrayLike, selected: Mapping[str, _Selected]
 ) -> dict[str, Fit | FitError]:
-    """Fit every feature of a task once: shapes to their selected points, then the figures in their planes.
+    """Fit every measured feature of a task once: shapes to their selected points, then the figures in their planes.
 
     A feature that cannot be fitted has a :class:`FitError` in place of a fit. Derived features have none.
     """
@@ -65,8 +65,9 @@ def _fits(
             fits[name] = _credible_fit(_points(one), surface, one.places, cloud.grid.origin)
         except FitError as error:
             fits[name] = error
+    measured = task.measured
     for name, feature in task.features.items():
-        if feature.shaped or feature.kind in DERIVED:
+        if feature.shaped or feature.kind in DERIVED or name not in measured:
             continue
         (parent,) = feature.of or ("",)
         plane, nominal = fits[parent], task.nominal(name, sensor_from_part)
@@ -90,9 +91,9 @@ def _credible_fit(points: Array, nominal: Surface, places: Array, viewpoint: Arr
 
 
 def _selected(cloud: PointCloud, task: Task, sensor_from_part: ArrayLike, minimum_points: int) -> dict[str, _Selected]:
-    """Return the points of every shape [mm], sensor frame: those with its label that can lie on it."""
-    selected = {}
-    for name in task.shapes:
+    """Return the points of every measured shape [mm], sensor frame: those with its label that can lie on it."""
+    selected, measured = {}, task.measured
+    for name in (shape for shape in task.shapes if shape in measured):
         if name not in cloud.feature_names:
             known = list(cloud.feature_names)
             labels = f"labels of the cloud: {', '.join(known) or 'there are none'}"
@@ -124,11 +125,11 @@ def measure(
 ) -> dict[str, Result]:
     """Evaluate all measurements of a task in one labelled cloud, seen from the origin of its grid.
 
-    Each feature is fitted once. Shapes are fitted to their points in the labelled cloud, without points too far from
-    the nominal surface (:func:`characterisation.features.fits.belonging`); circles and points of edges to the places
-    where the points of their plane end (:mod:`characterisation.features.edges`). A measurement has no value if a shape
-    has fewer than ``minimum_points`` points, or less than a quarter of the recovered points near it, or if a fit is not
-    credible (:mod:`characterisation.features.credibility`).
+    Each measured feature is fitted once. Shapes are fitted to their points in the labelled cloud, without those too far
+    from the nominal surface (:func:`characterisation.features.fits.belonging`); circles and points of edges to the
+    places where the points of their plane end (:mod:`characterisation.features.edges`). A measurement has no value if a
+    shape has fewer than ``minimum_points`` points, or less than a quarter of the recovered points near it, or if a fit
+    is not credible (:mod:`characterisation.features.credibility`).
 
     Parameters
     ----------
@@ -193,7 +194,9 @@ def measure_points(
     measure : a single organised cloud
     """
     fits: dict[str, Fit | FitError] = {}
-    given = {name: np.asarray(points.get(name, np.empty((0, 3))), float) for name in task.shapes}
+    measured = task.measured
+    shapes = [name for name in task.shapes if name in measured]
+    given = {name: np.asarray(points.get(name, np.empty((0, 3))), float) for name in shapes}
     for name, some in given.items():
         try:
             if len(some) < minimum_points:

@@ -250,6 +250,11 @@ class Task(Document):
         """Return the names of the shapes of the scene that a measurement depends on, each once."""
         return tuple(name for name in self.fitted_for(measurement) if self.features[name].shaped)
 
+    @property
+    def measured(self) -> frozenset[str]:
+        """Return the names of the features that a measurement depends on; a drawing may state many others."""
+        return frozenset(name for measurement in self.measurements for name in self.fitted_for(measurement))
+
     def _fitted_for(self, name: str) -> tuple[str, ...]:
         feature = self.features[name]
         return (feature.of or ()) + (() if feature.kind in DERIVED else (name,))

@@ -16,7 +16,7 @@ deviation, since its statement is about a part at the limit of the tolerance
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,11 +70,15 @@ def measured_with_form(
         Whether the cloud has a form deviation at all.
     """
     names = form_measurements(task) if deviates else []
-    found = evaluate(task, True)
     if not names:
-        return found
-    own = task.model_copy(update={"measurements": {name: task.measurements[name] for name in names}})
-    return found | evaluate(own, False)
+        return evaluate(task, True)
+
+    def part(wanted: Collection[str]) -> Task:
+        return task.model_copy(update={"measurements": {name: task.measurements[name] for name in wanted}})
+
+    others = [name for name in task.measurements if name not in names]
+    found = evaluate(part(names), False) | (evaluate(part(others), True) if others else {})
+    return {name: found[name] for name in task.measurements}
 
 
 def form_deviation(

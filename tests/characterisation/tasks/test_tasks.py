@@ -116,6 +116,25 @@ def test_each_feature_is_fitted_once_for_all_measurements_and_their_counts(monke
     assert apart.points_given == sum(seen.values()) and apart.points > results["pillar1_pillar2_distance"].points
 
 
+def test_features_without_a_measurement_are_not_fitted(monkeypatch):
+    """A drawing has a hundred faces and a dozen dimensions."""
+    fitted, matrix = [], pose(50, 20)
+    task = read_task(TASK)
+    radius = task.model_copy(update={"measurements": {"pillar1_radius": task.measurements["pillar1_radius"]}})
+    cloud = part_cloud(matrix)
+    labels = ("a face of the scene", "pillar1", "another face")
+    without = PointCloud(cloud.points, cloud.status, cloud.grid, "", "", feature=cloud.feature, feature_names=labels)
+
+    def counted(points, surface, viewpoint):
+        fitted.append(surface.kind)
+        return fit_surface(points, surface, viewpoint)
+
+    monkeypatch.setattr(evaluation, "fit_surface", counted)
+    results = measure(without, radius, matrix)
+    assert fitted == ["cylinder"] and list(results) == ["pillar1_radius"]
+    assert results["pillar1_radius"].value == measure(cloud, task, matrix)["pillar1_radius"].value
+
+
 def test_the_standard_uncertainty_is_the_scatter_of_repeated_measurements():
     task, matrix, runs = read_task(TASK), pose(50, 20), 30
     outcomes = [measure(part_cloud(matrix, 0.2, seed), task, matrix) for seed in range(runs)]

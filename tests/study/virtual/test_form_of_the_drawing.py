@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mitsim.study.virtual.form import drawn_form
+from mitsim.study.virtual.form import drawn_form, measured_with_form
 from mitsim.study.virtual.plan import measurements_of
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.stated import budget_groups
@@ -59,3 +59,17 @@ def test_form_moves_other_measurements_of_the_face_but_not_that_of_the_form_itse
     assert world.form and abs(bent.errors["plane_pillar1_angle"] - plane.errors["plane_pillar1_angle"]) > 1e-3
     assert bent.errors["flat"] == plane.errors["flat"]
     assert np.array_equal(bent.deviations["flat"], plane.deviations["flat"], equal_nan=True)
+
+
+def test_a_form_is_measured_once_and_the_rest_with_it(flat) -> None:
+    """Half of the time of a trial of a large plane went to a flatness that was then replaced."""
+    task, asked = flat().task, []
+
+    def evaluate(part, with_form):
+        asked.append((with_form, list(part.measurements)))
+        return dict.fromkeys(part.measurements, with_form)
+
+    found = measured_with_form(task, evaluate, deviates=True)
+    assert list(found) == list(task.measurements)
+    assert [name for name, with_form in found.items() if not with_form] == ["flat"]
+    assert sorted(name for _, names in asked for name in names) == sorted(task.measurements)
