@@ -47,6 +47,10 @@ def share(inside: ArrayLike) -> Share:
     return Share(k, n, low, high if n else 1.0)
 
 
+#: exponent of a factor so large that few trials set no limit; chosen
+NO_LIMIT = 50.0
+
+
 def coverage_interval(errors: Floats, coverage: float = COVERAGE) -> tuple[float, float]:
     """Return the probabilistically symmetric coverage interval of a further trial, from the errors (n,) of trials.
 
@@ -86,7 +90,8 @@ def expanded_interval(errors: Floats, related: NDArray[np.int64] | None = None) 
     exceeding = int(binom.isf(tail, count, 1 - COVERAGE)) + 1
     low = float(np.sort(np.abs(errors))[-min(exceeding, count)])
     moved = float(standard_errors(errors, lambda part: np.array([expanded_uncertainty(part)]), related)[0])
-    high = half * math.exp(min(float(t.ppf(0.975, BLOCKS - 1)) * moved / half, 700.0))
+    exponent = float(t.ppf(0.975, BLOCKS - 1)) * moved / half
+    high = half * math.exp(exponent) if exponent < NO_LIMIT else math.inf
     beyond = int(binom.ppf(tail, count, tail))  # so many or fewer: at least 2.5 %
     if beyond > 0:
         ordered = np.sort(errors)

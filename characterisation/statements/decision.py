@@ -46,6 +46,7 @@ from characterisation.files.arrays import Floats
 from characterisation.statements.coverage import (
     BLOCKS,
     COVERAGE,
+    NO_LIMIT,
     coverage_interval,
     expanded_interval,
     expanded_uncertainty,
@@ -342,5 +343,6 @@ def _demand_interval(
         return np.array([demand(part, tolerance)])
 
     moved = float(standard_errors(np.arange(len(errors), dtype=float), without_block, related)[0])
-    factor = math.exp(min(float(t.ppf(0.975, BLOCKS - 1)) * moved / asked, 700.0))
+    exponent = float(t.ppf(0.975, BLOCKS - 1)) * moved / asked
+    factor = math.exp(exponent) if exponent < NO_LIMIT else math.inf
     return asked / factor, asked * factor

@@ -17,7 +17,8 @@ OFTEN = 0.05
 class Judged:
     """A measurement and its verdict: standard ``uncertainty`` and ``needed`` one, in its unit; NaN if unknown.
 
-    ``fits_corrected`` says whether it would fit with its bias subtracted; ``without_value`` is a share of the trials.
+    ``fits_corrected`` says whether it would fit with its ``bias`` subtracted; ``without_value`` is a share of the
+    trials.
     ``trials`` is the number of virtual measurements: 0 if the verdict is by screening alone, None if it is not known.
     """
 
@@ -29,6 +30,7 @@ class Judged:
     fits_corrected: bool = False
     without_value: float = 0.0
     trials: int | None = None
+    bias: float = math.nan
 
 
 def result_in_words(judged: Sequence[Judged]) -> str:
@@ -43,8 +45,9 @@ def result_in_words(judged: Sequence[Judged]) -> str:
         return ". ".join([text, *filter(None, [losses_in_words(judged)])])
     fitting = [one for one in asked if one.verdict == "fits"]
     rest = sorted((one for one in asked if one.verdict not in ("fits", "not decided")), key=_ratio, reverse=True)
-    lines = [f"fits {len(fitting)} of {len(asked)} tolerances", *(_why(one) for one in rest)]
     unsure = [one for one in asked if one.verdict == "not decided"]
+    undecided = f", {len(unsure)} not decided" if unsure else ""
+    lines = [f"fits {len(fitting)} of {len(asked)} tolerances{undecided}", *(_why(one) for one in rest)]
     if valued := [one.name for one in unsure if math.isfinite(one.uncertainty)]:
         lines.append(f"{', '.join(valued)}: not decided, more virtual measurements are needed")
     if single := [one.name for one in unsure if not math.isfinite(one.uncertainty) and one.without_value < 1]:
@@ -57,6 +60,13 @@ def result_in_words(judged: Sequence[Judged]) -> str:
         if one.without_value >= OFTEN
     ]
     return "; ".join(lines)
+
+
+def shortened(words: str, kept: int) -> str:
+    """Return the first reasons of :func:`result_in_words`, and the number of measurements in those left out."""
+    reasons, mark = words.split("; "), ": not decided"
+    more = sum(1 + reason.split(mark)[0].count(", ") if mark in reason else 1 for reason in reasons[kept:])
+    return "; ".join(reasons[:kept]) + (f"; and {more} more, see the table" if more else "")
 
 
 def losses_in_words(judged: Sequence[Judged]) -> str:
@@ -91,8 +101,13 @@ def _why(judged: Judged) -> str:
         return f"{judged.name} {words}: {by}"
     if judged.fits_corrected:
         return f"{judged.name} {words} unless its bias is subtracted"
+    biased = abs(judged.bias) > 2 * judged.uncertainty
+    bias = f"bias {_two(judged.bias)} {judged.unit} and " if biased else ""
     needed = f", {_two(judged.needed)} {judged.unit} needed" if math.isfinite(judged.needed) else ""
-    return f"{judged.name} {words}: standard uncertainty {_two(judged.uncertainty)} {judged.unit}{needed}"
+    without = " without bias" if biased and needed else ""
+    return (
+        f"{judged.name} {words}: {bias}standard uncertainty {_two(judged.uncertainty)} {judged.unit}{needed}{without}"
+    )
 
 
 def _percent(share: float) -> str:

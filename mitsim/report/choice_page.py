@@ -82,9 +82,7 @@ def _row(choice: ChoiceDocument, entry: SensorEntry) -> dict[str, Any]:
         "name": entry.name,
         "stated": entry.status == "stated",
         "why": entry.why,
-        "fits": f"{entry.fits if entry.status == 'stated' else entry.expected_fits} of {toleranced}"
-        if toleranced
-        else "",
+        "fits": entry.fits_in_words(toleranced) if toleranced else "",
         "possible": entry.possible_in_words,
         "ratio": NONE if entry.ratio is None else two_digits(entry.ratio),
         "capture": NONE if entry.capture is None else f"{rounded(1e3 * entry.capture.seconds)}\N{NO-BREAK SPACE}ms",

@@ -18,7 +18,14 @@ from numpy.typing import ArrayLike
 
 from characterisation.plots.statements import GROUPS
 from characterisation.statements.budget import largest_line
-from characterisation.statements.verdict_words import OFTEN, Judged, fits_all, losses_in_words, result_in_words
+from characterisation.statements.verdict_words import (
+    OFTEN,
+    Judged,
+    fits_all,
+    losses_in_words,
+    result_in_words,
+    shortened,
+)
 from mitsim.report.first_rows import ResultRow, RowValues, measured_words
 from mitsim.report.placement_figure import face_verdicts, placement_figure
 from mitsim.report.pose_texts import pose_of_view, pose_words
@@ -58,9 +65,8 @@ class FirstScreen:
     @property
     def short_words(self) -> str:
         """Return the result with its first reasons only; the table has them all."""
-        reasons = self.words.split("; ")
-        rest = len(reasons) - _MOST_REASONS
-        return "; ".join(reasons[:_MOST_REASONS]) + f"; and {rest} more, see the table" if rest > 1 else self.words
+        reasons = self.words.count("; ") + 1
+        return shortened(self.words, _MOST_REASONS) if reasons > _MOST_REASONS + 1 else self.words
 
     @property
     def tolerances(self) -> bool:
@@ -271,6 +277,7 @@ def _judged(name: str, measurement: StatedMeasurement) -> Judged:
         or_nan(None if decision is None else decision.needed),
         decision is not None and decision.fits_corrected,
         measurement.without_value,
+        bias=or_nan(measurement.bias),
     )
 
 

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 
 from characterisation.files.atomic_io import atomic_write
 from characterisation.plots.style import INK, MUTED, drawing
+from characterisation.statements.verdict_words import shortened
 from mitsim.report.declaration import Declaration, DeclaredRow, read_declaration
 from mitsim.report.first_screen import Tone
 from mitsim.report.placement_figure import draw_placement
@@ -153,10 +154,8 @@ def _head(page: Page, declaration: Declaration) -> None:
 
 def _result(words: str) -> str:
     """Return the result in at most :data:`_RESULT_LINES` lines: the reasons that do not fit are in the table."""
-    reasons = words.split("; ")
-    for kept in range(len(reasons), 0, -1):
-        rest = len(reasons) - kept
-        text = "; ".join(reasons[:kept]) + (f"; and {rest} more, see the table" if rest else "")
+    for kept in range(words.count("; ") + 1, 0, -1):
+        text = shortened(words, kept)
         if len(wrapped(text, _RESULT, ACROSS, "bold")) <= _RESULT_LINES:
             break
     return text

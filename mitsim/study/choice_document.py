@@ -136,6 +136,13 @@ class SensorEntry(PartialDocument):
         cells = self.measurements.values()
         return sum(cell.verdict != "no tolerance" and cell.demand is not None and cell.demand <= 1 for cell in cells)
 
+    def fits_in_words(self, toleranced: int) -> str:
+        """Return how many of the tolerances fit, or are expected to, and how many of a measured sensor are open."""
+        if self.status != "stated":
+            return f"{self.expected_fits} of {toleranced}"
+        open_ones = sum(cell.verdict == "not decided" for cell in self.measurements.values())
+        return f"{self.fits} of {toleranced}" + (f", {open_ones} open" if open_ones else "")
+
     @property
     def fits_all(self) -> bool:
         """Return whether all measurements are possible, and every tolerance is decided to fit."""

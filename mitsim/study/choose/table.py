@@ -201,7 +201,7 @@ def _fits(sensor_entry: SensorEntry, toleranced: int) -> str:
     if not toleranced:
         return "-"
     known = sensor_entry.status == "stated"
-    return f"{sensor_entry.fits} of {toleranced}" if known else f"({sensor_entry.expected_fits} of {toleranced})"
+    return sensor_entry.fits_in_words(toleranced) if known else f"({sensor_entry.expected_fits} of {toleranced})"
 
 
 def _cell(cell: CellEntry, measurement: ComparedMeasurement) -> str:

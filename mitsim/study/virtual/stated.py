@@ -283,6 +283,7 @@ def judged(stated: Sequence[Statement]) -> list[Judged]:
             math.nan if one.decided is None else one.decided.needed,
             one.decided is not None and one.decided.fits_corrected,
             one.without_value,
+            bias=one.bias,
         )
         for one in stated
     ]

@@ -3,7 +3,7 @@
 import math
 from dataclasses import replace
 
-from characterisation.statements.verdict_words import Judged, fits_all, result_in_words
+from characterisation.statements.verdict_words import Judged, fits_all, result_in_words, shortened
 
 
 def test_what_fits_is_counted_and_the_worst_is_named_first():
@@ -15,7 +15,7 @@ def test_what_fits_is_counted_and_the_worst_is_named_first():
         Judged("note", "mm", "no tolerance", 0.02, math.nan),
     ]
     assert result_in_words(judged) == (
-        "fits 1 of 4 tolerances; seat_radius is undecidable: standard uncertainty 0.12 mm, 0.030 mm "
+        "fits 1 of 4 tolerances, 1 not decided; seat_radius is undecidable: standard uncertainty 0.12 mm, 0.030 mm "
         "needed; angle does not fit: standard uncertainty 0.20 deg, 0.10 deg needed; width: not decided, more virtual "
         "measurements are needed"
     )
@@ -32,10 +32,26 @@ def test_a_bias_that_is_all_and_values_that_are_missing_are_told():
     assert "c fits, but has no value in 13 % of the virtual measurements" in words
 
 
+def test_a_bias_beyond_the_uncertainty_is_named():
+    """A flatness of 0.2 mm whose noise alone reads 0.38 mm: the uncertainty is not what is missing."""
+    flat = Judged("top", "mm", "undecidable", 0.028, 0.025, bias=0.378)
+    assert result_in_words([flat]).endswith(
+        "top is undecidable: bias 0.38 mm and standard uncertainty 0.028 mm, 0.025 mm needed without bias"
+    )
+    assert "bias" not in result_in_words([replace(flat, bias=0.05)])
+
+
+def test_measurements_left_out_of_a_summary_are_counted_one_by_one():
+    many = [Judged(name, "mm", "not decided", math.nan, math.nan, without_value=1.0) for name in "abcdefghijk"]
+    words = result_in_words([Judged("top", "mm", "does not fit", 0.2, 0.1), *many])
+    assert shortened(words, 2).endswith("0.10 mm needed; and 11 more, see the table")
+    assert shortened(words, 3) == words
+
+
 def test_a_single_value_is_not_told_as_none():
     single = Judged("b", "mm", "not decided", math.nan, math.nan, without_value=0.5, trials=2)
     assert result_in_words([single]) == (
-        "fits 0 of 1 tolerances; b: not decided, a single virtual measurement gave a value"
+        "fits 0 of 1 tolerances, 1 not decided; b: not decided, a single virtual measurement gave a value"
     )
 
 
