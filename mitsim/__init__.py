@@ -43,6 +43,7 @@ _NAMES = {
     "read_capture": "mitsim.decoding.captures",
     "read_cloud": "mitsim.decoding.captures",
     "read_task": "characterisation.tasks.task_reading",
+    "read_truth": "mitsim.capture.simulated.truth",
     "render": "mitsim.decoding.captures",
     "run_study": "mitsim.study.run",
     "score": "mitsim.study.session",
@@ -63,7 +64,7 @@ if TYPE_CHECKING:
     from characterisation.tasks.task_file import Task
     from characterisation.tasks.task_reading import read_task
     from mitsim.capture.capture import Capture
-    from mitsim.capture.simulated.truth import Truth
+    from mitsim.capture.simulated.truth import Truth, read_truth
     from mitsim.decoding.captures import (
         decode,
         load_scene,
@@ -118,6 +119,7 @@ __all__ = [
     "read_capture",
     "read_cloud",
     "read_task",
+    "read_truth",
     "render",
     "run_study",
     "score",

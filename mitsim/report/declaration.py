@@ -194,8 +194,9 @@ def _of_statement(document: StatementDocument, exposures: str) -> list[tuple[str
     trials = max((measurement.trials for measurement in document.measurements.values()), default=0)
     how = "rendered and decoded" if document.measured_by == "render" else "drawn from a performance map"
     exposed = exposed_in_words(document.exposure)
+    made = f"{count(trials)} virtual measurement{'' if trials == 1 else 's'}"
     return [
-        ("Method", f"{count(trials)} virtual measurements, {how}: a virtual experiment, “simulate and analyse”"),
+        ("Method", f"{made}, {how}: a virtual experiment, “simulate and analyse”"),
         ("Calibration", document.calibration.split("; drift:")[0]),
         ("Exposure", exposed or exposures),
         ("Verified by", VERIFIED),

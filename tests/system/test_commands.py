@@ -13,7 +13,7 @@ import pytest
 from characterisation.cloud_files import read_cloud
 from characterisation.files.atomic_io import HOST
 from mitsim.capture.folder import read_capture
-from mitsim.capture.simulated.truth import read_exr
+from mitsim.capture.simulated.truth import read_truth
 from mitsim.running.progress import be_quiet, say, say_progress, track
 from tests.shell import ROOT, mitsim, mitsim_here
 from tests.smaller_sensors import coarse_sensor
@@ -96,8 +96,8 @@ def test_render_decode_and_back(tmp_path):
         3,
         "--truth",
     )
-    known = read_exr(tmp_path / "capture/truth/right.exr")
-    assert 400 < np.nanmedian(known["Z"]) < 600
+    known = read_truth(tmp_path / "capture")["right"]
+    assert 400 < np.nanmedian(known.depth) < 600
     capture = read_capture(tmp_path / "capture")
     assert capture.source == "simulated"
     assert capture.images["left"].shape == (1, 480, 752)

@@ -17,6 +17,7 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
+from characterisation.files.errors import InputError
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.projector_light import ProjectedPatterns
@@ -24,6 +25,9 @@ from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.raycast import PixelRays, cast
 from mitsim.sensor.transforms import Transform
+
+#: folder of the true images in a capture folder
+FOLDER = "truth"
 
 
 @dataclass(frozen=True)
@@ -184,7 +188,60 @@ def encode_exr(truth: Truth) -> bytes:
         return file.read_bytes()
 
 
-def read_exr(path: str | Path) -> dict[str, NDArray[np.float32]]:
-    """Return the channels of a ground-truth image by name, (H, W) float32 each."""
-    with OpenEXR.File(str(path), separate_channels=True) as file:
-        return {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+def read_truth(path: str | Path) -> dict[str, Truth]:
+    """Read the ground truth of a capture folder, written by ``mitsim render --truth``.
+
+    Parameters
+    ----------
+    path
+        The folder.
+
+    Returns
+    -------
+    dict of Truth
+        By camera.
+
+    Raises
+    ------
+    InputError
+        If the folder has no truth, or a file of it cannot be read.
+
+    See Also
+    --------
+    read_capture : the images
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> truth = ms.read_truth("capture")["left"]  # doctest: +SKIP
+    >>> truth.depth[truth.lit].mean()  # doctest: +SKIP
+    """
+    files = sorted(Path(path, FOLDER).glob("*.exr"))
+    if not files:
+        hint = "render it again with --truth, or with truth=True"
+        raise InputError(path, FOLDER, "no true images", f"a capture folder with {FOLDER}/CAMERA.exr", hint)
+    return {file.stem: _read_exr(file) for file in files}
+
+
+def _read_exr(file: Path) -> Truth:
+    try:
+        with OpenEXR.File(str(file), separate_channels=True) as image:
+            names = tuple(str(image.header()["features"]).split("\n"))
+            known = {name: np.array(channel.pixels, np.float32) for name, channel in image.channels().items()}
+        feature = known["feature"].astype(np.int16)
+        if feature.max(initial=-1) >= len(names):
+            raise InputError(file, "feature", int(feature.max()), f"-1 to {len(names) - 1}, a line of `features`")
+        return Truth(
+            known["distance"],
+            known["Z"],
+            np.stack([known["normal.X"], known["normal.Y"], known["normal.Z"]], axis=-1),
+            feature,
+            names,
+            np.stack([known["projector.U"], known["projector.V"]], axis=-1),
+            known["lit"] > 0,
+            known["indirect"],
+        )
+    except KeyError as error:
+        raise InputError(file, "", f"no {error}", "a true image of mitsim render --truth") from None
+    except RuntimeError as error:
+        raise InputError(file, "", str(error), "a whole OpenEXR image") from None

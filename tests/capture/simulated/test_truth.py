@@ -5,13 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import OpenEXR
 import pytest
 from scipy.ndimage import binary_erosion
 
 import mitsim as ms
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.capture.simulated.truth import encode_exr, read_exr, true_image
+from mitsim.capture.simulated.truth import encode_exr, read_truth, true_image
 from mitsim.decoding.matching.stereo import stereo_geometry
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
@@ -99,16 +101,27 @@ def test_indirect_light_is_none_on_top_and_most_below(ball):
 
 
 def test_the_image_keeps_every_channel(ball, tmp_path):
-    file = tmp_path / "truth.exr"
-    file.write_bytes(encode_exr(ball))
-    channels = read_exr(file)
-    assert np.array_equal(channels["Z"], ball.depth, equal_nan=True)
-    assert np.array_equal(channels["projector.V"], ball.projector[..., 1], equal_nan=True)
-    assert np.array_equal(channels["normal.X"], ball.normal[..., 0])
-    assert np.array_equal(channels["feature"], ball.feature)
-    assert np.array_equal(channels["lit"], ball.lit)
-    assert np.array_equal(channels["indirect"], ball.indirect, equal_nan=True)
-    assert len(channels) == 10
+    (tmp_path / "truth").mkdir()
+    (tmp_path / "truth" / "left.exr").write_bytes(encode_exr(ball))
+    again = read_truth(tmp_path)
+    assert list(again) == ["left"] and again["left"].feature_names == ball.feature_names
+    for name in ("distance", "depth", "normal", "feature", "projector", "lit", "indirect"):
+        kept, known = getattr(again["left"], name), getattr(ball, name)
+        assert kept.dtype == known.dtype and np.array_equal(kept, known, equal_nan=True), name
+
+
+def test_a_folder_without_truth_and_damaged_files_are_told(ball, tmp_path):
+    with pytest.raises(InputError, match=r"truth: found no true images.*--truth"):
+        read_truth(tmp_path)
+    (tmp_path / "truth").mkdir()
+    file = tmp_path / "truth" / "left.exr"
+    for data in (b"", b"not an image", encode_exr(ball)[:400]):
+        file.write_bytes(data)
+        with pytest.raises(InputError, match=r"left\.exr"):
+            read_truth(tmp_path)
+    OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Z": np.zeros((2, 2), np.float32)}).write(str(file))
+    with pytest.raises(InputError, match="no 'features'"):
+        read_truth(tmp_path)
 
 
 def test_truth_is_of_the_camera_as_it_is_and_not_as_it_was_calibrated(n10):
