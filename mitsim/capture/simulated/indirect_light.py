@@ -12,7 +12,8 @@ The filter suits light that two rough surfaces have scattered. It would blur sha
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -42,12 +43,22 @@ class KeptSettings:
     - ``photons``: for each of them.
     - ``kept``: paths that are evaluated for every finish.
     - ``smoothing_px``: standard deviation of the filter [px].
+    - ``most_pixels``: of more pixels, each has fewer paths, at least one; None for no limit.
     """
 
     samples: int
     photons: float
     kept: int
     smoothing_px: float
+    most_pixels: int | None = None
+
+    def for_pixels(self, count: int) -> KeptSettings:
+        """Return the settings for a number of pixels that see the part."""
+        if self.most_pixels is None or count <= self.most_pixels:
+            return self
+        share = self.most_pixels / count
+        samples, kept = math.isqrt(int(share * self.samples)) ** 2, round(share * self.kept)
+        return replace(self, samples=max(1, samples), kept=max(1, kept))
 
 
 @dataclass(frozen=True)

@@ -94,8 +94,8 @@ def keep_light(
     --------
     can_be_kept : whether it makes sense for a scene
     """
-    bsdfs, settings = distinct_bsdfs(scene), rendering.kept
-    assert settings is not None
+    bsdfs = distinct_bsdfs(scene)
+    assert rendering.kept is not None
     assert bsdfs is not None  # can_be_kept
     described = {
         shape.bsdf().id(): finish.description
@@ -110,6 +110,7 @@ def keep_light(
         shape = shapes_met(scene, simulated.pixel_rays(camera).within(roi), world_from_sensor)
         # a pixel at the edge of the part may see it although its centre does not
         pixels = np.flatnonzero(binary_dilation(shape >= 0, np.ones((3, 3))))
+        settings = rendering.kept.for_pixels(len(pixels))
         photons = int(np.ceil(np.sqrt(settings.photons * settings.samples * len(pixels)))) ** 2
         own = int(np.random.SeedSequence([seed, index]).generate_state(1)[0])
         tracing = Tracing(settings.samples, photons, rendering.depth, own, drawn, sampled, turned)

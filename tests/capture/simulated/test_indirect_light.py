@@ -1,5 +1,6 @@
 """Light by way of other surfaces, smoothed over the pixels of one shape."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 
 from characterisation.region_of_interest import Roi
 from mitsim.capture.simulated import simulate
-from mitsim.capture.simulated.indirect_light import IndirectLight, smoothed
+from mitsim.capture.simulated.indirect_light import IndirectLight, KeptSettings, smoothed
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.scene.backend import mi
@@ -98,3 +99,16 @@ def test_a_flat_coupon_is_not_traced_and_two_of_them_do_not_light_each_other(mon
     assert not two.any()
     assert one.dtype == two.dtype
     np.testing.assert_array_equal(one, two)
+
+
+def test_a_part_of_many_pixels_has_about_as_many_paths_as_one_of_few():
+    settings = KeptSettings(16, 4.0, 8, 2.5, most_pixels=400_000)
+    assert settings.for_pixels(400_000) == settings
+    for count in (500_000, 1_600_000, 5_000_000):
+        fewer = settings.for_pixels(count)
+        assert (
+            1 <= fewer.samples * count <= max(16 * 400_000, count) and math.isqrt(fewer.samples) ** 2 == fewer.samples
+        )
+        assert fewer.kept >= 1 and fewer.smoothing_px == 2.5
+    assert settings.for_pixels(1_600_000) == replace(settings, samples=4, kept=2)
+    assert replace(settings, most_pixels=None).for_pixels(5_000_000).samples == 16
