@@ -255,6 +255,12 @@ class Task(Document):
         """Return the names of the features that a measurement depends on; a drawing may state many others."""
         return frozenset(name for measurement in self.measurements for name in self.fitted_for(measurement))
 
+    def with_measured_features(self) -> Task:
+        """Return the task without the features on which no measurement depends."""
+        named = {name for measurement in self.measurements.values() for name in measurement.features}
+        kept = {name: feature for name, feature in self.features.items() if name in self.measured | named}
+        return self.model_copy(update={"features": kept})
+
     def _fitted_for(self, name: str) -> tuple[str, ...]:
         feature = self.features[name]
         return (feature.of or ()) + (() if feature.kind in DERIVED else (name,))

@@ -147,6 +147,7 @@ def open_study(
     )
     check_features(task, folder / file.task, scene.names)
     check_nominal_values(task, folder / file.task)
+    task = task.with_measured_features()  # a drawing has a hundred faces and a dozen dimensions
     file = _with_limits(path, file, task)
     radius = float(np.linalg.norm(scene.bounds[1] - scene.bounds[0])) / 2
     standoffs = chosen_standoffs(path, file.views, sensor, radius)

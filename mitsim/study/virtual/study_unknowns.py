@@ -50,14 +50,14 @@ def study_unknowns(study: Study, varied: tuple[str, ...] = GROUPS) -> Unknowns:
     Raises
     ------
     InputError
-        If a file is missing or belongs to another sensor, if a feature with a form deviation is not in the task, or
-        if a measured finish is not in the scene.
+        If a file is missing or belongs to another sensor, if a feature with a form deviation is not in the scene, or
+        if a measured finish is not.
     """
     table, sensor = study.unknowns, study.sensor
     for name in table.form.features:
-        if name not in study.task.shapes:
-            allowed = ", ".join(study.task.shapes)
-            raise InputError(study.path, f"unknowns.form.features.{name}", "no shape of the task", allowed)
+        if name not in study.scene.names:
+            allowed = ", ".join(study.scene.names)
+            raise InputError(study.path, f"unknowns.form.features.{name}", "no shape of the scene", allowed)
     table = table.model_copy(update={"form": FormUnknowns(features=drawn_form(study.task, table.form.features))})
     finishes = sorted({shape.bsdf().id() for shape in study.scene.shapes})
     for name in table.finish.measured:

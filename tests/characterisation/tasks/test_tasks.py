@@ -130,6 +130,7 @@ def test_features_without_a_measurement_are_not_fitted(monkeypatch):
         return fit_surface(points, surface, viewpoint)
 
     monkeypatch.setattr(evaluation, "fit_surface", counted)
+    assert radius.with_measured_features().shapes == ("pillar1",)
     results = measure(without, radius, matrix)
     assert fitted == ["cylinder"] and list(results) == ["pillar1_radius"]
     assert results["pillar1_radius"].value == measure(cloud, task, matrix)["pillar1_radius"].value
