@@ -48,7 +48,7 @@ def share(inside: ArrayLike) -> Share:
 
 
 #: exponent of a factor so large that few trials set no limit; chosen
-NO_LIMIT = 50.0
+_NO_LIMIT = 50.0
 
 
 def coverage_interval(errors: Floats, coverage: float = COVERAGE) -> tuple[float, float]:
@@ -90,13 +90,22 @@ def expanded_interval(errors: Floats, related: NDArray[np.int64] | None = None) 
     exceeding = int(binom.isf(tail, count, 1 - COVERAGE)) + 1
     low = float(np.sort(np.abs(errors))[-min(exceeding, count)])
     moved = float(standard_errors(errors, lambda part: np.array([expanded_uncertainty(part)]), related)[0])
-    exponent = float(t.ppf(0.975, BLOCKS - 1)) * moved / half
-    high = half * math.exp(exponent) if exponent < NO_LIMIT else math.inf
+    high = half * factor_of_limits(moved / half)
     beyond = int(binom.ppf(tail, count, tail))  # so many or fewer: at least 2.5 %
     if beyond > 0:
         ordered = np.sort(errors)
         high = max(high, abs(float(ordered[beyond - 1])), abs(float(ordered[-beyond])))
     return min(low, half), high
+
+
+def factor_of_limits(relative_error: float) -> float:
+    """Return the factor between a positive number and its 95 % limits, from its relative standard error.
+
+    The error is that of :func:`standard_errors`, so the logarithm is distributed as t. Infinite where few trials set no
+    limit.
+    """
+    exponent = float(t.ppf(0.975, BLOCKS - 1)) * relative_error
+    return math.exp(exponent) if exponent < _NO_LIMIT else math.inf
 
 
 def errors_of_ends(errors: Floats) -> tuple[float, float]:

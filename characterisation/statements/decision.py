@@ -40,16 +40,15 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
-from scipy.stats import norm, t
+from scipy.stats import norm
 
 from characterisation.files.arrays import Floats
 from characterisation.statements.coverage import (
-    BLOCKS,
     COVERAGE,
-    NO_LIMIT,
     coverage_interval,
     expanded_interval,
     expanded_uncertainty,
+    factor_of_limits,
     share,
     standard_errors,
 )
@@ -343,6 +342,5 @@ def _demand_interval(
         return np.array([demand(part, tolerance)])
 
     moved = float(standard_errors(np.arange(len(errors), dtype=float), without_block, related)[0])
-    exponent = float(t.ppf(0.975, BLOCKS - 1)) * moved / asked
-    factor = math.exp(exponent) if exponent < NO_LIMIT else math.inf
+    factor = factor_of_limits(moved / asked)
     return asked / factor, asked * factor

@@ -54,7 +54,7 @@ class _Selected:
 def _fits(
     cloud: PointCloud, task: Task, sensor_from_part: ArrayLike, selected: Mapping[str, _Selected]
 ) -> dict[str, Fit | FitError]:
-    """Fit every measured feature of a task once: shapes to their selected points, then the figures in their planes.
+    """Fit every feature of a task once: shapes to their selected points, then the figures in their planes.
 
     A feature that cannot be fitted has a :class:`FitError` in place of a fit. Derived features have none.
     """
@@ -65,9 +65,8 @@ def _fits(
             fits[name] = _credible_fit(_points(one), surface, one.places, cloud.grid.origin)
         except FitError as error:
             fits[name] = error
-    measured = task.measured
     for name, feature in task.features.items():
-        if feature.shaped or feature.kind in DERIVED or name not in measured:
+        if feature.shaped or feature.kind in DERIVED:
             continue
         (parent,) = feature.of or ("",)
         plane, nominal = fits[parent], task.nominal(name, sensor_from_part)
@@ -91,9 +90,9 @@ def _credible_fit(points: Array, nominal: Surface, places: Array, viewpoint: Arr
 
 
 def _selected(cloud: PointCloud, task: Task, sensor_from_part: ArrayLike, minimum_points: int) -> dict[str, _Selected]:
-    """Return the points of every measured shape [mm], sensor frame: those with its label that can lie on it."""
-    selected, measured = {}, task.measured
-    for name in (shape for shape in task.shapes if shape in measured):
+    """Return the points of every shape [mm], sensor frame: those with its label that can lie on it."""
+    selected = {}
+    for name in task.shapes:
         if name not in cloud.feature_names:
             known = list(cloud.feature_names)
             labels = f"labels of the cloud: {', '.join(known) or 'there are none'}"
@@ -153,7 +152,7 @@ def measure(
     --------
     measure_points : points of several views
     """
-    motion = np.asarray(sensor_from_part, float)
+    task, motion = task.with_measured_features(), np.asarray(sensor_from_part, float)
     selected = _selected(cloud, task, motion, minimum_points)
     fits = _fits(cloud, task, motion, selected)
     known: dict[InputQuantity, Estimate | FitError] = {
@@ -194,9 +193,8 @@ def measure_points(
     measure : a single organised cloud
     """
     fits: dict[str, Fit | FitError] = {}
-    measured = task.measured
-    shapes = [name for name in task.shapes if name in measured]
-    given = {name: np.asarray(points.get(name, np.empty((0, 3))), float) for name in shapes}
+    task = task.with_measured_features()
+    given = {name: np.asarray(points.get(name, np.empty((0, 3))), float) for name in task.shapes}
     for name, some in given.items():
         try:
             if len(some) < minimum_points:

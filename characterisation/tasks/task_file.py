@@ -250,15 +250,11 @@ class Task(Document):
         """Return the names of the shapes of the scene that a measurement depends on, each once."""
         return tuple(name for name in self.fitted_for(measurement) if self.features[name].shaped)
 
-    @property
-    def measured(self) -> frozenset[str]:
-        """Return the names of the features that a measurement depends on; a drawing may state many others."""
-        return frozenset(name for measurement in self.measurements for name in self.fitted_for(measurement))
-
     def with_measured_features(self) -> Task:
-        """Return the task without the features on which no measurement depends."""
+        """Return the task without the features on which no measurement depends; a drawing may state many."""
         named = {name for measurement in self.measurements.values() for name in measurement.features}
-        kept = {name: feature for name, feature in self.features.items() if name in self.measured | named}
+        fitted = {name for measurement in self.measurements for name in self.fitted_for(measurement)}
+        kept = {name: feature for name, feature in self.features.items() if name in named | fitted}
         return self.model_copy(update={"features": kept})
 
     def _fitted_for(self, name: str) -> tuple[str, ...]:
