@@ -102,7 +102,7 @@ def exposure_policy(
         return ExposurePolicy(
             f"fixed at {rule.exposure_s:g} s{several}", rule.exposure_s, None, rule.bracket, rule.limits_s
         )
-    radiance = rule.reflectance / np.pi * projector.plane_irradiance / rule.distance_mm**2
+    radiance = projector.plate_radiance(rule.reflectance, rule.distance_mm)
     wanted = rule.level * imager.full_well
     rate = float(radiance * electrons_per_radiance(imager, wavelength_nm, 1.0))  # of tiny factors it may be 0
     exposure = math.inf if rate == 0 else float(wanted / rate)

@@ -50,6 +50,10 @@ class Projector:
         optics = self.optics
         return float(self.flux * optics.matrix[0, 0] * optics.matrix[1, 1] / (optics.width * optics.height))
 
+    def plate_radiance(self, reflectance: float, distance_mm: float) -> float:
+        """Return the radiance [W / (mm^2 sr)] of a matt plate across the axis, in an all-white frame."""
+        return float(reflectance / np.pi * self.plane_irradiance / distance_mm**2)
+
     def emit(self, pattern: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return the light that a pattern of values 0..1, shape (..., H, W), emits relative to white."""
         values = np.asarray(pattern, np.float32)

@@ -89,8 +89,8 @@ def exposures_in_room(
     """
     by_radiance = sensor.electrons() * exposures_s[0] / sensor.imager.full_well
     control = sensor.exposure.control
-    dark = _WHITE / np.pi * sensor.projector.plane_irradiance / distance_mm**2 * by_radiance
-    dark = control.level if control is not None else dark
+    plate = sensor.projector.plate_radiance(_WHITE, distance_mm)
+    dark = plate * by_radiance if control is None else control.level
     both = dark + _WHITE / np.pi * irradiance * by_radiance
     factor = min(1.0, max(FULLEST, dark) / both)
     return tuple(factor * seconds for seconds in exposures_s)

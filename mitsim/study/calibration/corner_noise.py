@@ -127,7 +127,7 @@ def board_level(sensor: Sensor, distance_mm: float) -> float:
     control, policy = sensor.exposure.control, sensor.exposure
     if isinstance(control, AutomaticExposure):
         return min(control.level, 0.9)
-    radiance = WHITE / np.pi * sensor.projector.plane_irradiance / distance_mm**2
+    radiance = sensor.projector.plate_radiance(WHITE, distance_mm)
     assert policy.base_s is not None
     level = radiance * sensor.electrons() * policy.base_s / sensor.imager.full_well
     middle = float(np.sqrt(np.prod(sensor.working_range_mm)))
