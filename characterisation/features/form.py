@@ -55,6 +55,9 @@ NODES = 7
 #: share (49,) of the points that each node stands for, in any unit: a node at the edge stands for half a cell
 NODE_SHARES = np.kron(np.r_[0.5, np.ones(NODES - 2), 0.5], np.r_[0.5, np.ones(NODES - 2), 0.5])
 
+#: points whose extent has shrunk by less than this share have the same modes to rounding
+SAME_EXTENT = 0.01
+
 #: modes are excluded if less than this share of them remains after projection off the changes of the surface
 LEAST_SHARE = 0.01
 
@@ -156,22 +159,81 @@ def form_modes(surface: Plane | Cylinder, points: Array, rays: Array | None) -> 
     FitError
         If there are too few points.
     """
-    _, jacobian, _ = surface.linearised(np.zeros(surface.parameter_count), points, rays)
-    at = surface.meet(points, rays)
-    u, v = (_scaled(coordinate) for coordinate in _coordinates(surface, at.foot))
-    first, second = np.nonzero(np.add.outer(np.arange(DEGREE + 1), np.arange(DEGREE + 1)) <= DEGREE)
-    smooth = legvander(u, DEGREE)[:, first] * legvander(v, DEGREE)[:, second] / at.slope[:, None]
-    if len(points) <= jacobian.shape[1] + smooth.shape[1]:
-        needed = jacobian.shape[1] + smooth.shape[1] + 1
-        raise FitError(f"{len(points)} points, the form of a {surface.kind} needs at least {needed}")
-    rigid, _ = np.linalg.qr(jacobian / np.linalg.norm(jacobian, axis=0))
-    smooth /= np.linalg.norm(smooth, axis=0)
-    for _ in range(2):  # the second pass removes rounding errors
-        smooth = smooth - rigid @ (rigid.T @ smooth)
-    squares, mixed = np.linalg.eigh(smooth.T @ smooth)
-    kept = squares > LEAST_SHARE**2
-    modes: Array = smooth @ (mixed[:, kept] / np.sqrt(squares[kept]))
+    rows, rigid = _rows(surface, _Points.of(surface, points, rays))
+    modes: Array = (_combined(rows @ rows.T, rigid).T @ rows).T
     return modes
+
+
+@dataclass(frozen=True)
+class _Points:
+    """Points (n, 3) [mm] and their ``rays`` (n, 3), with where these meet a surface.
+
+    ``coordinates`` are (2, n) on the surface, by :func:`_coordinates`; residual and slope (n,) those of
+    :class:`~characterisation.features.surfaces.Meeting`.
+    """
+
+    points: Array
+    rays: Array | None
+    residual: Array
+    slope: Array
+    coordinates: Array
+
+    @classmethod
+    def of(cls, surface: Plane | Cylinder, points: Array, rays: Array | None) -> _Points:
+        """Return points (n, 3) with rays (n, 3) that meet a surface."""
+        at = surface.meet(points, rays)
+        return cls(points, rays, at.residual, at.slope, np.array(_coordinates(surface, at.foot)))
+
+    def among(self, some: NDArray[np.bool_]) -> _Points:
+        """Return the chosen points."""
+        rays = None if self.rays is None else self.rays[some]
+        return _Points(self.points[some], rays, self.residual[some], self.slope[some], self.coordinates[:, some])
+
+    def are_wider(self, some: NDArray[np.bool_]) -> bool:
+        """Return whether the points extend farther than some of them."""
+        extent, less = (np.ptp(places, axis=1) for places in (self.coordinates, self.coordinates[:, some]))
+        return bool((less < (1 - SAME_EXTENT) * extent).any())
+
+
+def _rows(surface: Plane | Cylinder, at: _Points) -> tuple[Array, int]:
+    """Return deviations (k, n) along the rays: those of small changes of a surface, then smooth ones.
+
+    The number of the former comes second. They are orthonormal, and the smooth ones have norm 1.
+    """
+    _check_count(surface, len(at.points))
+    _, jacobian, _ = surface.linearised(np.zeros(surface.parameter_count), at.points, at.rays)
+    along_u, along_v = (np.ascontiguousarray(legvander(_scaled(places), DEGREE).T) for places in at.coordinates)
+    rigid, _ = np.linalg.qr(jacobian / np.linalg.norm(jacobian, axis=0))
+    first, second = np.nonzero(np.add.outer(np.arange(DEGREE + 1), np.arange(DEGREE + 1)) <= DEGREE)
+    rows = np.empty((rigid.shape[1] + len(first), len(at.points)))
+    rows[: rigid.shape[1]] = rigid.T
+    for row, i, j in zip(rows[rigid.shape[1] :], first, second, strict=True):
+        np.multiply(along_u[i], along_v[j], out=row)
+        row /= at.slope
+        row /= np.linalg.norm(row)
+    return rows, rigid.shape[1]
+
+
+def _combined(products: Array, rigid: int) -> Array:
+    """Return the combinations (k, m) of rows that are orthonormal modes, of which no rigid row is a part.
+
+    ``products`` (k, k) are the scalar products of the rows over the points; the first ``rigid`` rows are those of small
+    changes of the surface. So modes over fewer points need no other rows.
+    """
+    projected = np.linalg.lstsq(products[:rigid, :rigid], products[:rigid, rigid:], rcond=None)[0]
+    scale = np.sqrt(np.diag(products)[rigid:])
+    left = (products[rigid:, rigid:] - products[rigid:, :rigid] @ projected) / np.outer(scale, scale)
+    squares, mixed = np.linalg.eigh(left)
+    kept = squares > LEAST_SHARE**2
+    smooth = mixed[:, kept] / np.sqrt(squares[kept]) / scale[:, None]
+    return np.concatenate([-projected @ smooth, smooth])
+
+
+def _check_count(surface: Plane | Cylinder, count: int) -> None:
+    """Raise FitError if points are too few for the form of a surface."""
+    needed = surface.parameter_count + (DEGREE + 1) * (DEGREE + 2) // 2 + 1
+    if count < needed:
+        raise FitError(f"{count} points, the form of a {surface.kind} needs at least {needed}")
 
 
 def fit_form(points: ArrayLike, surface: Plane | Cylinder, viewpoint: ArrayLike | None = None) -> Form:
@@ -195,37 +257,38 @@ def fit_form(points: ArrayLike, surface: Plane | Cylinder, viewpoint: ArrayLike 
     """
     points = usable(points, surface.kind, surface.parameter_count)
     rays = rays_from(viewpoint, points)
-    at = surface.meet(points, rays)
-    facing = np.abs(at.cosine) > GRAZING_COSINE
+    facing = np.abs(surface.meet(points, rays).cosine) > GRAZING_COSINE
     if facing.sum() <= surface.parameter_count:
         raise FitError(f"only {facing.sum()} of {len(points)} points are not seen at grazing incidence")
-    kept, deviation = facing, at.residual
+    among = _Points.of(surface, points[facing], None if rays is None else rays[facing])
+    near, rows = np.ones(len(among.points), bool), np.empty((0, 0))
     for _ in range(CHOICES):
-        chosen = np.flatnonzero(kept)
-        modes = form_modes(surface, points[chosen], None if rays is None else rays[chosen])
-        coefficients = modes.T @ at.residual[chosen]
-        deviation = at.residual[chosen] - modes @ coefficients
-        limit = CLIP * robust_std(deviation)
-        near = kept.copy()
-        near[chosen] = np.abs(deviation) <= limit
-        if np.array_equal(near, kept):
+        if not rows.size or among.are_wider(near):
+            among, near = among.among(near), np.ones(int(near.sum()), bool)
+            rows, rigid = _rows(surface, among)
+            products, right = rows @ rows.T, rows @ among.residual
+        chosen, gone = near, rows[:, ~near]
+        _check_count(surface, int(chosen.sum()))
+        combined = _combined(products - gone @ gone.T, rigid)
+        coefficients = combined.T @ (right - gone @ among.residual[~chosen])
+        deviation = among.residual - (combined @ coefficients) @ rows
+        near = chosen & (np.abs(deviation) <= CLIP * robust_std(deviation[chosen]))
+        if np.array_equal(near, chosen):
             break
-        kept = near
-    freedom = len(chosen) - surface.parameter_count - modes.shape[1]
-    variance = float(deviation @ deviation) / freedom
-    square, noise = float(coefficients @ coefficients), variance * modes.shape[1]
-    slope = at.slope[chosen]
-    heights = slope * (modes @ coefficients)
-    coefficients = coefficients * np.sqrt(max(0.0, 1.0 - noise / max(square, np.finfo(float).tiny)))
+    deviation, slope = deviation[chosen], among.slope[chosen]
+    modes = slope[:, None] * (combined.T @ rows[:, chosen]).T
+    count = modes.shape[1]
+    variance = float(deviation @ deviation) / (len(deviation) - surface.parameter_count - count)
+    square, noise = float(coefficients @ coefficients), variance * count
     return Form(
-        modes * at.slope[chosen, None],
-        coefficients,
-        variance * np.eye(modes.shape[1]),
+        modes,
+        coefficients * np.sqrt(max(0.0, 1.0 - noise / max(square, np.finfo(float).tiny))),
+        variance * np.eye(count),
         float(np.sqrt(variance)),
-        len(chosen),
-        np.column_stack([_scaled(coordinate) for coordinate in _coordinates(surface, at.foot[chosen])]),
-        heights,
-        float(np.sqrt(noise / len(chosen) * np.mean(slope**2))),
+        len(deviation),
+        np.column_stack([_scaled(places) for places in among.coordinates[:, chosen]]),
+        modes @ coefficients,
+        float(np.sqrt(noise / len(deviation) * np.mean(slope**2))),
     )
 
 

@@ -1,18 +1,18 @@
 """How noisy the interreflections of a view are, over the sensor's noise, and what smoothing them leaves.
 
-python tests/benchmarks/kept_paths.py [--sensors NAME ...] [--view N]
+python tests/benchmarks/kept_paths.py [--sensors NAME ...] [--view N] [--study STUDY] [--most-pixels N]
 
-Two pillars of `scenes/two_pillars/study.toml`, the best estimate and three drawn finishes. *noise*: from two seeds, of
-which 68.3 % of the lit pixels have less; *rendered* anew for one finish, and on the *kept* paths of the view. *bias* of
-the smoothing: root of the mean over 25 x 25 px of the product of two seeds' differences between smoothed and plain
-images, median and 68.3 % quantile over the part. All in standard deviations of the temporal noise of the sensor.
+Two pillars of `scenes/two_pillars/study.toml`, or another study, the best estimate and three drawn finishes. *noise*:
+from two seeds, of which 68.3 % of the lit pixels have less; *rendered* anew for one finish, and on the *kept* paths of
+the view. *bias* of the smoothing: root of the mean over 25 x 25 px of the product of two seeds' differences between
+smoothed and plain images, median and 68.3 % quantile over the part. All in standard deviations of the temporal noise of
+the sensor.
 """
 
 from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -28,32 +28,34 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sensors", nargs="+", default=["ensenso-n10", "david-sls-3"])
     parser.add_argument("--view", type=int, default=99)
+    parser.add_argument("--study", type=Path, default=STUDY)
+    parser.add_argument("--most-pixels", type=int, help="of which more have fewer paths; by default that of studies")
     given = parser.parse_args()
     backend.activate(None)
     for name in given.sensors:
-        for row in rows(name, given.view):
+        for row in rows(given.study, name, given.view, given.most_pixels):
             print(row, flush=True)
 
 
-def rows(name: str, number: int):
+def rows(path: Path, name: str, number: int, most_pixels: int | None):
     """Yield the rows of one sensor."""
     from characterisation.files.documents import read_toml
     from mitsim.capture.simulated.kept_light import keep_light
     from mitsim.capture.simulated.render_residual import temporal_noise
     from mitsim.scene.light_transport.light_paths import LightPaths
-    from mitsim.scene.light_transport.plain_scene import distinct_bsdfs
     from mitsim.scene.light_transport.transport import trace
     from mitsim.study import StudyFile, open_study
     from mitsim.study.virtual.plan import measurements_of
     from mitsim.study.virtual.study_unknowns import study_unknowns
-    from mitsim.study.virtual.world import Trial, finish_deviation
+    from mitsim.study.virtual.world import Trial
 
-    study = open_study(STUDY, read_toml(STUDY, StudyFile).model_copy(update={"sensor": name}))
+    study = open_study(path, read_toml(path, StudyFile).model_copy(update={"sensor": name}))
     maker = measurements_of(study, study_unknowns(study))
     simulated, sensor, view = maker.simulated, study.sensor, study.view(number, "--view")
     pose, rois, rendering = view.world_from_sensor, maker._view_light(view).rois, maker.rendering
-    drawn = [partial(finish_deviation, maker.unknowns, k) for k in (-1, 101, 102, 103, 104)]
-    finishes = [distinct_bsdfs(maker.part.deviated(one)) for one in drawn]
+    if most_pixels is not None:
+        rendering = replace(rendering, kept=replace(rendering.kept, most_pixels=most_pixels))
+    finishes = [maker.part.bsdfs(number) for number in (-1, 101, 102, 103, 104)]
     plain = replace(rendering, kept=replace(rendering.kept, smoothing_px=0.0))
     kept, unsmoothed = (
         [keep_light(simulated, study.scene, pose, rois, how, finishes, seed) for seed in (1, 2)]
@@ -62,7 +64,7 @@ def rows(name: str, number: int):
     electrons = sensor.electrons()
     for day in (None, 0, 1, 2):
         finish = -1 if day is None else maker.unknowns.draw(Trial(day)).finish
-        scene = maker.part.deviated(partial(finish_deviation, maker.unknowns, finish))
+        scene, _ = maker.part.in_finish(finish)
         for camera, roi in rois.items():
             some = np.unique(np.linspace(0, simulated.patterns.count - 1, 4).astype(int))
             on_paths = [one[camera].images(scene, simulated)[some] * electrons for one in kept]

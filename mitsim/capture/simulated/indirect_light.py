@@ -43,7 +43,8 @@ class KeptSettings:
     - ``photons``: for each of them.
     - ``kept``: paths that are evaluated for every finish.
     - ``smoothing_px``: standard deviation of the filter [px].
-    - ``most_pixels``: of more pixels, each has fewer paths, at least one; None for no limit.
+    - ``most_pixels``: of more pixels, each has fewer paths, at least one, and the filter is as much wider: the light
+      has the same noise, and is as sharp relative to the part. None for no limit.
     """
 
     samples: int
@@ -58,7 +59,8 @@ class KeptSettings:
             return self
         share = self.most_pixels / count
         samples, kept = math.isqrt(int(share * self.samples)) ** 2, round(share * self.kept)
-        return replace(self, samples=max(1, samples), kept=max(1, kept))
+        smoothing_px = self.smoothing_px / math.sqrt(share)
+        return replace(self, samples=max(1, samples), kept=max(1, kept), smoothing_px=smoothing_px)
 
 
 @dataclass(frozen=True)

@@ -39,12 +39,16 @@ _NO_PART_OF_A_TRIAL: Any = {"decision": True, "measurements": {"__all__": {"deci
 #: standard deviation of the smoothing of interreflections [px], see mitsim/capture/simulated/indirect_light.py
 _SMOOTHING_PX = 1.5
 
+#: pixels that see the part, of which more have fewer paths each and a wider filter: a part that fills an image of two
+#: million took 22 s to trace with all paths. The two pillars in a Zivid's image are 0.2 million
+_MOST_PIXELS = 400_000
+
 #: paths of interreflections that all trials of a view share, for matchers, whose images are few and coarse. Render
 #: noise 0.14 to 0.21 of the sensor's (N10) on the two pillars: tests/benchmarks/kept_paths.py
-_KEPT_MATCHER = KeptSettings(49, 4.0, 40, 1.5)
+_KEPT_MATCHER = KeptSettings(49, 4.0, 40, 1.5, _MOST_PIXELS)
 
 #: the same for fringes and time of flight. Render noise 0.24 to 0.35 of the sensor's (David), by the same benchmark
-_KEPT = KeptSettings(16, 4.0, 8, 2.5)
+_KEPT = KeptSettings(16, 4.0, 8, 2.5, _MOST_PIXELS)
 
 #: rays per pixel of direct light for fringes. Root mean square error 0.03 (PhoXi), 0.09 (David) and 0.08 (Zivid) of the
 #: sensor's noise, but for the hundredth of the pixels at edges: tests/benchmarks/direct_samples.py
@@ -60,10 +64,6 @@ _SAMPLES = 16
 #: their root mean square, and the smallest, of the angle between pillars with fringes, by 0.3 to 0.8; the root mean
 #: square of 12 trials is 0.7 to 1.46 of that with all paths, median 1.0: tests/benchmarks/race_paths.py
 _FEWER_IN_RACE = 4
-
-#: pixels that see the part, of which more have fewer paths each in the race: a part that fills an image of two million
-#: took 22 s to trace with all paths. The two pillars in a Zivid's image are 0.2 million
-_MOST_PIXELS_IN_RACE = 400_000
 
 
 def rendering_of(study: Study) -> Rendering:
@@ -93,7 +93,7 @@ def race_rendering(study: Study) -> Rendering:
     kept = rendering.kept
     assert kept is not None  # of every study
     side = math.isqrt(kept.samples // _FEWER_IN_RACE)  # of the square of samples in a pixel
-    fewer = replace(kept, samples=side**2, kept=kept.kept // _FEWER_IN_RACE, most_pixels=_MOST_PIXELS_IN_RACE)
+    fewer = replace(kept, samples=side**2, kept=kept.kept // _FEWER_IN_RACE)
     return replace(rendering, kept=fewer)
 
 

@@ -11,6 +11,9 @@ machine. Workers read the study's scene, task and sensor at the same paths.
 from __future__ import annotations
 
 import copy
+import statistics
+import time
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -27,6 +30,12 @@ from mitsim.study.virtual.world import Unknowns
 
 #: largest number of jobs in one order; a worker that dies loses at most these, and some workers wait for as many
 _IN_A_ROW = 4
+
+#: time of an order that slow trials may take [s]: two orders of each worker can end after a time limit; chosen
+_ORDER_S = 6.0
+
+#: number of orders whose time tells that of the next
+_REMEMBERED = 20
 
 
 @dataclass(frozen=True)
@@ -53,6 +62,7 @@ class SpreadMeasurements:
 
     def __init__(self, workers: Executor, renderer: RenderedMeasurements, digest: str) -> None:
         self.workers, self.renderer = workers, renderer
+        self._seconds: deque[float] = deque(maxlen=_REMEMBERED)  # of a trial in the last orders
         path = str(Path(renderer.study.path).absolute())
         self._order = TrialOrder(
             path, renderer.study.file, renderer.unknowns, renderer.separate_light, digest, (), renderer.rendering
@@ -77,15 +87,20 @@ class SpreadMeasurements:
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, Outcome]]:
         """Yield the outcome of every virtual measurement, job by job as they arrive."""
         orders = [replace(self._order, jobs=some) for some in self._rows(jobs)]
-        for order, results in self.workers.distribute(orders, lambda trial_order: trial_order, make_trials, _light_of):
-            yield from zip(order.jobs, results, strict=True)
+        made = self.workers.distribute(orders, lambda trial_order: trial_order, timed_trials, _light_of)
+        for order, (outcomes, seconds) in made:
+            self._seconds.append(seconds)
+            yield from zip(order.jobs, outcomes, strict=True)
 
     def _rows(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, ...]]:
-        """Yield runs of jobs of one view, at most :data:`_IN_A_ROW` each."""
+        """Yield runs of jobs of one view, each of at most :data:`_IN_A_ROW` or, of slow trials, :data:`_ORDER_S`."""
+        longest = _IN_A_ROW
+        if self._seconds:
+            longest = max(1, min(longest, int(_ORDER_S / max(statistics.median(self._seconds), 1e-3))))
         for _, some in groupby(jobs, key=lambda job: job.view.number):
             row = tuple(some)
-            for first in range(0, len(row), _IN_A_ROW):
-                yield row[first : first + _IN_A_ROW]
+            for first in range(0, len(row), longest):
+                yield row[first : first + longest]
 
 
 def _light_of(order: TrialOrder) -> tuple[tuple[str, Rendering], int]:
@@ -95,6 +110,13 @@ def _light_of(order: TrialOrder) -> tuple[tuple[str, Rendering], int]:
 
 #: digest of a study, and its measurements with the light paths of the last order
 _prepared: dict[str, RenderedMeasurements] = {}
+
+
+def timed_trials(order: TrialOrder) -> tuple[list[Outcome], float]:
+    """Make the trials of an order, and return the time [s] of each as well; workers call this function."""
+    began = time.monotonic()
+    outcomes = make_trials(order)
+    return outcomes, (time.monotonic() - began) / len(order.jobs)
 
 
 def make_trials(order: TrialOrder) -> list[Outcome]:

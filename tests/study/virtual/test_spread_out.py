@@ -57,3 +57,22 @@ def test_the_race_has_fewer_paths_and_trials_of_its_own(study, tmp_path, monkeyp
     assert len(spread_out._prepared) == 1
     assert session.race_trials.digest != session.trials.digest
     assert session.race_trials.folder != session.trials.folder
+
+
+def test_orders_of_slow_trials_are_short(study, tmp_path, monkeypatch):
+    session = Session(study, tmp_path)
+    sizes, seconds = [], [0.1]
+
+    class Workers:
+        def distribute(self, orders, _order, _make, _prepared):
+            sizes.append([len(order.jobs) for order in orders])
+            return ((order, ([None] * len(order.jobs), seconds[0])) for order in orders)
+
+    spread = SpreadMeasurements(Workers(), session.renderer, session.digest)
+    jobs = [Job(study.views[1], Trial(day)) for day in range(8)]
+    for each in (0.1, 2.9, 40.0):
+        seconds[0] = each
+        for _ in range(spread_out._REMEMBERED):
+            assert [job for job, _ in spread.run(jobs)] == jobs
+    assert sizes[0] == [4, 4] and sizes[-1] == [1] * 8
+    assert [2] * 4 in sizes
