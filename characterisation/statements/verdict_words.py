@@ -6,11 +6,15 @@ Signal chain: verdict, standard uncertainty and needed uncertainty of every meas
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 #: least share of trials without a value that is mentioned
 OFTEN = 0.05
+
+#: number of measurements that a reason names if it is that of more
+NAMED = 3
 
 
 @dataclass(frozen=True)
@@ -47,13 +51,13 @@ def result_in_words(judged: Sequence[Judged]) -> str:
     rest = sorted((one for one in asked if one.verdict not in ("fits", "not decided")), key=_ratio, reverse=True)
     unsure = [one for one in asked if one.verdict == "not decided"]
     undecided = f", {len(unsure)} not decided" if unsure else ""
-    lines = [f"fits {len(fitting)} of {len(asked)} tolerances{undecided}", *(_why(one) for one in rest)]
+    lines = [f"fits {len(fitting)} of {len(asked)} tolerances{undecided}", *_reasons(rest)]
     if valued := [one.name for one in unsure if math.isfinite(one.uncertainty)]:
-        lines.append(f"{', '.join(valued)}: not decided, more virtual measurements are needed")
+        lines.append(f"{named(valued)}: not decided, more virtual measurements are needed")
     if single := [one.name for one in unsure if not math.isfinite(one.uncertainty) and one.without_value < 1]:
-        lines.append(f"{', '.join(single)}: not decided, a single virtual measurement gave a value")
+        lines.append(f"{named(single)}: not decided, a single virtual measurement gave a value")
     if none := [one.name for one in unsure if one.without_value == 1]:
-        lines.append(f"{', '.join(none)}: not decided, no value in the few virtual measurements")
+        lines.append(f"{named(none)}: not decided, no value in the few virtual measurements")
     lines += [
         f"{one.name} fits, but has no value in {_percent(one.without_value)} of the virtual measurements"
         for one in fitting
@@ -64,9 +68,22 @@ def result_in_words(judged: Sequence[Judged]) -> str:
 
 def shortened(words: str, kept: int) -> str:
     """Return the first reasons of :func:`result_in_words`, and the number of measurements in those left out."""
-    reasons, mark = words.split("; "), ": not decided"
-    more = sum(1 + reason.split(mark)[0].count(", ") if mark in reason else 1 for reason in reasons[kept:])
+    reasons = words.split("; ")
+    more = sum(map(_measurements, reasons[kept:]))
     return "; ".join(reasons[:kept]) + (f"; and {more} more, see the table" if more else "")
+
+
+def named(names: Sequence[str]) -> str:
+    """Return the names of measurements: all of up to :data:`NAMED` + 1, else the first and the number of the others."""
+    shown = list(names) if len(names) <= NAMED + 1 else list(names[:NAMED])
+    return ", ".join(shown) + (f" and {len(names) - len(shown)} more" if len(shown) < len(names) else "")
+
+
+def _measurements(reason: str) -> int:
+    """Return the number of measurements that a reason names."""
+    names = re.split(": not decided| are undecidable| do not fit", reason, maxsplit=1)
+    more = re.search(r" and (\d+) more$", names[0])
+    return 1 + (names[0].count(", ") if len(names) > 1 else 0) + (int(more[1]) if more else 0)
 
 
 def losses_in_words(judged: Sequence[Judged]) -> str:
@@ -94,11 +111,24 @@ def _ratio(judged: Judged) -> float:
     return math.inf if math.isnan(ratio) else ratio
 
 
+def _reasons(rest: Sequence[Judged]) -> list[str]:
+    """Return why measurements do not fit, in their order; those without a value for the same reason in one line."""
+    lost: dict[tuple[str, str], list[str]] = {}
+    for one in rest:
+        if not math.isfinite(one.uncertainty):
+            by = "by screening, no view can make" if one.trials == 0 else "no virtual measurement gave a value"
+            lost.setdefault((one.verdict, by), []).append(one.name)
+    lines = list[str]()
+    for (verdict, by), names in lost.items():
+        verb = "is" if len(names) == 1 else "are"
+        words = f"{verb} undecidable" if verdict == "undecidable" else f"do{'es' * (len(names) == 1)} not fit"
+        them = (" it" if len(names) == 1 else " them") if by.endswith("make") else ""
+        lines.append(f"{named(names)} {words}: {by}{them}")
+    return lines + [_why(one) for one in rest if math.isfinite(one.uncertainty)]
+
+
 def _why(judged: Judged) -> str:
     words = "is undecidable" if judged.verdict == "undecidable" else "does not fit"
-    if not math.isfinite(judged.uncertainty):
-        by = "by screening, no view can make it" if judged.trials == 0 else "no virtual measurement gave a value"
-        return f"{judged.name} {words}: {by}"
     if judged.fits_corrected:
         return f"{judged.name} {words} unless its bias is subtracted"
     biased = abs(judged.bias) > 2 * judged.uncertainty

@@ -37,6 +37,7 @@ from mitsim.study.remedies.entries import remedies_in_words
 from mitsim.study.run_folder import Run
 from mitsim.study.scene_geometry import SceneGeometry
 from mitsim.study.statement_file import StatedMeasurement, StatementDocument
+from mitsim.views.view_scores import apart_in_words
 
 #: good: every tolerance fits; plain: there are no tolerances; warn: values are missing, or a verdict is open; bad: a
 #: tolerance does not fit, or a set of views exceeds a limit
@@ -130,7 +131,7 @@ def of_run(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
         verdicts,
         max((measurement.trials for measurement in document.measurements.values()), default=0),
         tuple(with_degree_signs(line) for line in remedies_in_words(run.about.remedies)),
-        tuple(document.doubts()),
+        (*document.doubts(), *filter(None, [_apart(run)])),
     )
 
 
@@ -170,6 +171,12 @@ def _without_statement(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
         about.race_trials,
         doubts=(f"Standard uncertainties are expected by the performance map and {made}, and include the bias",),
     )
+
+
+def _apart(run: Run) -> str:
+    """Return that no single view can make all measurements, if that is so and no set of views is asked for."""
+    apart = "" if run.about.view_sets else apart_in_words(run.scores)
+    return apart and f"By the map, {apart}. The table [set] of a study finds the fewest views that measure together"
 
 
 def _caption(run: Run, view: int) -> str:

@@ -17,8 +17,6 @@ from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.samples import Samples
 from characterisation.maps.shipped import map_path, shipped_maps
-from characterisation.statements.decision import needed
-from characterisation.statements.tolerance import tolerance_of
 from characterisation.tasks.task_file import Task
 from characterisation.tasks.task_reading import check_features, check_nominal_values, read_task
 from mitsim.maps.campaign.missing_finishes import (
@@ -39,7 +37,7 @@ from mitsim.scene.surface.lay import lays_in_words
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
-from mitsim.study.screened_errors import screened_errors
+from mitsim.study.screened_errors import needed_by_tolerance
 from mitsim.study.tables import ExposureTable, StudyFile
 from mitsim.views import Candidates, View, candidate_views
 from mitsim.views.standoffs import characterised_range, chosen_standoffs
@@ -235,10 +233,7 @@ def _with_limits(path: str | Path, file: StudyFile, task: Task) -> StudyFile:
             raise InputError(path, f"set.limits.{name}", "no such measurement", ", ".join(task.measurements))
     if file.set.limits:
         return file
-    tolerances = {name: tolerance_of(task, name) for name in task.measurements}
-    limits = {
-        name: needed(screened_errors(1.0), tolerance) for name, tolerance in tolerances.items() if tolerance is not None
-    }
+    limits = needed_by_tolerance(task)
     if not limits:
         allowed = "a limit for at least one measurement, or a tolerance in the task"
         raise InputError(path, "set.limits", "none, and no tolerance in the task", allowed)

@@ -164,8 +164,8 @@ def run_within(
     chosen = tried[-1].chosen if tried else chosen
     clock.lap("confirm")
     pictured = limit.part(1.0, plan.page(limit) if whole is not None else 0.0)
-    drawn = sorted({*leaders, *(() if pictured.over() else _best(scores)), *(chosen.views if chosen else ())})
-    draw_clouds(session, performance_map, drawn)
+    first = dict.fromkeys([*leaders, *(chosen.views if chosen else ()), *_best(scores)])
+    drawn = sorted(draw_clouds(session, performance_map, list(first), pictured))
     shown = leaders[: study.file.check.views] if twin is not None else []
     if twin is not None:
         began = time.monotonic()

@@ -18,6 +18,7 @@ from characterisation.files.atomic_io import write_json
 from characterisation.maps.performance_map import PerformanceMap
 from mitsim.maps.prediction import performance
 from mitsim.running.progress import track
+from mitsim.running.time_limit import TimeLimit
 from mitsim.running.version import __version__
 from mitsim.scene.surface.lay import lay_left_out
 from mitsim.study import finishes_of_features
@@ -32,10 +33,15 @@ from mitsim.views.view_scores import not_scored_in_words
 RUNNERS_UP = 5
 
 
-def draw_clouds(session: Session, performance_map: PerformanceMap, numbers: list[int]) -> None:
-    """Write a predicted cloud of each of some views."""
-    study, predictor = session.study, session.predictor
+def draw_clouds(
+    session: Session, performance_map: PerformanceMap, numbers: list[int], limit: TimeLimit | None = None
+) -> list[int]:
+    """Write a predicted cloud of each of some views, of the first one in any case; return those within a limit."""
+    study, predictor, drawn = session.study, session.predictor, list[int]()
     for number in track(numbers, "predict clouds"):
+        if drawn and limit is not None and limit.over():
+            break
+        drawn.append(number)
         pose = study.view(number).world_from_sensor
         surfaces = predictor.surfaces(study.scene, pose)
         labels, ideal = predictor.labels(study.scene, pose, surfaces), predictor.ideal(surfaces)
@@ -43,6 +49,7 @@ def draw_clouds(session: Session, performance_map: PerformanceMap, numbers: list
         rng = np.random.default_rng([study.file.seed, number])
         cloud = predictor.draw(study.scene, ideal, labels, fraction, sigma, rng)
         write_cloud(cloud, session.folder / "clouds" / f"predicted_{number:04d}.ply")
+    return drawn
 
 
 def _runners_up(session: Session, raced: Raced) -> list[dict[str, Any]]:

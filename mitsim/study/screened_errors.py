@@ -10,6 +10,8 @@ import numpy as np
 from scipy.stats import norm
 
 from characterisation.files.arrays import Floats
+from characterisation.statements.decision import needed
+from characterisation.statements.tolerance import tolerance_of
 from characterisation.tasks.folded import folded_values
 from characterisation.tasks.task_file import Task
 
@@ -24,6 +26,14 @@ def stated_shares(task: Task) -> Floats:
     """
     folded = folded_values(task)
     return np.array([folded[name].far_share() if name in folded else 1.0 for name in task.measurements])
+
+
+def needed_by_tolerance(task: Task) -> dict[str, float]:
+    """Return the largest standard uncertainty that fits, by measurement with a tolerance: of normal errors, no bias."""
+    tolerances = {name: tolerance_of(task, name) for name in task.measurements}
+    return {
+        name: needed(screened_errors(1.0), tolerance) for name, tolerance in tolerances.items() if tolerance is not None
+    }
 
 
 def screened_errors(u: float) -> Floats:

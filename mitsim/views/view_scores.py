@@ -23,6 +23,7 @@ from characterisation.features.robust_fit import FitError
 from characterisation.files.arrays import Floats
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.scores.view_score import rank_views, score_views, view_statistics
+from characterisation.statements.verdict_words import named
 from characterisation.tasks.covariance import LEAST_CHANCE, ExpectedPoints
 from characterisation.tasks.measurement_model import InputQuantity
 from characterisation.tasks.prediction import (
@@ -214,6 +215,22 @@ def not_scored_in_words(scores: xr.Dataset) -> str:
     """Return how many views were scored within a limit of time; empty if all were."""
     scored, views = int(scores.attrs.get("views_scored", scores.sizes["view"])), scores.sizes["view"]
     return f"only {scored} of {views} views screened, for lack of time" if scored < views else ""
+
+
+def apart_in_words(scores: xr.Dataset) -> str:
+    """Return which view can make the most measurements, if none can make all; empty otherwise, and for a single one."""
+    possible = scores["uncertainty_possible"].values
+    if len(possible) < 2 or possible.all(axis=0).any():
+        return ""
+    if not possible.any():
+        return f"no view can make any of the {len(possible)} measurements"
+    most = int(possible.sum(axis=0).argmax())
+    names = scores["measurement"].values[~possible.any(axis=1)].tolist()
+    never = f"; no view can make {named(names)}" if names else ""
+    return (
+        f"no single view can make all {len(possible)} measurements: "
+        f"view {int(scores['view'][most])} can make the most, {int(possible[:, most].sum())}{never}"
+    )
 
 
 def scoring_order(views: Sequence[View], limit: TimeLimit | None) -> list[int]:

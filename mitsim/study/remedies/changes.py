@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 
 from characterisation.files.errors import InputError
-from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.statement import Statement
 from mitsim.running.time_limit import TimeLimit
 from mitsim.scene.load import bounds_of
@@ -39,6 +38,7 @@ from mitsim.study.remedies.change import (
     same_direction,
 )
 from mitsim.study.remedies.repeats import state_mean
+from mitsim.study.screened_errors import needed_by_tolerance
 from mitsim.study.session import Session
 from mitsim.study.view_sets.confirmed_set import state_set
 from mitsim.views.view_scores import MATT_WHITE, screening_risk
@@ -55,8 +55,8 @@ _MOST_OTHER_VIEWS = 2
 #: largest ratio of standoffs at which a nearer one is worth a try
 _NEARER = 0.9
 
-#: largest number of views that may measure together; chosen
-_MOST_VIEWS = 3
+#: largest number of views that may measure together: a box is seen from all sides by eight; chosen
+_MOST_VIEWS = 8
 
 #: time to search for them [s]; chosen
 _SEARCH_S = 5.0
@@ -253,19 +253,26 @@ def _several_views(now: Shortfall) -> Iterator[Change]:
     if now.session.source == "map" or study.file.set is not None:
         return
     here = now.scores["predicted_uncertainty"].sel(view=now.stated.view.number)
+    of_tolerance = needed_by_tolerance(study.task)
     limits, needed = dict[str, float](), dict[str, float]()
     for name, statement in now.missed.items():
-        predicted = float(here.values[names.index(name)])
-        if statement.decided is not None and math.isfinite(statement.decided.needed) and statement.root_mean_square > 0:
+        predicted, decided = float(here.values[names.index(name)]), statement.decided
+        if decided is not None and math.isfinite(decided.needed) and statement.root_mean_square > 0:
             optimism = min(1.0, predicted / statement.root_mean_square) if math.isfinite(predicted) else 1.0
-            needed[name], limits[name] = statement.decided.needed, statement.decided.needed * optimism
-    if not limits:
+            needed[name], limits[name] = decided.needed, decided.needed * optimism
+        elif math.isfinite(of_tolerance.get(name, math.nan)):  # no value from this view
+            needed[name] = limits[name] = of_tolerance[name]
+    table, chosen = SetTable(seconds=_SEARCH_S), None
+    while limits and chosen is None:
+        table = table.model_copy(update={"limits": dict(limits)})
+        try:
+            chosen = now.search(limits, table=table)
+        except InputError as error:
+            if error.field not in limits:
+                return
+            limits.pop(error.field)  # joined views cannot make it
+    if chosen is None:
         return
-    table = SetTable(limits=limits, seconds=_SEARCH_S)
-    try:
-        chosen: ViewSet = now.search(limits, table=table)
-    except InputError:
-        return  # a measurement that joined views cannot make
     able = [name for name, reached in zip(limits, chosen.feasible, strict=True) if reached]
     if not able or not 2 <= len(chosen.views) <= _MOST_VIEWS:
         return

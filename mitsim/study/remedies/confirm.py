@@ -23,6 +23,7 @@ from mitsim.running.progress import say
 from mitsim.running.time_limit import OutOfTimeError, TimeLimit
 from mitsim.study.remedies.change import Change, Shortfall
 from mitsim.study.remedies.changes import changes
+from mitsim.study.remedies.entries import CHANGES_FOR
 from mitsim.study.remedies.sensors import other_sensors
 
 #: first trials of a change, and those of the next steps while a verdict is open, over the trials of the study's table
@@ -149,7 +150,7 @@ def of_missed(found: Remedies | None, missed: dict[str, Statement], proposed_all
         return None
     now = Remedies(missed) if found is None else replace(found, missed=missed)
     known = () if found is None else found.missed
-    now = replace(now, untried=[*now.untried, *(f"changes for {name}" for name in now.open if name not in known)])
+    now = replace(now, untried=[*now.untried, *(f"{CHANGES_FOR}{name}" for name in now.open if name not in known)])
     return now if proposed_all else _without_sensors(now)
 
 

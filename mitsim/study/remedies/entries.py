@@ -11,8 +11,15 @@ from typing import Any
 
 from pydantic import Field
 
+from characterisation.statements.verdict_words import named
 from mitsim.running.numbers import listed, or_nan, two_digits
 from mitsim.study.statement_file import PartialDocument
+
+#: what was not tried: any change for a measurement, whose name follows
+CHANGES_FOR = "changes for "
+
+#: why no change makes a measurement fit, if time did not suffice for any
+_NOT_TRIED = "not tried"
 
 
 class MissedEntry(PartialDocument):
@@ -70,9 +77,14 @@ def remedies_in_words(found: RemediesEntry | None) -> list[str]:
         if measurement.fits_by is None:
             told, why = _unsolved(found, name)
             unsolved.setdefault(why, []).append(told)
-    lines += [f"{listed(told)}: {why}" for why, told in unsolved.items()]
+    open_ones = [one.removeprefix(CHANGES_FOR) for one in found.untried if one.startswith(CHANGES_FOR)]
+    for why, told in unsolved.items():
+        left = [name for name in told if why != _NOT_TRIED or name not in open_ones]
+        lines += [f"{named(left)}: {why}"] if left else []
     if found.untried and any(measurement.fits_by is None for measurement in found.measurements.values()):
-        lines.append(f"not tried for lack of time: {'; '.join(found.untried)}")
+        others = [one for one in found.untried if not one.startswith(CHANGES_FOR)]
+        untried = ([f"{CHANGES_FOR}{named(open_ones)}"] if open_ones else []) + others
+        lines.append(f"not tried for lack of time: {'; '.join(untried)}")
     return lines
 
 
@@ -94,7 +106,7 @@ def _unsolved(found: RemediesEntry, name: str) -> tuple[str, str]:
     rows = [(or_nan(tried.measurements[name].demand), tried) for tried in found.tried if name in tried.measurements]
     rows = [row for row in rows if math.isfinite(row[0])]
     if not rows:
-        return name, "not tried" if found.untried else "by its budget, no single change that mitsim knows suffices"
+        return name, _NOT_TRIED if found.untried else "by its budget, no single change that mitsim knows suffices"
     demand, best = min(rows, key=lambda row: row[0])
     helps = one.demand is None or demand < one.demand
     nearest = best.measurements[name].standard_uncertainty if helps else one.standard_uncertainty

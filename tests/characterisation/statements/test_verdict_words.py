@@ -46,6 +46,20 @@ def test_measurements_left_out_of_a_summary_are_counted_one_by_one():
     words = result_in_words([Judged("top", "mm", "does not fit", 0.2, 0.1), *many])
     assert shortened(words, 2).endswith("0.10 mm needed; and 11 more, see the table")
     assert shortened(words, 3) == words
+    assert "; a, b, c and 8 more: not decided, no value" in words
+
+
+def test_measurements_without_a_value_are_one_reason():
+    """A part that one view cannot show: eleven reasons of the same words fill the first screen."""
+    lost = [Judged(name, "mm", "undecidable", math.nan, math.nan, without_value=1.0) for name in "abcdefghijk"]
+    words = result_in_words([*lost, Judged("top", "mm", "does not fit", 0.2, 0.1)])
+    assert words == (
+        "fits 0 of 12 tolerances; a, b, c and 8 more are undecidable: no virtual measurement gave a value; top does "
+        "not fit: standard uncertainty 0.20 mm, 0.10 mm needed"
+    )
+    assert shortened(words, 1) == "fits 0 of 12 tolerances; and 12 more, see the table"
+    four = result_in_words([replace(one, trials=0) for one in lost[:4]])
+    assert four.endswith("; a, b, c, d are undecidable: by screening, no view can make them")
 
 
 def test_a_single_value_is_not_told_as_none():

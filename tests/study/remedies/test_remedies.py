@@ -19,7 +19,7 @@ from mitsim.running.time_limit import OutOfTimeError, TimeLimit
 from mitsim.study.remedies.bounds import EXPOSURE, Effect, can_fit, least_shares, least_uncertainty
 from mitsim.study.remedies.change import Change, changed_file
 from mitsim.study.remedies.confirm import Remedies, find_remedies, of_missed, remedies_document
-from mitsim.study.remedies.entries import RemediesEntry, remedies_in_words
+from mitsim.study.remedies.entries import CHANGES_FOR, MissedEntry, RemediesEntry, remedies_in_words
 from mitsim.study.tables import StudyFile
 
 #: equally likely errors of a standard normal distribution
@@ -168,7 +168,6 @@ def test_a_longer_statement_takes_remedies_away_and_names_what_was_not_tried() -
     assert longer is not None
     assert remedies_in_words(RemediesEntry.model_validate(remedies_document(longer))) == [
         "with spray: c (u 0.020 mm, before 0.80 mm) fits (40 virtual measurements)",
-        "d: not tried",
         "not tried for lack of time: changes for d",
     ]
 
@@ -206,3 +205,18 @@ def test_keys_of_a_change_replace_single_keys_of_the_study() -> None:
     assert changed.unknowns.calibration.row_mrad == 0.5 and changed.unknowns.calibration.scale == 0.25
     assert changed.unknowns.light.room == "dark cell" and changed.sprayed
     assert changed.views == file.views
+
+
+def test_measurements_with_no_change_tried_are_one_line() -> None:
+    names = "abcdef"
+    found = RemediesEntry(
+        measurements={
+            name: MissedEntry.model_validate({"unit": "mm", "standard_uncertainty": None, "needed": None})
+            for name in names
+        },
+        tried=[],
+        untried=[*(f"{CHANGES_FOR}{name}" for name in names), "with another sensor"],
+    )
+    assert remedies_in_words(found) == [
+        "not tried for lack of time: changes for a, b, c and 3 more; with another sensor"
+    ]
