@@ -23,7 +23,7 @@ from characterisation.scores.joining import (
     joint_information,
     rigid_derivatives,
 )
-from characterisation.scores.view_sets import FeatureInformation, ViewSet, fewest_views
+from characterisation.scores.view_sets import FeatureInformation, ViewSet, fewest_views, squares
 from characterisation.tasks.measurement_model import InputQuantity, measurement_model
 from characterisation.tasks.prediction import ExpectedInput, joint_quadratic_form
 from characterisation.tasks.task_file import Task
@@ -100,7 +100,7 @@ def choose_set(
     def joined(chosen: Floats) -> Floats:
         some = [view for view, taken in zip(views, chosen, strict=True) if taken]
         covariance = joined_covariance(some, whole.rigid, joining.known, joining.best_fit)
-        return np.asarray(np.sqrt(np.maximum(np.einsum("mij,ji->m", whole.quadratic, covariance), 0.0)))
+        return np.asarray(np.sqrt(squares(whole.quadratic, covariance)))
 
     return fewest_views(features, np.array(list(limits.values())), seconds, joined)
 

@@ -224,8 +224,17 @@ def _covariance(feature: FeatureInformation, chosen: Floats) -> Floats:
 
 def _total(features: Sequence[FeatureInformation], covariances: Sequence[Floats]) -> Floats:
     """Return u_m^2 (measurements,)."""
-    parts = [np.einsum("mij,ji->m", f.quadratic, c) for f, c in zip(features, covariances, strict=True)]
+    parts = [squares(feature.quadratic, one) for feature, one in zip(features, covariances, strict=True)]
     return np.asarray(np.sum(parts, axis=0))
+
+
+def squares(quadratic: Floats, covariance: Floats) -> Floats:
+    """Return u_m^2 = tr(G_m C) (measurements,), at least the rounding error of the sum.
+
+    Terms of unseen features are large and cancel in a measurement that does not need them. What is left may be below 0.
+    """
+    rounding = np.finfo(float).eps * len(covariance) * np.einsum("mij,ji->m", np.abs(quadratic), np.abs(covariance))
+    return np.asarray(np.maximum(np.einsum("mij,ji->m", quadratic, covariance), rounding))
 
 
 def _answer(uncertainty_of: Joined, chosen: Floats, feasible: NDArray[np.bool_], exact: bool) -> ViewSet:

@@ -32,6 +32,9 @@ from characterisation.tasks.task_file import Task
 #: step of the parameters for the quadratic form of a measurement, in units of their standard deviations
 STEP = 1e-3
 
+#: number of random steps that give the mean square of a zone: known to a tenth
+DRAWS = 200
+
 
 @dataclass(frozen=True)
 class ExpectedInput:
@@ -179,10 +182,14 @@ def joint_quadratic_form(task: Task, measurement: str, inputs: Mapping[InputQuan
     alone, the others the errors that inputs share. G follows, by polarisation, from the second moments of the
     measurement over steps of a thousandth of the parameters' standard deviations. It is exact for a linear measurement,
     or for the length of a vector that is nominally 0.
+
+    The square of the largest or the range of several deviations is no quadratic form; polarisation gives it negative
+    squares. G is then their sum over all deviations, scaled so that tr(G C) is right for independent parameters.
     """
     model = measurement_model(task, measurement)
     known = [inputs[quantity] for quantity in model.inputs]
-    value = _at_its_points(model.value, [expected_input.fit.middle for expected_input in known])
+    middles = [expected_input.fit.middle for expected_input in known]
+    value = _at_its_points(model.value, middles)
     estimates = [expected_input.estimate for expected_input in known]
     sizes = [len(expected_input.fit.covariance) for expected_input in known]
     best = value(*estimates)
@@ -199,6 +206,11 @@ def joint_quadratic_form(task: Task, measurement: str, inputs: Mapping[InputQuan
             total += 0.5 * (value(*moved) - best) ** 2
         return total
 
+    if model.deviations is not None:
+        deviations = _at_its_points(model.deviations, middles)
+        if len(deviations(*estimates)) > 1:
+            form = _of_zone(deviations, estimates, steps, moment)
+            return np.asarray(_scale(task, measurement) ** 2 * form / np.outer(steps, steps))
     own = [moment(steps * unit) for unit in np.eye(len(steps))]
     form = np.diag(own)
     for i in range(len(steps)):
@@ -207,6 +219,26 @@ def joint_quadratic_form(task: Task, measurement: str, inputs: Mapping[InputQuan
             both[[i, j]] = steps[[i, j]]
             form[i, j] = form[j, i] = (moment(both) - own[i] - own[j]) / 2
     return np.asarray(_scale(task, measurement) ** 2 * form / np.outer(steps, steps))
+
+
+def _of_zone(
+    deviations: Callable[..., Any], estimates: Sequence[Any], steps: Floats, moment: Callable[[Floats], float]
+) -> Floats:
+    """Return the form (P, P) of a zone over ``steps`` (P,): the sum of the squares of all of its deviations, scaled.
+
+    The scale makes its trace the mean of ``moment`` over random steps.
+    """
+    ends = np.cumsum([estimate.parameter_count for estimate in estimates])[:-1]
+
+    def at(step: Floats) -> Floats:
+        parts = np.split(step, ends)
+        moved = [estimate.moved(part) for estimate, part in zip(estimates, parts, strict=True)]
+        return np.asarray(deviations(*moved), float).ravel()
+
+    rows = np.array([(at(step) - at(-step)) / 2 for step in np.diag(steps)])
+    drawn = np.random.default_rng(0).standard_normal((DRAWS, len(steps))) * steps
+    form = rows @ rows.T
+    return np.asarray(form * (np.mean([moment(step) for step in drawn]) / np.trace(form)))
 
 
 def _scale(task: Task, measurement: str) -> float:
@@ -227,10 +259,10 @@ def _one_by_one(value: Callable[..., float], known: Sequence[ExpectedInput]) -> 
     return [alone(index) for index in range(len(known))]
 
 
-def _at_its_points(value: Callable[..., float], middles: Sequence[Floats]) -> Callable[..., float]:
+def _at_its_points(value: Callable[..., Any], middles: Sequence[Floats]) -> Callable[..., Any]:
     """Return the measurement on axes described at the foot of their measured points, as fits are."""
 
-    def at_points(*estimates: Any) -> float:
+    def at_points(*estimates: Any) -> Any:
         return value(
             *[
                 estimate.at_foot_of(middle) if isinstance(estimate, Cylinder | Cone) else estimate

@@ -10,9 +10,11 @@ from characterisation.features.fits import fit_plane
 from characterisation.features.form import fit_form, zone
 from characterisation.features.pose_fit import Pose
 from characterisation.files.documents import validate
+from characterisation.tasks.covariance import ExpectedFit
 from characterisation.tasks.deviations import form_size
 from characterisation.tasks.folded import folded_value
 from characterisation.tasks.measurement_model import measurement_model
+from characterisation.tasks.prediction import ExpectedInput, joint_quadratic_form
 from characterisation.tasks.task_file import Task
 
 FEATURES = """
@@ -218,3 +220,37 @@ def test_an_added_deviation_has_its_size_and_a_direction_of_its_own():
     moved = [folded.moved(np.zeros((1, 3)), -0.5, seed) for seed in (1, 1, 2)]
     assert [folded.error(one) for one in moved] == pytest.approx([0.5] * 3)
     assert np.array_equal(moved[0], moved[1]) and not np.allclose(moved[0], moved[2])
+
+
+@pytest.mark.parametrize(
+    "name", ["pin", "face", "slot", "step to top", "pin about bore", "wall to top", "foot", "shift"]
+)
+def test_the_quadratic_form_of_a_zone_has_no_negative_squares(name):
+    """A set of views was predicted to know a position exactly, because its form had a negative square."""
+    some = task(CASES, 0)
+    model = measurement_model(some, name)
+    if model.inputs[0].kind == "pose":
+        nominal = [Pose(np.eye(4), np.zeros(3))]
+    else:
+        nominal = [some.nominal(one) for one in some.fitted_for(name)]
+    rng = np.random.default_rng(20261128)
+    spreads = [1e-4 * np.exp(rng.uniform(-1, 1, one.parameter_count)) for one in nominal]
+    inputs = {}
+    for quantity, one, spread in zip(model.inputs, nominal, spreads, strict=True):
+        middle, nothing = getattr(one, "point", np.zeros(3)), np.zeros((len(spread), 1))
+        inputs[quantity] = ExpectedInput(ExpectedFit(np.diag(spread**2), nothing, 100.0, 1.0, middle, 0.1), one)
+    form = joint_quadratic_form(some, name, inputs)
+    scale = np.concatenate(spreads)
+    squares = np.linalg.eigvalsh(form * np.outer(scale, scale))
+    assert squares[-1] > 0 and squares[0] > -1e-3 * squares[-1]
+    # independent parameters, and errors that they share: against measuring
+    for shared, low, high in ((0.0, 0.9, 1.1), (3.0, 0.6, 1.4)):
+        cause = shared * scale * rng.standard_normal(len(scale))
+        drawn = scale * rng.standard_normal((2000, len(scale))) + cause * rng.standard_normal((2000, 1))
+        ends = np.cumsum([one.parameter_count for one in nominal])[:-1]
+        values = [
+            model.value(*[one.moved(part) for one, part in zip(nominal, np.split(draw, ends), strict=True)])
+            for draw in drawn
+        ]
+        expected = np.sqrt(np.trace(form @ (np.diag(scale**2) + np.outer(cause, cause))))
+        assert low < np.sqrt(np.mean(np.square(values))) / expected < high, (shared, expected)
