@@ -36,7 +36,7 @@ def label_columns(
     most
         Largest number of names on a side; the least important others are left out.
     longest
-        Largest number of characters of a name; longer ones are cut.
+        Largest number of characters of a name; longer ones lack their middle.
 
     See Also
     --------
@@ -61,11 +61,18 @@ def label_columns(
             place = places[name]
             axes.plot([x, place[0]], [y, place[1]], color=MUTED, lw=0.7, zorder=4)
             axes.plot(*place, "o", ms=2.5, color=INK, zorder=5)
-            short = name if len(name) <= longest else f"{name[: longest - 1]}…"
-            axes.text(x + way * 0.01 * float(span.max()), y, short, ha=side, va="center", fontsize=8, zorder=8)
+            axes.text(
+                x + way * 0.01 * float(span.max()), y, cut(name, longest), ha=side, va="center", fontsize=8, zorder=8
+            )
     room = aside + _ROOM * float(span.max())
     axes.set_xlim(low[0] - room, high[0] + room)
     axes.set_ylim(min(every) - step / 2, max(every) + step / 2)
+
+
+def cut(name: str, longest: int) -> str:
+    """Return a name of at most ``longest`` characters, of which the middle is left out: ends tell names apart."""
+    kept = longest - 1
+    return name if len(name) <= longest else f"{name[: kept - kept // 2]}…{name[-(kept // 2) :]}"
 
 
 def spread(heights: Sequence[float], step: float) -> list[float]:

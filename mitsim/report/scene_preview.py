@@ -20,7 +20,7 @@ from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
 from characterisation.files.arrays import Floats
-from characterisation.plots.labels import round_length, scale_bar
+from characterisation.plots.labels import cut, round_length, scale_bar
 from characterisation.plots.part_pictures import EDGE_SHADE, shape_edges
 from characterisation.plots.style import FIELD, INK, MUTED, OTHER_SHAPE, SHAPES, bare, drawing
 from mitsim.running.numbers import finish_name
@@ -371,7 +371,7 @@ def _marks(sensor: Sensor) -> list[Patch | Line2D]:
 
 
 def _label(shape: ShapeFacts) -> str:
-    name = shape.name if len(shape.name) <= 22 else f"{shape.name[:21]}…"
+    name = cut(shape.name, 22)
     if shape.finish is not None:
         return f"{name}  {finish_name(shape.finish.name, shape.finish.roughness)}"
     return f"{name}  {'lamp' if shape.emitter else shape.bsdf}"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from characterisation.plots.labels import spread
+from characterisation.plots.labels import cut, spread
 from mitsim.report.placement_figure import depth_buffer, face_verdicts, placement_figure
 from mitsim.study.scene_geometry import read_scene_geometry
 from tests.report.conftest import write_scene_geometry
@@ -53,3 +53,10 @@ def test_no_writing_of_the_picture_overlaps_other_writing_or_leaves_it(tmp_path,
     inside = figure.bbox.padded(0.5)
     assert all(inside.x0 <= one.x0 and one.x1 <= inside.x1 for one in boxes), boxes
     assert not [(a, b) for k, a in enumerate(boxes) for b in boxes[:k] if a.overlaps(b)]
+
+
+def test_long_names_keep_the_ends_that_tell_them_apart():
+    names = ["bore_35mm_front_left", "bore_35mm_front_right", "bore_35mm_back_left", "bore_35mm_back_right", "top"]
+    short = [cut(name, 16) for name in names]
+    assert len(set(short)) == len(names) and max(map(len, short)) == 16 and short[-1] == "top"
+    assert cut("chamfer_30deg_bottom_front_3", 16) == "chamfer_…front_3"

@@ -110,7 +110,8 @@ def _unsolved(found: RemediesEntry, name: str) -> tuple[str, str]:
     demand, best = min(rows, key=lambda row: row[0])
     helps = one.demand is None or demand < one.demand
     nearest = best.measurements[name].standard_uncertainty if helps else one.standard_uncertainty
-    told = f"{name} (u {_plain(nearest, one.unit)}, {_plain(one.needed, one.unit)} needed)"
+    needed = "" if one.needed is None else f", {_plain(one.needed, one.unit)} needed"
+    told = f"{name} (u {_plain(nearest, one.unit)}{needed})"
     if best.measurements[name].verdict == "not decided" and demand <= 1:
         return told, f"perhaps {best.words}, not decided by {best.trials} virtual measurements"
     if len(rows) == 1:
