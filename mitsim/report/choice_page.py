@@ -56,7 +56,7 @@ def page_content(choice: ChoiceDocument, folder: Path) -> dict[str, Any]:
         ],
         "asked": [_asked(choice, name) for name in choice.measurements],
         "rows": [_row(choice, entry) for entry in taking_part],
-        "screened": any(entry.status == "screened" for entry in taking_part),
+        "screened": any(entry.status == "screened" or entry.roughness_in_words for entry in taking_part),
         "sensors": [_details(choice, entry, tolerances) for entry in taking_part],
         "excluded": [
             {"name": sensor.name, "why": sensor.why} for sensor in choice.sensors if sensor.status == "excluded"
@@ -82,6 +82,7 @@ def _row(choice: ChoiceDocument, entry: SensorEntry) -> dict[str, Any]:
         "name": entry.name,
         "stated": entry.status == "stated",
         "why": entry.why,
+        "rough": entry.roughness_in_words,
         "fits": entry.fits_in_words(toleranced) if toleranced else "",
         "possible": entry.possible_in_words,
         "ratio": NONE if entry.ratio is None else two_digits(entry.ratio),

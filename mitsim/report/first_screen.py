@@ -212,7 +212,11 @@ def of_choice(
         poses,
         verdicts,
         max((cell.trials for cell in best.measurements.values()), default=0),
-        doubts=(*_others_fit_more(choice, best), *(statement.doubts() if statement else ())),
+        doubts=(
+            *filter(None, [best.roughness_in_words]),
+            *_others_fit_more(choice, best),
+            *(statement.doubts() if statement else ()),
+        ),
     )
 
 

@@ -6,10 +6,12 @@ screening alone.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Literal
 
 from pydantic import Field, model_validator
+from scipy.special import gammaincinv
 
 from characterisation.files.checked_files import read_json_object
 from characterisation.files.documents import validate
@@ -75,6 +77,10 @@ class CellEntry(PartialDocument):
         return f"{what}: {self.reason}" if self.reason else what
 
 
+#: trials of the first round of a comparison; with as many, a standard uncertainty may be 1.4 times as large, and one of
+#: fewer is called rough
+FEW_TRIALS = 24
+
 _Row = tuple[float, float, float, float]
 
 
@@ -123,6 +129,18 @@ class SensorEntry(PartialDocument):
     def impossible(self) -> dict[str, str]:
         """Return the reason of every impossible measurement, by name."""
         return {name: cell.why_impossible for name, cell in self.measurements.items() if cell.why_impossible}
+
+    @property
+    def roughness_in_words(self) -> str:
+        """Return how much larger standard uncertainties may be, if few trials stand behind them; otherwise empty.
+
+        The factor is that of normal errors with 97.5 % confidence, from the chi-square distribution.
+        """
+        trials = min((cell.trials for cell in self.measurements.values() if cell.by == "statement"), default=0)
+        if not 2 <= trials < FEW_TRIALS:
+            return ""
+        factor = math.sqrt((trials - 1) / (2 * gammaincinv((trials - 1) / 2, 0.025)))
+        return f"{trials} virtual measurements only: standard uncertainties may be {factor:.1f} times as large"
 
     @property
     def possible_in_words(self) -> str:

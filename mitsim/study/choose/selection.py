@@ -30,6 +30,7 @@ from mitsim.running.executor import Executor
 from mitsim.running.numbers import two_digits
 from mitsim.running.progress import say
 from mitsim.running.time_limit import TimeLimit
+from mitsim.study.choice_document import FEW_TRIALS
 from mitsim.study.choose.candidates import CandidateSensor
 from mitsim.study.choose.ranking import rank_keys, unpromising
 from mitsim.study.choose.rounds import able_to_win, race_and_state, race_as_stated, refine_leader, state_by_screening
@@ -38,9 +39,6 @@ from mitsim.study.choose.sensor_result import SensorResult, ordered
 from mitsim.study.run_record import complete_winner
 from mitsim.study.session import Session
 from mitsim.study.virtual.race import ALL
-
-#: trials of a statement in the first round; chosen
-FIRST_TRIALS = 24
 
 #: factor of the trials from round to round; chosen
 GROWTH = 2
@@ -98,7 +96,7 @@ def _measure_in_rounds(
     found: list[SensorResult], limit: TimeLimit, report_results: Callable[[list[SensorResult], bool], None]
 ) -> None:
     """Measure the promising sensors in rounds, until one is left or time is over."""
-    rivals, count = _promising(found), FIRST_TRIALS
+    rivals, count = _promising(found), FEW_TRIALS
     raced = len(rivals) == 1
     for turn in range(_ROUNDS):
         work = limit.part(_ROUND_SHARE if len(rivals) > 1 else 1.0, _reserve(limit))

@@ -179,6 +179,7 @@ def as_text(choice: ChoiceDocument) -> str:
         "order: sensors with virtual measurements, then the most possible measurements, then the smallest worst"
     )
     lines = [*aligned(rows), "", legend, *choice.fit_more]
+    lines += [f"{sensor.name}: {sensor.roughness_in_words}" for sensor in choice.sensors if sensor.roughness_in_words]
     if any(sensor.status == "screened" for sensor in choice.sensors):
         least = "" if choice.toleranced else " times the best"
         reasons = f"fewer measurements are possible there, its demand there is above {LARGEST_DEMAND:g}{least}"
