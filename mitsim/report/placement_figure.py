@@ -47,6 +47,9 @@ _LEGEND = {"no tolerance": "measured, without tolerance"}
 _PIXELS = 900
 _LABEL_PIXELS = 240
 
+#: number of pixels of boxes around triangles that are tested at once
+_AT_ONCE = 1 << 20
+
 #: azimuth of the picture's viewpoint relative to the sensor [deg]; chosen
 _ASIDE_DEG = 62.0
 
@@ -209,24 +212,35 @@ def depth_buffer(places: Floats, depth: Floats, size: tuple[int, ...]) -> tuple[
     ``places`` (n, 3, 2) [px] of the vertices, ``depth`` (n, 3), larger is nearer; ``size`` is (columns, rows).
     """
     columns, rows = size
-    index, nearest = np.full((rows, columns), -1, np.int64), np.full((rows, columns), -np.inf)
-    for number, (corner, high) in enumerate(zip(places, depth, strict=True)):
-        low_x, low_y = np.maximum(np.ceil(corner.min(axis=0)), 0).astype(int)
-        high_x, high_y = np.minimum(np.floor(corner.max(axis=0)), [columns - 1, rows - 1]).astype(int)
-        (ax, ay), (bx, by), (cx, cy) = corner
-        area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
-        if high_x < low_x or high_y < low_y or abs(area) < 1e-12:
-            continue
-        x, y = np.arange(low_x, high_x + 1)[None, :], np.arange(low_y, high_y + 1)[:, None]
-        first = ((bx - x) * (cy - y) - (cx - x) * (by - y)) / area
-        second = ((cx - x) * (ay - y) - (ax - x) * (cy - y)) / area
+    index, nearest = np.full(rows * columns, -1, np.int64), np.full(rows * columns, -np.inf)
+    low = np.maximum(np.ceil(places.min(axis=1)), 0).astype(int)
+    high = np.minimum(np.floor(places.max(axis=1)), [columns - 1, rows - 1]).astype(int)
+    (ax, ay), (bx, by), (cx, cy) = places.transpose(1, 2, 0)
+    area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
+    width = np.where((high >= low).all(axis=1) & (np.abs(area) >= 1e-12), high[:, 0] - low[:, 0] + 1, 0)
+    some = np.flatnonzero(width)  # most triangles of a fine mesh lie between pixels
+    counts = width[some] * (high[some, 1] - low[some, 1] + 1)
+    ends = np.cumsum(counts)
+    for part in np.split(some, np.flatnonzero(np.diff(ends // _AT_ONCE)) + 1):
+        # every pixel of the box around every triangle
+        count = width[part] * (high[part, 1] - low[part, 1] + 1)
+        t = np.repeat(part, count)
+        place = np.arange(len(t)) - np.repeat(np.cumsum(count) - count, count)
+        x, y = low[t, 0] + place % width[t], low[t, 1] + place // width[t]
+        first = ((bx[t] - x) * (cy[t] - y) - (cx[t] - x) * (by[t] - y)) / area[t]
+        second = ((cx[t] - x) * (ay[t] - y) - (ax[t] - x) * (cy[t] - y)) / area[t]
         third = 1 - first - second
-        here = first * high[0] + second * high[1] + third * high[2]
-        block = (slice(low_y, high_y + 1), slice(low_x, high_x + 1))
-        won = (np.minimum(np.minimum(first, second), third) >= -1e-9) & (here > nearest[block])
-        nearest[block] = np.where(won, here, nearest[block])
-        index[block] = np.where(won, number, index[block])
-    return index, nearest
+        inside = np.minimum(np.minimum(first, second), third) >= -1e-9
+        here, t, pixel = (
+            (first * depth[t, 0] + second * depth[t, 1] + third * depth[t, 2])[inside],
+            t[inside],
+            (y * columns + x)[inside],
+        )
+        order = np.lexsort((-t, here, pixel))
+        last = order[np.diff(pixel[order], append=-1) != 0]  # the nearest of each pixel
+        won = last[here[last] > nearest[pixel[last]]]
+        nearest[pixel[won]], index[pixel[won]] = here[won], t[won]
+    return index.reshape(rows, columns), nearest.reshape(rows, columns)
 
 
 def _sensor(

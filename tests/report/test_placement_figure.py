@@ -55,6 +55,22 @@ def test_no_writing_of_the_picture_overlaps_other_writing_or_leaves_it(tmp_path,
     assert not [(a, b) for k, a in enumerate(boxes) for b in boxes[:k] if a.overlaps(b)]
 
 
+def test_of_many_triangles_each_pixel_shows_the_nearest():
+    rng = np.random.default_rng(7)
+    corners = rng.uniform(-5, [35, 25], (60, 1, 2)) + rng.normal(0, 6, (60, 3, 2))
+    depth = rng.normal(size=(60, 1)) + np.zeros((60, 3))
+    index, nearest = depth_buffer(corners, depth, (30, 20))
+    for y in range(20):
+        for x in range(30):
+            edges = np.roll(corners, -1, axis=1) - corners
+            to = [x, y] - corners
+            sides = edges[..., 0] * to[..., 1] - edges[..., 1] * to[..., 0]
+            inside = (sides >= 0).all(axis=1) | (sides <= 0).all(axis=1)
+            expected = int(np.argmax(np.where(inside, depth[:, 0], -np.inf))) if inside.any() else -1
+            assert index[y, x] == expected
+            assert nearest[y, x] == pytest.approx(depth[expected, 0] if inside.any() else -np.inf)
+
+
 def test_long_names_keep_the_ends_that_tell_them_apart():
     names = ["bore_35mm_front_left", "bore_35mm_front_right", "bore_35mm_back_left", "bore_35mm_back_right", "top"]
     short = [cut(name, 16) for name in names]
