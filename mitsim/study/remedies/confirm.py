@@ -84,6 +84,7 @@ def find_remedies(
     trials: int,
     limit: TimeLimit | None = None,
     before: Remedies | None = None,
+    trial_s: float = 0.0,
 ) -> Remedies:
     """Try changes until every missed measurement fits with one, no change is left, or time is over.
 
@@ -99,6 +100,9 @@ def find_remedies(
         Time; none by default.
     before
         What was tried before. It is not tried again, and is part of the result.
+    trial_s
+        Expected time of a virtual measurement [s]: a change whose share of the time is too short for the fewest is not
+        tried.
     """
     known = Remedies(missed) if before is None else before
     found, limit = Remedies(missed, list(known.tried), list(known.failed)), limit or TimeLimit()
@@ -112,12 +116,13 @@ def find_remedies(
         wanted = [name for name in change.expected if name in found.open]
         if not wanted or change.words in done:
             continue
-        if limit.over():
+        own = limit.part(_CHANGE_SHARE)
+        if own.left <= (_FEWEST * trial_s if change.kind != "bias" else 0.0):  # the bias needs no trials
             found.untried.append(change.words)
             continue
         began = time.monotonic()
         try:
-            stated = _stated(change, wanted, trials, limit.part(_CHANGE_SHARE))
+            stated = _stated(change, wanted, trials, own)
         except OutOfTimeError:
             found.untried.append(change.words)
             continue

@@ -78,9 +78,9 @@ def remedies_in_words(found: RemediesEntry | None) -> list[str]:
             told, why = _unsolved(found, name)
             unsolved.setdefault(why, []).append(told)
     open_ones = [one.removeprefix(CHANGES_FOR) for one in found.untried if one.startswith(CHANGES_FOR)]
-    for why, told in unsolved.items():
-        left = [name for name in told if why != _NOT_TRIED or name not in open_ones]
-        lines += [f"{named(left)}: {why}"] if left else []
+    for why, entries in unsolved.items():
+        names = [entry for entry in entries if why != _NOT_TRIED or entry not in open_ones]
+        lines += [f"{named(names)}: {why}"] if names else []
     if found.untried and any(measurement.fits_by is None for measurement in found.measurements.values()):
         others = [one for one in found.untried if not one.startswith(CHANGES_FOR)]
         untried = ([f"{CHANGES_FOR}{named(open_ones)}"] if open_ones else []) + others

@@ -67,7 +67,9 @@ def state_and_mend(
         if not shortfall.missed or not seeks_remedies(session.study):
             return before
         proposed = all_changes(shortfall, within) if sensors else changes(shortfall)
-        found = find_remedies(shortfall.missed, proposed, table.trials, within, before)
+        made = max((statement.trials for statement in stated.statements), default=0)
+        trial_s = clock.steps.get("state", 0.0) / made if made else 0.0
+        found = find_remedies(shortfall.missed, proposed, table.trials, within, before, trial_s)
         clock.lap("remedies")
         return found
 
