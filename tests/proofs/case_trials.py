@@ -6,11 +6,14 @@
 - *apart*: trials of the stated views, for the coverage. Nothing is shared: every world renders all of its light at its
   own pose.
 
-All kinds but *tool* may include light paths over more surfaces than the tool.
+All kinds but *tool* may include light paths over more surfaces than the tool, and have other worlds in every case. With
+the same 45 decoders in all cases of a matcher, 13 of 45 correlated blocks of 7 px where a statement had 14 %, and the
+misses of one case were those of all.
 """
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -45,7 +48,8 @@ def trials_by_kind(case: PartCase, study: Study, folder: Path, workers: Executor
 
 def _study_of_kind(case: PartCase, study: Study, kind: str) -> Study:
     """Return the study with the worlds of a kind, and with its light paths."""
-    file = study.file.model_copy(update={"seed": study.file.seed + KINDS[kind]})
+    own = 0 if kind == "tool" else zlib.crc32(case.name.encode()) % (1 << 19)
+    file = study.file.model_copy(update={"seed": study.file.seed + KINDS[kind] + own})
     if kind != "tool" and case.table.surfaces is not None:
         measured_with = file.measure.model_copy(update={"light_path_depth": case.table.surfaces})
         file = file.model_copy(update={"measure": measured_with})
