@@ -193,7 +193,9 @@ def _parsed(path: Path, text: str) -> ElementTree.Element:
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(path, "", f"XML that does not parse ({error})", "well-formed XML") from None
+        is_study = path.suffix == ".toml"
+        hint = "name the scene of the study here; `mitsim run` and `mitsim study` take the study" if is_study else ""
+        raise InputError(path, "", f"XML that does not parse ({error})", "well-formed XML", hint) from None
     if root is None:
         raise InputError(path, "", "XML that does not parse (no element found)", "well-formed XML")
     return root

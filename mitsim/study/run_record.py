@@ -36,7 +36,17 @@ RUNNERS_UP = 5
 def draw_clouds(
     session: Session, performance_map: PerformanceMap, numbers: list[int], limit: TimeLimit | None = None
 ) -> list[int]:
-    """Write a predicted cloud of each of some views, of the first one in any case; return those within a limit."""
+    """Write a predicted cloud of each of some views, and return the numbers of those written.
+
+    Parameters
+    ----------
+    session, performance_map
+        The study with its folder, and the map that the clouds are drawn from.
+    numbers
+        Of the views, the most important first.
+    limit
+        Time of all but the first, which is written in any case; none by default.
+    """
     study, predictor, drawn = session.study, session.predictor, list[int]()
     for number in track(numbers, "predict clouds"):
         if drawn and limit is not None and limit.over():

@@ -258,3 +258,10 @@ def test_a_mesh_whose_vertices_have_two_numbers_is_refused(tmp_path):
     path.write_text("\n".join([f"v {y} {z}" for x, y, z in corners] + lines[8:]))
     with pytest.raises(InputError, match="three numbers"):
         read_mesh(path)
+
+
+def test_a_study_in_place_of_a_scene_is_told_from_a_damaged_scene(tmp_path):
+    study = tmp_path / "study.toml"
+    study.write_text('scene = "part.xml"\n')
+    with pytest.raises(InputError, match="name the scene of the study here; `mitsim run`"):
+        checked_trees(study)
