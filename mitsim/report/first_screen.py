@@ -94,6 +94,9 @@ class FirstScreen:
 #: reasons in the result in words: the first says how many tolerances fit
 _MOST_REASONS = 5
 
+#: share of the virtual measurements without a value from which a view counts as one that cannot make a measurement
+_MOSTLY = 0.5
+
 #: values of a measurement, and of its decision, that documents and rows hold by the same names
 _MEASURED = ("verdict", "bias", "without_value")
 _DECIDED = ("needed", "demand", "demand_interval", "accepted", "false_accept")
@@ -131,7 +134,7 @@ def of_run(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
         verdicts,
         max((measurement.trials for measurement in document.measurements.values()), default=0),
         tuple(with_degree_signs(line) for line in remedies_in_words(run.about.remedies)),
-        (*document.doubts(), *filter(None, [_apart(run)])),
+        (*document.doubts(), *filter(None, [_apart(run, document)])),
     )
 
 
@@ -173,9 +176,13 @@ def _without_statement(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
     )
 
 
-def _apart(run: Run) -> str:
-    """Return that no single view can make all measurements, if that is so and no set of views is asked for."""
-    apart = "" if run.about.view_sets else apart_in_words(run.scores)
+def _apart(run: Run, document: StatementDocument) -> str:
+    """Return that no single view can make all measurements, if the stated one cannot and no set of views is asked for.
+
+    The map may find a view impossible that makes a measurement.
+    """
+    made = all(measurement.without_value <= _MOSTLY for measurement in document.measurements.values())
+    apart = "" if made or run.about.view_sets else apart_in_words(run.scores)
     return apart and f"By the map, {apart}. The table [set] of a study finds the fewest views that measure together"
 
 

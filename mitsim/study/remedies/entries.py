@@ -79,6 +79,8 @@ def remedies_in_words(found: RemediesEntry | None) -> list[str]:
             unsolved.setdefault(why, []).append(told)
     open_ones = [one.removeprefix(CHANGES_FOR) for one in found.untried if one.startswith(CHANGES_FOR)]
     for why, entries in unsolved.items():
+        if why == _NOT_TRIED and not found.tried:
+            continue  # the last line says so
         names = [entry for entry in entries if why != _NOT_TRIED or entry not in open_ones]
         lines += [f"{named(names)}: {why}"] if names else []
     if found.untried and any(measurement.fits_by is None for measurement in found.measurements.values()):

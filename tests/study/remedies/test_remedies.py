@@ -157,7 +157,7 @@ def test_without_time_nothing_is_confirmed_and_the_changes_are_named() -> None:
     found = find_remedies(missed("a"), [good.change], 40, TimeLimit(0.0))
     assert not good.asked and found.open == ["a"]
     lines = remedies_in_words(RemediesEntry.model_validate(remedies_document(found)))
-    assert lines == ["a: not tried", "not tried for lack of time: with spray; with another sensor"]
+    assert lines == ["not tried for lack of time: with spray; with another sensor"]
 
 
 def test_a_change_that_time_cannot_confirm_takes_none() -> None:
