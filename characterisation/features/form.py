@@ -35,14 +35,14 @@ zone that the noise produces.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
 from numpy.typing import ArrayLike, NDArray
 
 from characterisation.features.robust_fit import CHOICES, CLIP, FitError, rays_from, robust_std, usable
-from characterisation.features.surfaces import GRAZING_COSINE, Cylinder, Plane, tangents
+from characterisation.features.surfaces import GRAZING_COSINE, Cylinder, Meeting, Plane, tangents
 
 Array = NDArray[np.float64]
 
@@ -55,7 +55,8 @@ NODES = 7
 #: share (49,) of the points that each node stands for, in any unit: a node at the edge stands for half a cell
 NODE_SHARES = np.kron(np.r_[0.5, np.ones(NODES - 2), 0.5], np.r_[0.5, np.ones(NODES - 2), 0.5])
 
-#: points whose extent has shrunk by less than this share have the same modes to rounding
+#: points whose extent has shrunk by less than this share keep their polynomials: of 300,000 noisy points of a cylinder,
+#: the zone changes by 3e-8 mm; chosen
 SAME_EXTENT = 0.01
 
 #: modes are excluded if less than this share of them remains after projection off the changes of the surface
@@ -159,7 +160,7 @@ def form_modes(surface: Plane | Cylinder, points: Array, rays: Array | None) -> 
     FitError
         If there are too few points.
     """
-    rows, rigid = _rows(surface, _Points.of(surface, points, rays))
+    rows, rigid = _rows(surface, _Points.of(surface, points, rays, surface.meet(points, rays), slice(None)))
     modes: Array = (_combined(rows @ rows.T, rigid).T @ rows).T
     return modes
 
@@ -179,10 +180,10 @@ class _Points:
     coordinates: Array
 
     @classmethod
-    def of(cls, surface: Plane | Cylinder, points: Array, rays: Array | None) -> _Points:
-        """Return points (n, 3) with rays (n, 3) that meet a surface."""
-        at = surface.meet(points, rays)
-        return cls(points, rays, at.residual, at.slope, np.array(_coordinates(surface, at.foot)))
+    def of(cls, surface: Plane | Cylinder, points: Array, rays: Array | None, at: Meeting, some: Any) -> _Points:
+        """Return some of the points (n, 3), chosen by mask or slice, of which all meet a surface."""
+        rays, coordinates = None if rays is None else rays[some], _coordinates(surface, at.foot[some])
+        return cls(points[some], rays, at.residual[some], at.slope[some], np.array(coordinates))
 
     def among(self, some: NDArray[np.bool_]) -> _Points:
         """Return the chosen points."""
@@ -257,10 +258,11 @@ def fit_form(points: ArrayLike, surface: Plane | Cylinder, viewpoint: ArrayLike 
     """
     points = usable(points, surface.kind, surface.parameter_count)
     rays = rays_from(viewpoint, points)
-    facing = np.abs(surface.meet(points, rays).cosine) > GRAZING_COSINE
+    at = surface.meet(points, rays)
+    facing = np.abs(at.cosine) > GRAZING_COSINE
     if facing.sum() <= surface.parameter_count:
         raise FitError(f"only {facing.sum()} of {len(points)} points are not seen at grazing incidence")
-    among = _Points.of(surface, points[facing], None if rays is None else rays[facing])
+    among = _Points.of(surface, points, rays, at, facing)
     near, rows = np.ones(len(among.points), bool), np.empty((0, 0))
     for _ in range(CHOICES):
         if not rows.size or among.are_wider(near):

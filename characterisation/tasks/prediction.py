@@ -191,26 +191,29 @@ def joint_quadratic_form(task: Task, measurement: str, inputs: Mapping[InputQuan
     middles = [expected_input.fit.middle for expected_input in known]
     value = _at_its_points(model.value, middles)
     estimates = [expected_input.estimate for expected_input in known]
-    sizes = [len(expected_input.fit.covariance) for expected_input in known]
     best = value(*estimates)
     steps = STEP * np.concatenate([np.sqrt(np.diag(expected_input.fit.covariance)) for expected_input in known])
 
     def moment(step: Floats) -> float:
-        total = 0.0
-        for sign in (1.0, -1.0):
-            parts = np.split(sign * step, np.cumsum(sizes)[:-1])
-            moved = [
-                estimate.moved(part) if part.any() else estimate
-                for estimate, part in zip(estimates, parts, strict=True)
-            ]
-            total += 0.5 * (value(*moved) - best) ** 2
-        return total
+        changes = [value(*_moved(estimates, sign * step)) - best for sign in (1.0, -1.0)]
+        return float(np.mean(np.square(changes)))
 
-    if model.deviations is not None:
-        deviations = _at_its_points(model.deviations, middles)
-        if len(deviations(*estimates)) > 1:
-            form = _of_zone(deviations, estimates, steps, moment)
-            return np.asarray(_scale(task, measurement) ** 2 * form / np.outer(steps, steps))
+    deviations = None if model.deviations is None else _at_its_points(model.deviations, middles)
+    if deviations is not None and len(deviations(*estimates)) > 1:
+        form = _of_zone(deviations, estimates, steps, moment)
+    else:
+        form = _polarised(steps, moment)
+    return np.asarray(_scale(task, measurement) ** 2 * form / np.outer(steps, steps))
+
+
+def _moved(estimates: Sequence[Any], step: Floats) -> list[Any]:
+    """Return estimates with their parameters, in one row (P,), changed by a step."""
+    parts = np.split(step, np.cumsum([estimate.parameter_count for estimate in estimates])[:-1])
+    return [estimate.moved(part) if part.any() else estimate for estimate, part in zip(estimates, parts, strict=True)]
+
+
+def _polarised(steps: Floats, moment: Callable[[Floats], float]) -> Floats:
+    """Return the form (P, P) over ``steps`` (P,) whose squares are those of ``moment``."""
     own = [moment(steps * unit) for unit in np.eye(len(steps))]
     form = np.diag(own)
     for i in range(len(steps)):
@@ -218,7 +221,7 @@ def joint_quadratic_form(task: Task, measurement: str, inputs: Mapping[InputQuan
             both = np.zeros(len(steps))
             both[[i, j]] = steps[[i, j]]
             form[i, j] = form[j, i] = (moment(both) - own[i] - own[j]) / 2
-    return np.asarray(_scale(task, measurement) ** 2 * form / np.outer(steps, steps))
+    return form
 
 
 def _of_zone(
@@ -228,12 +231,9 @@ def _of_zone(
 
     The scale makes its trace the mean of ``moment`` over random steps.
     """
-    ends = np.cumsum([estimate.parameter_count for estimate in estimates])[:-1]
 
     def at(step: Floats) -> Floats:
-        parts = np.split(step, ends)
-        moved = [estimate.moved(part) for estimate, part in zip(estimates, parts, strict=True)]
-        return np.asarray(deviations(*moved), float).ravel()
+        return np.asarray(deviations(*_moved(estimates, step)), float).ravel()
 
     rows = np.array([(at(step) - at(-step)) / 2 for step in np.diag(steps)])
     drawn = np.random.default_rng(0).standard_normal((DRAWS, len(steps))) * steps

@@ -26,6 +26,7 @@ from characterisation.statements.verdict_words import (
     result_in_words,
     shortened,
 )
+from characterisation.tasks.covariance import LEAST_CHANCE
 from mitsim.report.first_rows import ResultRow, RowValues, measured_words
 from mitsim.report.placement_figure import face_verdicts, placement_figure
 from mitsim.report.pose_texts import pose_of_view, pose_words
@@ -37,7 +38,7 @@ from mitsim.study.remedies.entries import remedies_in_words
 from mitsim.study.run_folder import Run
 from mitsim.study.scene_geometry import SceneGeometry
 from mitsim.study.statement_file import StatedMeasurement, StatementDocument
-from mitsim.views.view_scores import apart_in_words
+from mitsim.views.view_scores import TOGETHER, apart_in_words
 
 #: good: every tolerance fits; plain: there are no tolerances; warn: values are missing, or a verdict is open; bad: a
 #: tolerance does not fit, or a set of views exceeds a limit
@@ -93,9 +94,6 @@ class FirstScreen:
 
 #: reasons in the result in words: the first says how many tolerances fit
 _MOST_REASONS = 5
-
-#: share of the virtual measurements without a value from which a view counts as one that cannot make a measurement
-_MOSTLY = 0.5
 
 #: values of a measurement, and of its decision, that documents and rows hold by the same names
 _MEASURED = ("verdict", "bias", "without_value")
@@ -181,9 +179,9 @@ def _apart(run: Run, document: StatementDocument) -> str:
 
     The map may find a view impossible that makes a measurement.
     """
-    made = all(measurement.without_value <= _MOSTLY for measurement in document.measurements.values())
+    made = all(1 - measurement.without_value >= LEAST_CHANCE for measurement in document.measurements.values())
     apart = "" if made or run.about.view_sets else apart_in_words(run.scores)
-    return apart and f"By the map, {apart}. The table [set] of a study finds the fewest views that measure together"
+    return apart and f"By the map, {apart}. {TOGETHER}"
 
 
 def _caption(run: Run, view: int) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 from pydantic import Field, model_validator
-from scipy.special import gammaincinv
+from scipy.stats import chi2
 
 from characterisation.files.checked_files import read_json_object
 from characterisation.files.documents import validate
@@ -78,7 +78,7 @@ class CellEntry(PartialDocument):
 
 
 #: trials of the first round of a comparison; with as many, a standard uncertainty may be 1.4 times as large, and one of
-#: fewer is called rough
+#: fewer is called rough; chosen
 FEW_TRIALS = 24
 
 _Row = tuple[float, float, float, float]
@@ -139,7 +139,7 @@ class SensorEntry(PartialDocument):
         trials = min((cell.trials for cell in self.measurements.values() if cell.by == "statement"), default=0)
         if not 2 <= trials < FEW_TRIALS:
             return ""
-        factor = math.sqrt((trials - 1) / (2 * gammaincinv((trials - 1) / 2, 0.025)))
+        factor = math.sqrt((trials - 1) / chi2.ppf(0.025, trials - 1))
         return f"{trials} virtual measurements only: standard uncertainties may be {factor:.1f} times as large"
 
     @property

@@ -38,7 +38,7 @@ from mitsim.study.view_sets.confirmed_set import Search, joining_in_words
 from mitsim.study.virtual.race import Raced
 from mitsim.study.virtual.race_tables import raced_errors, with_race
 from mitsim.views import write_views
-from mitsim.views.view_scores import apart_in_words
+from mitsim.views.view_scores import TOGETHER, apart_in_words
 
 
 def score_study(
@@ -52,8 +52,7 @@ def score_study(
     study, folder = session.study, session.folder
     scores, inputs = session.screen(performance_map, limit)
     if apart := apart_in_words(scores):
-        together = "" if study.file.set else ". The table [set] of a study finds the fewest views that measure together"
-        say(f"{apart}, by the map{together}")
+        say(f"{apart}, by the map" + ("" if study.file.set else f". {TOGETHER}"))
     shares = stated_shares(study.task)
     search = partial(set_within, study, inputs, shares)
     chosen = _chosen_set(study, search)

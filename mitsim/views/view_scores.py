@@ -217,6 +217,10 @@ def not_scored_in_words(scores: xr.Dataset) -> str:
     return f"only {scored} of {views} views screened, for lack of time" if scored < views else ""
 
 
+#: what to do if no view can make all measurements
+TOGETHER = "The table [set] of a study finds the fewest views that measure together"
+
+
 def apart_in_words(scores: xr.Dataset) -> str:
     """Return which view can make the most measurements, if none can make all; empty otherwise, and for a single one."""
     possible = scores["uncertainty_possible"].values

@@ -92,6 +92,10 @@ class Change:
         Makes the virtual measurements; raises :class:`InputError` if the change is impossible.
     captures
         Number of captures whose mean is taken.
+    release
+        Frees the memory of its measurements.
+    needs_trials
+        Whether it takes virtual measurements of its own.
     """
 
     kind: str
@@ -102,6 +106,7 @@ class Change:
     state: Stating
     captures: int = 1
     release: Callable[[], None] = field(default=lambda: None)
+    needs_trials: bool = True
 
 
 class ChangedStudy:

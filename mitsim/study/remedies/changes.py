@@ -122,7 +122,8 @@ def _bias(now: Shortfall) -> Iterator[Change]:
 
     words = "with its bias subtracted"
     expected = {name: statement.standard_uncertainty for name, statement in able.items()}
-    yield Change("bias", words, {"decision": {"subtract_bias": True}}, (number,), expected, state)
+    keys = {"decision": {"subtract_bias": True}}
+    yield Change("bias", words, keys, (number,), expected, state, needs_trials=False)
 
 
 def _views(now: Shortfall) -> Iterator[Change]:
@@ -264,7 +265,6 @@ def _several_views(now: Shortfall) -> Iterator[Change]:
             needed[name] = limits[name] = of_tolerance[name]
     table, chosen = SetTable(seconds=_SEARCH_S), None
     while limits and chosen is None:
-        table = table.model_copy(update={"limits": dict(limits)})
         try:
             chosen = now.search(limits, table=table)
         except InputError as error:
@@ -278,6 +278,7 @@ def _several_views(now: Shortfall) -> Iterator[Change]:
         return
     listed = f"{', '.join(map(str, chosen.views[:-1]))} and {chosen.views[-1]}"
     keys = {"set": {"joining": table.joining, "limits": {name: needed[name] for name in able}}}
+    table = table.model_copy(update={"limits": limits})
 
     def state(count: int, limit: TimeLimit) -> list[Statement]:
         joined = changed_file(study.file, {"set": table.model_copy(update={"trials": count}).model_dump()})

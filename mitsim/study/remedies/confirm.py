@@ -117,7 +117,7 @@ def find_remedies(
         if not wanted or change.words in done:
             continue
         own = limit.part(_CHANGE_SHARE)
-        if own.left <= (_FEWEST * trial_s if change.kind != "bias" else 0.0):  # the bias needs no trials
+        if own.left <= (_FEWEST * trial_s if change.needs_trials else 0.0):
             found.untried.append(change.words)
             continue
         began = time.monotonic()

@@ -103,7 +103,8 @@ class Fake:
 
     def __init__(self, kind: str, expected: tuple[str, ...], error: str = "", **u: float) -> None:
         self.u, self.error, self.asked = u, error, list[int]()
-        self.change = Change(kind, f"with {kind}", {}, (1,), dict.fromkeys(expected, 0.0), self.state)
+        least, own = dict.fromkeys(expected, 0.0), kind != "bias"
+        self.change = Change(kind, f"with {kind}", {}, (1,), least, self.state, needs_trials=own)
 
     def state(self, count: int, _limit: TimeLimit) -> list[Statement]:
         if self.error:
