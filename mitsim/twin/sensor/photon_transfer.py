@@ -33,9 +33,11 @@ from mitsim.twin.finish.fine_detail import FINEST, level_variances
 #: number of bins by local mean; chosen
 _BINS = 24
 
-#: least distance from either end of the grey levels: of a pixel of repeated images in standard deviations of its noise,
-#: of a bin of one image in DN; chosen
-_CLEAR = 4.0
+#: least distance of a pixel of repeated images from either end of the grey levels [standard deviations]; chosen
+_CLEAR_SIGMAS = 4.0
+
+#: least distance of the level of a bin of one image from either end of the grey levels [DN]; chosen
+_CLEAR_DN = 4.0
 
 #: side [px] of the local mean around a pixel
 _AROUND_PX = 3
@@ -118,7 +120,7 @@ def repeated_line(repeats: list[Repeats], chip: Imager) -> TransferLine | None:
     for own in repeats:
         electrons = linearised(own.levels, chip)
         mean, variance = electrons.mean(axis=0), electrons.var(axis=0, ddof=1)
-        clear = _CLEAR * float(np.sqrt(own.levels.var(axis=0, ddof=1).mean()))
+        clear = _CLEAR_SIGMAS * float(np.sqrt(own.levels.var(axis=0, ddof=1).mean()))
         inside = (own.around > clear) & (own.around < chip.full_scale - clear)
         rows += _bins(mean[inside], variance[inside], own.around[inside], len(own.levels) - 1, chip)
     return _line(rows)
@@ -136,7 +138,7 @@ def one_image_line(
     rows, every = [], np.arange(chip.full_scale + 1.0)
     for level, variance, count in zip(levels, variances, counts, strict=True):
         shown = float(np.interp(level, linearised(every, chip), every))
-        if not _CLEAR < shown < chip.full_scale - _CLEAR:
+        if not _CLEAR_DN < shown < chip.full_scale - _CLEAR_DN:
             continue
         own = float(widths(np.array(shown), chip)) ** 2 / 12
         spread = 2 * variance**2 / (count * _MEDIAN_EFFICIENCY * independent_share())
