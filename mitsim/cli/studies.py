@@ -226,17 +226,23 @@ def exposures(
             help="Fraction by which points and uncertainty may miss their limit; default: from the study.",
         ),
     ] = None,
+    minutes: Annotated[
+        float | None,
+        typer.Option(min=0.1, help="Time for the whole command [min]; default: until the plan is finished."),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print exposures.json in place of the table.")] = False,
     variant: options.Variant = None,
 ) -> None:
     """Find the fewest exposures of one view with which every feature nearly reaches its least possible uncertainty.
 
     The limits of a feature are the most points and the smallest uncertainty that any exposures reach; --within says how
-    near is enough. The command simulates the light once and decodes sets of exposures. Exit code 1 if a feature that
-    the task needs has too few points at every exposure, or if a limit is not met.
+    near is enough. The command simulates the light once and decodes sets of exposures. If time ends, or with the first
+    Ctrl-C, the plan is the best single exposure that was tried. Exit code 1 if a feature that the task needs has too
+    few points at every exposure, or if a limit is not met.
 
     Example: mitsim study exposures scenes/two_pillars/study.toml --view 40 -o runs/exposures
     """
+    limit = TimeLimit(None if minutes is None else 60 * minutes)
     options.start(variant)
 
     from mitsim.study import ExposureTable, open_study
@@ -256,12 +262,16 @@ def exposures(
     shown = chosen.view(view, "--view")
     table = chosen.file.exposure or ExposureTable()
     rules = PlanRules(most or table.most, within or table.within)
-    plan = plan_view(rendered(Session(chosen).measurements), shown, rules)
+    with ending_in_order():
+        plan = plan_view(rendered(Session(chosen).measurements), shown, rules, limit)
+        stopped = stopped_by_user()
     document = plan_document(chosen, plan)
     write_json(output / "exposures.json", document)
     write_plan_csv(output / "exposures.csv", plan)
     print(json.dumps(document, indent=2) if as_json else plan_table(plan))
     say(f"plan: {output / 'exposures.json'}\n{plan_in_words(plan)}")
+    if stopped:
+        raise KeyboardInterrupt  # exit code 130
     if plan.unseen or not plan.reached:
         raise typer.Exit(1)
 

@@ -9,7 +9,7 @@ best view (:mod:`mitsim.study.virtual.stated`) -> predicted clouds, and images, 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -123,7 +123,7 @@ def run_within(
         Writes the report of the folder. Called for the first answer after :data:`FIRST_ANSWER_S`, and as it improves.
     """
     whole = None if limit.end is None else limit.end - limit.began
-    plan = time_plan(whole or 0.0, len(study.views), seeks_remedies(study))
+    plan = time_plan(whole or 0.0, len(study.views), seeks_remedies(study), measures_set(study))
     if whole is not None:
         say(plan.in_words())
     session, clock = Session(study, folder, workers), StepTimes()
@@ -160,7 +160,7 @@ def run_within(
         now = Shortfall(session, stated, scores, raced, search)
         stated, remedies = state_and_mend(session, now, rest, clock)
         twin = session.renderer
-    tried = [] if limit.over() else _confirm(session, chosen, search)
+    tried = [] if limit.over() else _confirm(session, chosen, search, plan.set_limit(limit))
     chosen = tried[-1].chosen if tried else chosen
     clock.lap("confirm")
     pictured = limit.part(1.0, plan.page(limit) if whole is not None else 0.0)
@@ -193,21 +193,28 @@ def run_within(
         view_sets=[] if chosen is None else [_set_record(study, chosen, tried)],
         remedies=None if remedies is None else remedies_document(remedies),
         seconds=clock.steps,
-        lacks=lacking(study, scores, raced, stated, limit),
+        lacks=lacking(study, scores, raced, stated, tried, limit),
         finished=not limit.over(),
     )
     return [] if stated is None else stated.statements
 
 
-def lacking(study: Study, scores: xr.Dataset, raced: Raced, stated: StatedView | None, limit: TimeLimit) -> list[str]:
+def lacking(
+    study: Study,
+    scores: xr.Dataset,
+    raced: Raced,
+    stated: StatedView | None,
+    tried: Sequence[TriedSet],
+    limit: TimeLimit,
+) -> list[str]:
     """Return what a run with a limit has not done, each in a few words; nothing for a run that ended by its own rules.
 
     Parameters
     ----------
     study
         Study of the run.
-    scores, raced, stated
-        Results of screening, race and statement.
+    scores, raced, stated, tried
+        Results of screening, race and statement, and sets of views that were measured, the best last.
     limit
         Time of the run.
     """
@@ -231,26 +238,37 @@ def lacking(study: Study, scores: xr.Dataset, raced: Raced, stated: StatedView |
             out.append(f"statement from {by}: {len(open_ones)} of {len(stated.statements)} not settled")
         if not any(statement.budget for statement in stated.statements):
             out.append("no budget")
+    if study.file.set is not None and tried and tried[-1].stated[0].trials < study.file.set.trials:
+        out.append(f"set of views: {tried[-1].stated[0].trials} of {study.file.set.trials} trials")
     if limit.over():
         out.append("pictures" if not stopped_by_user() else "stopped by the user")
     return out
 
 
-def _confirm(session: Session, chosen: ViewSet | None, search: Search) -> list[TriedSet]:
+def measures_set(study: Study) -> bool:
+    """Return whether a run measures a set of views virtually: the study asks for one, and for its trials."""
+    return study.file.set is not None and study.file.set.trials >= 2
+
+
+def _confirm(session: Session, chosen: ViewSet | None, search: Search, limit: TimeLimit) -> list[TriedSet]:
     """Measure sets of views virtually, if there are any, until one keeps its limits; the best set comes last."""
     table = session.study.file.set
-    if table is None or chosen is None or not chosen.views or table.trials < 2:
+    if table is None or chosen is None or not chosen.views or not measures_set(session.study):
         return []
     if session.renderer is None:
         say("the set of views is not confirmed: clouds drawn from a map cannot be joined")
         return []
-    tried = confirmed_set(session, chosen, search)
+    tried = confirmed_set(session, chosen, search, limit.over)
+    if not tried:
+        say("the set of views is not confirmed: time is over")
+        return []
     best = tried[-1]
     write_set_csv(session.folder / "view_set.csv", table, best)
     kept = "keeps its limits" if best.excess(table.limits) <= 1 else "the best set found, misses a limit"
     views = ", ".join(map(str, best.chosen.views))
+    made = max(statement.trials for statement in best.stated)
     say(
-        f"{len(best.chosen.views)} views ({views}), {joining_in_words(table)}, measured together {table.trials} times: "
+        f"{len(best.chosen.views)} views ({views}), {joining_in_words(table)}, measured together {made} times: "
         f"{kept} (sets measured: {len(tried)})\n"
         f"{set_table(table, best)}"
     )

@@ -49,6 +49,9 @@ from mitsim.study.virtual.trials import TrialFolder
 from mitsim.study.virtual.world import Unknowns
 from mitsim.views import View
 
+#: largest share of the time of a statement for the plan of its exposures; chosen
+_PLAN_SHARE = 0.5
+
 
 class Session:
     """A study that is being measured virtually. Everything is prepared on first use.
@@ -74,6 +77,7 @@ class Session:
     ) -> None:
         self.study, self.workers, self.separate_light = study, workers, separate_light
         self._folder = None if folder is None else Path(folder)
+        self._exposures: dict[int, PlannedExposure] = {}
 
     @property
     def folder(self) -> Path:
@@ -200,12 +204,17 @@ class Session:
         renderer = rendered(self.measurements)
         if table.exposures_s is not None:
             return stated_exposures(self.study, table.exposures_s, table.power)
-        rules = PlanRules(table.most, table.within)
-        return kept_plan(renderer, view, rules, self.folder / "exposures", self.digest, limit)
+        if view.number not in self._exposures:  # all trials of a session have one plan, finished or not
+            rules, folder = PlanRules(table.most, table.within), self.folder / "exposures"
+            self._exposures[view.number] = kept_plan(renderer, view, rules, folder, self.digest, limit)
+        return self._exposures[view.number]
 
-    def trials_of(self, view: View) -> TrialsOfView:
-        """Return what makes the trials of a statement of a view at its exposures, and where they are kept."""
-        planned = self.exposures(view)
+    def trials_of(self, view: View, limit: TimeLimit | None = None) -> TrialsOfView:
+        """Return what makes the trials of a statement of a view at its exposures, and where they are kept.
+
+        A plan of exposures may take half of the time within a ``limit``.
+        """
+        planned = self.exposures(view, None if limit is None else limit.part(_PLAN_SHARE))
         if planned is None:
             return TrialsOfView(self.runner, self.trials, None)
         runner = self.runner
@@ -229,7 +238,7 @@ class Session:
         table, limit, after_batch
             As of :func:`mitsim.study.virtual.stated.state_view`.
         """
-        return state_view(self.study, self.unknowns, self.trials_of(view), view, table, limit, after_batch)
+        return state_view(self.study, self.unknowns, self.trials_of(view, limit), view, table, limit, after_batch)
 
     def release(self) -> None:
         """Free the memory of the measurements, which are prepared again when they are needed."""

@@ -41,6 +41,9 @@ _LARGEST_REPORT_SHARE = 0.4
 #: share of the rest for the race; the statement gets what the race leaves
 _RACE_SHARE = 0.45
 
+#: share of the time that is left after the first statement for virtual measurements of a set of views; chosen
+_SET_SHARE = 0.4
+
 #: share of the time after the race for changes that would make measurements fit; the rest is that of the statement
 _REMEDIES_SHARE = 0.6
 
@@ -54,11 +57,12 @@ class TimePlan:
     statement: float
     report: float
     remedies: float = 0.0
+    sets: float = 0.0
 
     @property
     def total(self) -> float:
         """Return the planned time of all steps [s]."""
-        return self.screening + self.race + self.statement + self.remedies + self.report
+        return self.screening + self.race + self.statement + self.remedies + self.sets + self.report
 
     def in_words(self) -> str:
         """Return the plan in one line, like ``about 2 min: 20 s screening, ...``."""
@@ -67,6 +71,7 @@ class TimePlan:
             (self.race, "comparing views"),
             (self.statement, "statement"),
             *([(self.remedies, "changes that would fit")] if self.remedies else []),
+            *([(self.sets, "set of views")] if self.sets else []),
             (self.report, "pictures and report"),
         ]
         return f"about {_in_words(self.total)}: " + ", ".join(f"{_in_words(seconds)} {name}" for seconds, name in steps)
@@ -81,12 +86,16 @@ class TimePlan:
 
     def statement_limit(self, limit: TimeLimit) -> TimeLimit:
         """Return the limit of the statement, which starts now."""
-        both = self.statement + self.remedies
-        return limit.part(1.0 - (self.remedies / both if both > 0 else 0.0), self._pictures(limit))
+        after = self.statement + self.remedies + self.sets
+        return limit.part(self.statement / after if after > 0 else 1.0, self._pictures(limit))
 
     def rest_limit(self, limit: TimeLimit) -> TimeLimit:
-        """Return the limit of what starts now and may take all time but that of pictures and report."""
-        return limit.part(1.0, self._pictures(limit))
+        """Return the limit of what starts now and may take all time but that of the set, pictures and report."""
+        return limit.part(1.0 - (_SET_SHARE if self.sets else 0.0), self._pictures(limit))
+
+    def set_limit(self, limit: TimeLimit) -> TimeLimit:
+        """Return the limit of the virtual measurements of a set of views, which start now."""
+        return limit.part(1.0, self.page(limit))
 
     def _pictures(self, limit: TimeLimit) -> float:
         """Return the time [s] that is kept for pictures and report."""
@@ -98,14 +107,25 @@ class TimePlan:
         return min(busy * _PAGE_S, _PAGE_SHARE * limit.left)
 
 
-def time_plan(seconds: float, views: int, remedies: bool = False) -> TimePlan:
-    """Return the plan of a command of ``seconds`` with a number of candidate ``views``, with or without remedies."""
+def time_plan(seconds: float, views: int, remedies: bool = False, sets: bool = False) -> TimePlan:
+    """Return the plan of a command.
+
+    Parameters
+    ----------
+    seconds
+        Of the whole command.
+    views
+        Number of candidate views.
+    remedies, sets
+        Whether it looks for changes that would make measurements fit, and measures a set of views virtually.
+    """
     report = min(max(_REPORT_SHARE * seconds, _REPORT_S[0]), _REPORT_S[1], seconds / 2)
     screening = min(SCREENING_S * views, _SCREENING_SHARE * seconds)
     rest = max(0.0, seconds - report - screening)
     race, after = _RACE_SHARE * rest, (1 - _RACE_SHARE) * rest
-    share = _REMEDIES_SHARE if remedies else 0.0
-    return TimePlan(screening, race, (1 - share) * after, report, share * after)
+    second = (_REMEDIES_SHARE if remedies else _SET_SHARE if sets else 0.0) * after
+    joined = (_SET_SHARE * second if remedies else second) if sets else 0.0
+    return TimePlan(screening, race, after - second, report, second - joined, joined)
 
 
 def _in_words(seconds: float) -> str:

@@ -35,12 +35,14 @@ def test_the_first_ctrl_c_ends_every_limit_and_the_second_the_command():
 @pytest.mark.parametrize("seconds", [6.0, 30.0, 120.0, 600.0, 36000.0])
 @pytest.mark.parametrize("views", [1, 102, 5000])
 @pytest.mark.parametrize("remedies", [False, True])
-def test_a_plan_shares_out_all_of_the_time(seconds, views, remedies):
-    plan = time_plan(seconds, views, remedies)
+@pytest.mark.parametrize("sets", [False, True])
+def test_a_plan_shares_out_all_of_the_time(seconds, views, remedies, sets):
+    plan = time_plan(seconds, views, remedies, sets)
     steps = (plan.screening, plan.race, plan.statement, plan.report)
-    assert min(steps) > 0 and sum(steps) + plan.remedies == pytest.approx(seconds)
+    assert min(steps) > 0 and sum(steps) + plan.remedies + plan.sets == pytest.approx(seconds)
     words = plan.in_words()
     assert (plan.remedies > 0) == remedies == ("changes that would fit" in words)
+    assert (plan.sets > 0) == sets == ("set of views" in words)
     assert words.startswith("about ") and all(
         name in words for name in ("screening", "comparing views", "statement", "report")
     )

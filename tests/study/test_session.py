@@ -149,7 +149,7 @@ class NormalErrors:
 
 
 def stated_with(runner, study, folder, monkeypatch):
-    monkeypatch.setattr(Session, "trials_of", lambda session, _: TrialsOfView(runner, session.trials, None))
+    monkeypatch.setattr(Session, "trials_of", lambda session, *_: TrialsOfView(runner, session.trials, None))
     monkeypatch.setattr(state, "_settled", lambda _: False)
     return Session(study, folder).state(study.views[4]).statements
 

@@ -11,6 +11,8 @@ require a longer exposure, in which the room adds more light.
 The predicted points of a set are those that at least one of its exposures recovers alone. Sets that could reach the
 limits are decoded. The best of many noisy results is biased. So the search uses few noise samples, and the decision
 more samples of independent noise. A set misses a limit of u only if the difference exceeds twice its standard error.
+
+If time ends before the decision, the plan is the single exposure that comes closest to the limits of those tried.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsim.running.time_limit import OutOfTimeError
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study.exposures.exposure_sweep import ExposureResult, FeatureResult
 
@@ -79,6 +82,7 @@ class ExposurePlan:
     - ``reached``: whether the plan reached all limits when it was chosen.
     - ``unseen``: features with too few points at every exposure.
     - ``sets_tried``: number of decoded sets, single exposures included.
+    - ``finished``: whether time sufficed for sets of several exposures and for the decision among them.
     """
 
     view: int
@@ -89,16 +93,29 @@ class ExposurePlan:
     reached: bool
     unseen: tuple[str, ...]
     sets_tried: int
+    finished: bool = True
 
 
 class _Results:
-    """Results with one noise, each computed once: call it with a set of exposures. ``known`` has all of them."""
+    """Results with one noise, each computed once: call it with a set of exposures. ``known`` has all of them.
 
-    def __init__(self, evaluate: Callable[[PlannedExposure, int, int], ExposureResult], noise: int) -> None:
-        self.evaluate, self.noise, self.known = evaluate, noise, dict[PlannedExposure, ExposureResult]()
+    The first is computed even if time is over; after it, a call for a new one raises
+    :class:`~mitsim.running.time_limit.OutOfTimeError`.
+    """
+
+    def __init__(
+        self,
+        evaluate: Callable[[PlannedExposure, int, int], ExposureResult],
+        noise: int,
+        over: Callable[[], bool],
+    ) -> None:
+        self.evaluate, self.noise, self.over = evaluate, noise, over
+        self.known = dict[PlannedExposure, ExposureResult]()
 
     def __call__(self, exposure: PlannedExposure) -> ExposureResult:
         if exposure not in self.known:
+            if self.known and self.over():
+                raise OutOfTimeError
             self.known[exposure] = self.evaluate(exposure, self.noise, DRAWS[self.noise])
         return self.known[exposure]
 
@@ -110,8 +127,9 @@ def plan_exposures(
     rules: PlanRules,
     dimmable: bool = True,
     view: int = 0,
+    over: Callable[[], bool] = lambda: False,
 ) -> ExposurePlan:
-    """Plan the exposures of one view.
+    """Plan the exposures of one view, or take the best single exposure that was tried when time ends.
 
     Parameters
     ----------
@@ -127,27 +145,42 @@ def plan_exposures(
         Whether the power may be lowered if the shortest exposure is too bright.
     view
         Number of the view, for the plan.
+    over
+        Returns whether time is over.
     """
-    search, decision, report = (_Results(evaluate, noise) for noise in (SEARCH, DECISION, REPORT))
-    singles = _sweep(search, own, limits_s, dimmable)
-    names = list(singles[0].features)
-    full_power = [single for single in singles if single.exposure.power == 1.0]
-    # with half of the exposures, the greedy search finds other sets
-    sets = [_greedy_sets(search, start, names, rules.most) for start in (full_power, full_power[::2])]
-    first_limits = _measurable(_limits(list(search.known.values()), names))
-    for exposure in {own, *(result.exposure for result in _nearest(singles, first_limits)), *sets[0], *sets[1]}:
-        decision(exposure)
-    limits = _measurable(_limits(list(decision.known.values()), names))
-    chosen, reached = (
-        _fewest_exposures(search, decision, full_power, limits, rules) if limits else (decision(own), False)
-    )
-    added = []
-    for prefix in _by_usefulness(decision, chosen.exposure, limits or _limits([chosen], names)):
-        added.append((prefix[-1], report(PlannedExposure(tuple(sorted(prefix)), chosen.exposure.power))))
+    search, decision, report = (_Results(evaluate, noise, over) for noise in (SEARCH, DECISION, REPORT))
+    try:
+        singles = _sweep(search, own, limits_s, dimmable)
+        names = list(singles[0].features)
+        full_power = [single for single in singles if single.exposure.power == 1.0]
+        # with half of the exposures, the greedy search finds other sets
+        sets = [_greedy_sets(search, start, names, rules.most) for start in (full_power, full_power[::2])]
+        first_limits = _measurable(_limits(list(search.known.values()), names))
+        for exposure in {own, *(result.exposure for result in _nearest(singles, first_limits)), *sets[0], *sets[1]}:
+            decision(exposure)
+        limits = _measurable(_limits(list(decision.known.values()), names))
+        chosen, reached = (
+            _fewest_exposures(search, decision, full_power, limits, rules) if limits else (decision(own), False)
+        )
+        added = []
+        for prefix in _by_usefulness(decision, chosen.exposure, limits or _limits([chosen], names)):
+            added.append((prefix[-1], report(PlannedExposure(tuple(sorted(prefix)), chosen.exposure.power))))
+        unseen = tuple(name for name in names if name not in limits)
+        tried = len(search.known | decision.known)
+        return ExposurePlan(view, chosen.exposure, tuple(added), report(own), limits, reached, unseen, tried)
+    except OutOfTimeError:
+        return _best_single(search, search.known.get(own) or evaluate(own, SEARCH, DRAWS[SEARCH]), view)
+
+
+def _best_single(search: _Results, own: ExposureResult, view: int) -> ExposurePlan:
+    """Return the single exposure that comes closest to the limits of those tried, as a plan that is not finished."""
+    singles = [result for exposure, result in search.known.items() if len(exposure.exposures_s) == 1]
+    names = list(own.features)
+    limits = _measurable(_limits(singles, names))
+    best = min(singles, key=lambda result: (shortfall(result, limits), result.exposure.seconds))
+    added = ((best.exposure.exposures_s[0], best),)
     unseen = tuple(name for name in names if name not in limits)
-    return ExposurePlan(
-        view, chosen.exposure, tuple(added), report(own), limits, reached, unseen, len(search.known | decision.known)
-    )
+    return ExposurePlan(view, best.exposure, added, own, limits, False, unseen, len(search.known), False)
 
 
 def shortfall(result: ExposureResult, limits: dict[str, FeatureResult]) -> float:
@@ -169,7 +202,8 @@ def _sweep(
     search: _Results, own: PlannedExposure, limits_s: tuple[float, float], dimmable: bool
 ) -> list[ExposureResult]:
     """Return the results of single exposures around the sensor's own, shortest first."""
-    middle = math.exp(np.mean(np.log(own.exposures_s)))
+    several = len(own.exposures_s) > 1
+    middle = math.exp(np.mean(np.log(own.exposures_s))) if several else own.exposures_s[0]
     shortest, longest = limits_s
     best: dict[str, float] = {}
     found = [search(PlannedExposure((middle,)))]

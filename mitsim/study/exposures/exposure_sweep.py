@@ -32,7 +32,6 @@ from characterisation.features.surfaces import GRAZING_COSINE, Surface
 from characterisation.files.arrays import Floats
 from characterisation.point_cloud import PointCloud, Status
 from characterisation.tasks.task_file import Task
-from mitsim.running.time_limit import OutOfTimeError, TimeLimit
 from mitsim.scene.light_transport.ambient import has_emitters
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import MINIMUM_POINTS
@@ -91,12 +90,10 @@ class _PossiblePoints:
 class ExposureSweep:
     """Light of one view on the imagers, which can be exposed any number of times.
 
-    ``dimmable``: whether all light is the projector's, so that a lower power reduces all of it. After the ``limit``,
-    an evaluation raises :class:`~mitsim.running.time_limit.OutOfTimeError`.
+    ``dimmable``: whether all light is the projector's, so that a lower power reduces all of it.
     """
 
-    def __init__(self, renderer: RenderedMeasurements, view: View, limit: TimeLimit | None = None) -> None:
-        self.limit = TimeLimit() if limit is None else limit
+    def __init__(self, renderer: RenderedMeasurements, view: View) -> None:
         drawn = replace(renderer.unknowns, varied=()).draw(Trial(0))
         self.renderer, self.view = renderer, view
         self.lit = renderer.lit(view, drawn)
@@ -110,8 +107,6 @@ class ExposureSweep:
 
         Each number ``noise`` has its own, independent samples.
         """
-        if self.limit.over():
-            raise OutOfTimeError
         results: dict[str, list[FeatureResult]] = {name: [] for name in self.possible}
         recovered: dict[str, NDArray[np.bool_]] = {}
         for k in range(draws):

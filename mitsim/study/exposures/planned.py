@@ -54,7 +54,7 @@ def kept_plan(
     digest: str,
     limit: TimeLimit | None = None,
 ) -> PlannedExposure:
-    """Return the planned exposures of a view, and keep the plan in a folder for the next call.
+    """Return the planned exposures of a view, and keep a finished plan in a folder for the next call.
 
     Parameters
     ----------
@@ -79,8 +79,9 @@ def kept_plan(
         if stored is not None and stored.digest == digest_of_plan:
             return PlannedExposure(tuple(stored.exposures_s), stored.power)
     plan = plan_view(renderer, view, rules, limit)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, plan_document(renderer.study, plan) | {"digest": digest_of_plan})
+    if plan.finished:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path, plan_document(renderer.study, plan) | {"digest": digest_of_plan})
     say(f"view {view.number}: {plan_in_words(plan)}")
     return plan.exposure
 
@@ -95,23 +96,18 @@ def plan_view(
     renderer, view, rules
         Virtual measurements, view, and rules of the plan.
     limit
-        Time; none by default.
-
-    Raises
-    ------
-    OutOfTimeError
-        If time ends before the plan.
+        Time, none by default. If it ends before the plan, the best single exposure that was tried is the plan.
     """
     sensor = renderer.study.sensor
     policy = sensor.exposure
     if policy.limits_s == _NO_LIMITS:
         say(f"{sensor.name} states no exposure limits: any exposure is allowed")
     own = PlannedExposure(policy.exposures(None, float(sensor.imager.full_well)))
-    sweep = ExposureSweep(renderer, view, limit)
+    sweep, limit = ExposureSweep(renderer, view), limit or TimeLimit()
     if not sensor.merges_exposures:
         say(f"{sensor.name} cannot merge exposures: the plan has one exposure")
         rules = PlanRules(1, rules.within)
-    return plan_exposures(sweep.evaluate, own, policy.limits_s, rules, sweep.dimmable, view.number)
+    return plan_exposures(sweep.evaluate, own, policy.limits_s, rules, sweep.dimmable, view.number, limit.over)
 
 
 def rendered(measurements: RenderedMeasurements | MappedMeasurements) -> RenderedMeasurements:
@@ -171,6 +167,7 @@ def plan_document(study: Study, plan: ExposurePlan) -> dict[str, Any]:
         "reached": plan.reached,
         "limits_s": list(study.sensor.exposure.limits_s),
         "sets_tried": plan.sets_tried,
+        "finished": plan.finished,
         "unseen": list(plan.unseen),
         "limits": {
             name: {"points": limit.points, "fraction": limit.fraction, "u_mm": _number(limit.u)}
@@ -244,7 +241,10 @@ def plan_in_words(plan: ExposurePlan) -> str:
         return f"no exposure gives enough points on any feature that the task needs: {', '.join(plan.unseen)}"
     count = len(plan.exposure.exposures_s)
     text = f"expose {exposure_in_words(plan.exposure)}: "
-    if plan.reached:
+    if not plan.finished:
+        tried = f"the best of {plan.sets_tried}" if plan.sets_tried > 1 else "the only one"
+        text += f"{tried} that time allowed to try"
+    elif plan.reached:
         text += "every feature" if not plan.unseen else "every other feature"
         text += f" is at its limit with {count} exposure{'s' if count > 1 else ''}"
     else:

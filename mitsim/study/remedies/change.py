@@ -117,19 +117,11 @@ class ChangedStudy:
         self.session: Session | None = None
 
     def state(self, count: int, limit: TimeLimit) -> list[Statement]:
-        """State every measurement from a number of trials, or those within a limit.
-
-        Raises
-        ------
-        OutOfTimeError
-            If exposures are planned, and time ends before the plan.
-        """
+        """State every measurement from a number of trials, or those within a limit."""
         if self.session is None:
             self.now.session.release()
             self.session = Session(self.study(), self.now.folder / self.name, self.now.session.workers)
-        view = self.view(self.session.study)
-        self.session.exposures(view, limit)  # planned ones are kept
-        return self.session.state(view, StatementTable(trials=count), limit).statements
+        return self.session.state(self.view(self.session.study), StatementTable(trials=count), limit).statements
 
     def release(self) -> None:
         """Free the memory of the measurements."""

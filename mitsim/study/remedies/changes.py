@@ -11,6 +11,7 @@ gets the study that was measured.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -117,7 +118,8 @@ def _bias(now: Shortfall) -> Iterator[Change]:
 
     def state(_: int, limit: TimeLimit) -> list[Statement]:
         # the trials of the statement itself
-        again = Session(replace(now.study, task=corrected), session.folder, session.workers)
+        again = copy.copy(session)
+        again.study = replace(now.study, task=corrected)
         return again.state(again.study.view(number), StatementTable(trials=most), limit).statements
 
     words = "with its bias subtracted"

@@ -76,19 +76,35 @@ class TriedSet:
         return max((_excess(found[name], limits[name]) for name in reachable), default=0.0)
 
 
-def confirmed_set(session: Session, first: ViewSet, search: Search) -> list[TriedSet]:
-    """Measure the first set, and sets for stricter limits until one keeps the limits.
+def confirmed_set(
+    session: Session, first: ViewSet, search: Search, over: Callable[[], bool] = lambda: False
+) -> list[TriedSet]:
+    """Measure the first set, and sets for stricter limits until one keeps the limits, or time is over.
 
-    Returns all measured sets, the best last: the set that keeps all reachable limits, or the one of least excess.
-    Trials in the folder are reused. Says of each set which limits it misses, and why no further set is tried.
+    Returns all sets with at least two virtual measurements, the best last: the set that keeps all reachable limits, or
+    the one of least excess. Trials in the folder are reused. Says of each set which limits it misses, and why no
+    further set is tried.
+
+    Parameters
+    ----------
+    session
+        The study, with a table ``set``.
+    first
+        Set that is measured first.
+    search
+        Finds a set for other limits.
+    over
+        Returns whether time is over.
     """
     table = session.study.file.set
     assert table is not None
     chosen, searched, tried = first, dict(table.limits), list[TriedSet]()
     while True:
-        stated = state_set(session, chosen)
+        stated = state_set(session, chosen, over)
+        if over() and stated[0].trials < 2:
+            break
         tried.append(TriedSet(chosen, dict(searched), tuple(stated)))
-        if tried[-1].excess(table.limits) <= 1:
+        if tried[-1].excess(table.limits) <= 1 or over():
             break
         say(f"set {len(tried)}, views {', '.join(map(str, chosen.views))}: {_missed(tried[-1], table.limits)}")
         if len(tried) == MOST_SETS:

@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
 
 import numpy as np
 
@@ -53,17 +52,9 @@ class JoinedMeasurements:
         self.known = pose_covariance(*table.pose_known)
 
     def run(self, days: Iterable[int]) -> Iterable[tuple[int, Outcome]]:
-        """Yield the outcome of every virtual measurement, day by day.
-
-        Days with the same finish are consecutive.
-        """
-        draw = self.renderer.unknowns.draw
-        order = sorted(days, key=lambda day: draw(Trial(day)).finish)
-        for _, days_of_finish in groupby(order, key=lambda day: draw(Trial(day)).finish):
-            row = list(days_of_finish)
-            measured = [{day: self._measure_view(view, k, day) for day in row} for k, view in enumerate(self.views)]
-            for day in row:
-                yield day, self._measured([one[day] for one in measured], day)
+        """Yield the outcome of every virtual measurement, day by day."""
+        for day in days:
+            yield day, self._measured([self._measure_view(view, k, day) for k, view in enumerate(self.views)], day)
 
     def _measure_view(self, view: View, place: int, day: int) -> _MeasuredView:
         """Return the points of one view on one day; its ``place`` in the set is the number of its capture."""

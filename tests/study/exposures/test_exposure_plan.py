@@ -17,6 +17,8 @@ from mitsim.study.exposures.planned import plan_document, plan_in_words, plan_ta
 
 POINTS = 4000
 
+LIMITS = SimpleNamespace(limits_s=(1e-5, 1.0))
+
 
 def sensor_of(brightness: dict[str, tuple[float, float]], dark: float = 0.1, full: float = 1.0):
     """Return a function that gives the results of exposures.
@@ -71,6 +73,29 @@ def test_of_sets_that_reach_the_limits_the_shortest_is_planned():
     grid = [0.01 * math.sqrt(2) ** k for k in range(-12, 13)]
     sufficient = [t for t in grid if shortfall(evaluate(PlannedExposure((t,)), 0, 1), plan.limits) <= 0.1]
     assert plan.exposure.exposures_s[0] == pytest.approx(min(sufficient), rel=0.01)
+
+
+def test_when_time_ends_the_plan_is_the_best_single_exposure_so_far():
+    """The dark feature needs 16 times the sensor's own exposure: eight steps of the sweep."""
+    evaluate, tried = sensor_of({"bright": (20, 60), "dark": (1.25, 4)}), []
+
+    def counted(exposure, noise, draws):
+        tried.append(exposure)
+        return evaluate(exposure, noise, draws)
+
+    def plan_after(count):
+        tried.clear()
+        over = lambda: len(tried) >= count  # noqa: E731
+        own = PlannedExposure((0.01,))
+        return plan_exposures(counted, own, (1e-5, 1.0), PlanRules(), over=over)
+
+    at_once, soon, whole = plan_after(0), plan_after(6), plan_after(10**6)
+    assert at_once.exposure.exposures_s == (0.01,) and at_once.sets_tried == 1 and at_once.unseen == ("dark",)
+    assert soon.sets_tried == 6 and soon.exposure.exposures_s[0] > 0.01 and len(soon.added) == 1
+    assert [plan.finished for plan in (at_once, soon, whole)] == [False, False, True]
+    assert "the best of 6 that time allowed" in plan_in_words(soon) and "time" not in plan_in_words(whole)
+    study = SimpleNamespace(path="", sensor=SimpleNamespace(name="", exposure=LIMITS))
+    assert not plan_document(study, soon)["finished"]
 
 
 def test_one_exposure_is_planned_where_no_more_may_be_merged_and_the_limits_then_are_those_of_one():

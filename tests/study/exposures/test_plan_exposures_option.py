@@ -11,7 +11,7 @@ import pytest
 import typer.main
 
 from mitsim.cli.program import app
-from mitsim.running.time_limit import OutOfTimeError, TimeLimit
+from mitsim.running.time_limit import TimeLimit
 from mitsim.study import open_study
 from mitsim.study.exposures import exposure_plan, planned
 from mitsim.study.reading import with_plan
@@ -120,14 +120,14 @@ def test_state_and_choose_plan_as_run_does(chosen, plans, command):
         assert captured["exposures_s"] == stated["exposure"]["exposures_s"]
 
 
-def test_a_plan_ends_with_its_time_and_is_not_kept(chosen):
+def test_a_plan_ends_with_its_time_holds_for_its_session_and_is_not_kept(chosen, capsys):
     folder, _, view = chosen
     study = open_study(folder / "study.toml")
     planned_study = with_plan(study, True)
     here = Session(planned_study, folder / "late")
-    with pytest.raises(OutOfTimeError):
-        here.exposures(study.view(view), TimeLimit(0.0))
-    assert not (folder / "late/exposures").exists()
+    first = here.exposures(study.view(view), TimeLimit(0.0))
+    assert "the only one that time allowed to try" in capsys.readouterr().err
+    assert here.trials_of(study.view(view)).planned == first and not (folder / "late/exposures").exists()
 
 
 def test_without_the_option_the_sensors_own_exposure_holds(chosen):

@@ -20,7 +20,7 @@ LIMITS = {"apart": 0.1, "radius": 0.1}
 def search_and_measure(monkeypatch):
     """Views of noise 0.2 as the map has it and of 0.2 ``hope`` in truth, with a ``floor`` that no view averages."""
 
-    def run(hope=(1.0, 1.0), floor=0.0, most=VIEWS):
+    def run(hope=(1.0, 1.0), floor=0.0, most=VIEWS, sets=MOST_SETS + 1):
         measured = []
 
         def search(limits):
@@ -29,7 +29,7 @@ def search_and_measure(monkeypatch):
             count = max([one for one, fine in zip(wanted, able, strict=True) if fine], default=0)
             return ViewSet(tuple(range(count)), np.full(2, 0.2 / np.sqrt(max(count, 1))), able, True)
 
-        def state(session, chosen):
+        def state(session, chosen, over):
             measured.append(len(chosen.views))
             rng = np.random.default_rng(len(measured))
             spread = 0.2 * np.array(hope) / np.sqrt(len(chosen.views))
@@ -41,7 +41,7 @@ def search_and_measure(monkeypatch):
         monkeypatch.setattr(confirmed_set, "state_set", state)
         study = SimpleNamespace(file=SimpleNamespace(set=SetTable(limits=LIMITS)), task=TASK)
         session = SimpleNamespace(study=study)
-        tried = confirmed_set.confirmed_set(session, search(LIMITS), search)
+        tried = confirmed_set.confirmed_set(session, search(LIMITS), search, lambda: len(measured) >= sets)
         assert measured[0] == 4 and len(measured) == len(tried) <= MOST_SETS
         return tried, measured
 
@@ -51,6 +51,12 @@ def search_and_measure(monkeypatch):
 def test_a_set_that_keeps_its_limits_is_measured_once(search_and_measure):
     tried, measured = search_and_measure(hope=(0.9, 0.9))
     assert measured == [4] and tried[-1].excess(LIMITS) <= 1
+
+
+def test_when_time_ends_no_further_set_is_measured(search_and_measure):
+    whole, _ = search_and_measure(hope=(1.5, 0.5))
+    tried, measured = search_and_measure(hope=(1.5, 0.5), sets=1)
+    assert len(tried) == len(measured) == 1 < len(whole)
 
 
 def test_a_map_that_is_too_hopeful_by_half_gets_a_set_of_more_than_twice_the_views(search_and_measure):
