@@ -1,4 +1,4 @@
-"""Region of interest: a rectangle of pixels of an image, as a camera reads one out.
+"""Describe a region of interest: a rectangle of pixels of an image.
 
 One class serves the renderer, the decoders and the measurements, for camera images and for the grids of clouds.
 """
@@ -15,9 +15,9 @@ from characterisation.files.errors import InputError
 
 @dataclass(frozen=True)
 class Roi:
-    """``width`` x ``height`` pixels whose first column is ``left`` and whose first row is ``top``.
+    """A region of ``width`` x ``height`` pixels from column ``left`` and row ``top`` on.
 
-    Settings of captures and options of commands write it as these four numbers, in this order.
+    Settings of captures and options of commands give these four numbers in the order of the fields.
     """
 
     left: int
@@ -27,12 +27,12 @@ class Roi:
 
     @classmethod
     def whole(cls, width: int, height: int) -> Roi:
-        """All pixels of an image."""
+        """Return the region of all pixels of an image."""
         return cls(0, 0, width, height)
 
     @classmethod
     def between(cls, left: float, top: float, right: float, bottom: float) -> Roi:
-        """From its edges, whole numbers.
+        """Return the region between edges.
 
         Parameters
         ----------
@@ -55,32 +55,32 @@ class Roi:
 
     @property
     def right(self) -> int:
-        """First column after the region."""
+        """Return the first column after the region."""
         return self.left + self.width
 
     @property
     def bottom(self) -> int:
-        """First row after the region."""
+        """Return the first row after the region."""
         return self.top + self.height
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """Rows and columns, to index an image (H, W) with."""
+        """Return slices of rows and columns, to index an image (H, W)."""
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
     def pixels(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Columns and rows (height, width) of all its pixels."""
+        """Return columns and rows (height, width) of all pixels."""
         columns, rows = np.meshgrid(np.arange(self.left, self.right), np.arange(self.top, self.bottom))
         return columns, rows
 
     def overlap(self, other: Roi) -> Roi | None:
-        """Return the region that two share, None if they share no pixel."""
+        """Return the common region of two; None if they share no pixel."""
         left, top = max(self.left, other.left), max(self.top, other.top)
         right, bottom = min(self.right, other.right), min(self.bottom, other.bottom)
         return Roi.between(left, top, right, bottom) if left < right and top < bottom else None
 
     def fits(self, width: int, height: int) -> bool:
-        """Whether it holds a pixel and lies in an image of this size."""
+        """Return whether the region holds a pixel and lies in an image of this size [px]."""
         return 0 <= self.left < self.right <= width and 0 <= self.top < self.bottom <= height
 
 

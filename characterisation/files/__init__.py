@@ -1,1 +1,1 @@
-"""What both packages stand on: errors, documents and files that are read with limits and written whole."""
+"""Share errors, documents and file access between both packages: bounded reading, atomic writing."""

@@ -1,4 +1,4 @@
-"""Files and folders that are there whole or not at all, on a full disk too."""
+"""Write files and folders atomically: completely or not at all, also on a full disk."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ from characterisation.files.checked_files import DIGEST, SEAL, dataset_digest
 if TYPE_CHECKING:  # the command line wants FULL, and --help is to be quick
     import xarray as xr
 
-#: what a system says where a disk, a quota or a process's largest file is full
+#: error numbers of a full disk, of a full quota, and of a file over the largest size of a process
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
-#: this machine in the names of what is being written: the number of a process says nothing on another
+#: this machine in the names of partial files, since process numbers of different machines may be equal
 HOST = hashlib.sha256(platform.node().encode()).hexdigest()[:6]
 
-#: bytes that netCDF writes for a file beside the values; measured: 8 kB
+#: bytes of a netCDF file beside its values, for each file; measured: 8 kB
 _NETCDF_FILE = 16 * 1024
 
-#: bytes that netCDF writes for each variable beside the values; measured: 2.9 kB, deflated
+#: the same for each variable; measured: 2.9 kB, deflated
 _NETCDF_VARIABLE = 4 * 1024
 
 
 @contextmanager
 def atomic_write(path: str | Path) -> Iterator[Path]:
-    """Give a place beside ``path`` to write to; it takes the name when the block ends well, and is gone otherwise.
+    """Yield a temporary path beside ``path``; it is renamed to ``path`` when the block succeeds, and removed otherwise.
 
     Raises
     ------
     OSError
-        Where there is no room: its ``errno`` is in :data:`FULL`, its ``filename`` is ``path``.
+        If the disk is full: its ``errno`` is in :data:`FULL`, its ``filename`` is ``path``.
     """
     path = Path(path)
     partial = path.with_name(f".{path.name}.{os.getpid()}-{HOST}.partial")
@@ -50,13 +50,13 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
             yield partial
             partial.replace(path)
     finally:
-        with suppress(OSError):  # a read-only file system refuses that too; its reason is already reported
+        with suppress(OSError):  # a read-only file system rejects that too; its error is already reported
             partial.unlink(missing_ok=True)
 
 
 @contextmanager
 def atomic_write_named(path: str | Path) -> Iterator[Path]:
-    """:func:`atomic_write` for libraries that go by the end of a name: a place of that name in a folder beside it.
+    """Yield a temporary path of the same name in a folder beside ``path``, for libraries that need the suffix.
 
     Raises
     ------
@@ -74,12 +74,12 @@ def atomic_write_named(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(folder: str | Path) -> Iterator[Path]:
-    """Make a folder beside ``folder``; it takes the name when the block ends well, and is gone otherwise.
+    """Yield a temporary folder beside ``folder``; it is renamed when the block succeeds, and removed otherwise.
 
     Raises
     ------
     OSError
-        As :func:`atomic_write`, and if ``folder`` is there with files in it.
+        As :func:`atomic_write`, or if ``folder`` exists and is not empty.
     """
     folder = Path(folder).absolute()
     partial = _beside(folder, "partial")
@@ -93,21 +93,21 @@ def atomic_folder(folder: str | Path) -> Iterator[Path]:
 
 
 def _beside(folder: Path, kind: str) -> Path:
-    """Return a path beside a folder that no other process uses, by which :mod:`mitsim.cli.folder_lock` knows ours."""
+    """Return a path beside a folder that no other process uses; :mod:`mitsim.cli.folder_lock` recognises its form."""
     return folder.with_name(f".{folder.name}.{kind}-{os.getpid()}-{HOST}{uuid.uuid4().hex[:12]}")
 
 
 def write_folder(folder: str | Path, files: Mapping[str, bytes], *, overwrite: bool = False) -> None:
-    """Write a folder of files by their paths in it, so that it survives a loss of power as a whole or not at all.
+    """Write a folder of files by their paths in it; after a loss of power it is complete or absent.
 
-    The files are written beside it, flushed to the disk and moved there in one step. ``overwrite`` replaces a folder
-    that is there.
+    The files are written beside the folder, flushed to the disk, and renamed in one step. ``overwrite`` replaces an
+    existing folder.
 
     Raises
     ------
     OSError
-        If it cannot be written, or is there already; what was there before is there still. Where there is no room, its
-        ``errno`` is in :data:`FULL` and its ``filename`` is ``folder``.
+        If the folder cannot be written, or exists already; an existing folder is then unchanged. If the disk is full,
+        ``errno`` is in :data:`FULL` and ``filename`` is ``folder``.
     """
     folder = Path(folder).absolute()
     partial, old = _beside(folder, "partial"), _beside(folder, "old")
@@ -138,7 +138,7 @@ def _write_synced(file: Path, data: bytes) -> None:
 
 
 def _sync_directory(directory: Path) -> None:
-    """Make names durable too, where the system can (Windows cannot open a folder)."""
+    """Flush the names in a folder to the disk, except on Windows, which cannot open a folder."""
     if os.name == "posix":
         handle = os.open(directory, os.O_RDONLY)
         try:
@@ -149,7 +149,7 @@ def _sync_directory(directory: Path) -> None:
 
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
-    """Say what it was that cannot be written: ``write`` itself names no file, and others name the place beside it."""
+    """Name ``path`` in errors of writing: ``write`` names no file, and other calls name the temporary path."""
     try:
         yield
     except OSError as error:
@@ -159,11 +159,11 @@ def _naming(path: Path) -> Iterator[None]:
 
 
 def write_netcdf(data: xr.Dataset, path: str | Path, encoding: Mapping[Any, Mapping[str, Any]] | None = None) -> None:
-    """Write a dataset as netCDF with a digest of its content, whole or not at all.
+    """Write a dataset as netCDF with a digest of its content, atomically.
 
-    Room for all of it uncompressed is asked for first: on a full disk HDF5 says "HDF error" or "Permission denied",
-    and holds the file open, and with it the room, until the process ends. Behind the last byte stands a seal, by which
-    a reader knows a damaged file before HDF5 parses it: on some of them it never ends.
+    The function first writes as many bytes as the uncompressed data need: on a full disk HDF5 reports "HDF error" or
+    "Permission denied", and holds the file open until the process ends. A seal follows the last byte. A reader checks
+    it before HDF5 parses the file, which may hang on a damaged file.
     """
     data = data.assign_attrs({DIGEST: dataset_digest(data)})
     attributes = [data.attrs, *(variable.attrs for variable in data.variables.values())]
@@ -180,18 +180,18 @@ def write_netcdf(data: xr.Dataset, path: str | Path, encoding: Mapping[Any, Mapp
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write text as UTF-8 whole or not at all."""
+    """Write text as UTF-8, atomically."""
     with atomic_write(path) as file:
         file.write_text(text, encoding="utf-8")
 
 
 def write_json(path: str | Path, data: Any) -> None:
-    """Write JSON whole or not at all."""
+    """Write JSON, atomically."""
     write_text(path, json.dumps(data, indent=2, ensure_ascii=False) + "\n")
 
 
 def json_values(value: Any) -> Any:
-    """Value as JSON has it: null for numbers that are not finite, lists for tuples; also inside lists and tables."""
+    """Return a value for JSON: null for numbers that are not finite, lists for tuples; also inside lists and tables."""
     if isinstance(value, dict):
         return {key: json_values(one) for key, one in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""Files that are believed only as far as they can be checked: bounded in size, inside their folder, with a checksum."""
+"""Read files with checks: of a bounded size, inside their folder, with a checksum."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DIGEST = "content_sha256"
 #: text that mitsim appends to a netCDF file; the SHA-256 of all bytes before it follows, in hexadecimal digits
 SEAL = b"mitsim sha256 "
 
-#: the largest single file that is read [bytes]
+#: size of the largest file that is read [bytes]
 LARGEST_FILE = 256 * 1024**2
 
 
@@ -33,18 +33,18 @@ def read_bounded(
     file
         Path of the file.
     absent
-        Name of the expected file, for the error about a missing one; without it a missing file cannot be read.
+        Description of the expected file, for the error about a missing file.
     hint
         Advice that the errors add.
     largest
         Largest size [bytes].
     first
-        Number of bytes to read from its beginning; all without it.
+        Number of bytes to read from the beginning; by default all.
 
     Raises
     ------
     InputError
-        If it is missing, too large, a folder, a pipe or a device, or cannot be read.
+        If the file is missing, too large, a folder, a pipe or a device, or cannot be read.
 
     See Also
     --------
@@ -72,7 +72,7 @@ def read_bounded(
 
 
 def read_text_bounded(file: Path, absent: str | None = None, hint: str = "", largest: int = LARGEST_FILE) -> str:
-    """Read a plain file of at most ``largest`` bytes as UTF-8, with or without its mark.
+    """Read a plain file of at most ``largest`` bytes as UTF-8, with or without a byte order mark.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def read_text_bounded(file: Path, absent: str | None = None, hint: str = "", lar
     Raises
     ------
     InputError
-        As :func:`read_bounded`, or if it is not UTF-8.
+        As :func:`read_bounded`, or if the text is not UTF-8.
 
     See Also
     --------
@@ -102,7 +102,7 @@ def read_json_object(file: Path, absent: str | None = None, hint: str = "") -> d
     Raises
     ------
     InputError
-        As :func:`read_text_bounded`, or if it is no JSON object.
+        As :func:`read_text_bounded`, or if the text is no JSON object.
     """
     text = read_text_bounded(file, absent, hint)
     try:
@@ -116,7 +116,7 @@ def read_json_object(file: Path, absent: str | None = None, hint: str = "") -> d
 
 
 def is_file(path: str | Path) -> bool:
-    """Whether there is a plain file of this name; a name that no file can have is none."""
+    """Return whether a path is an existing plain file; False for a name that no file can have."""
     try:
         return Path(path).is_file()
     except (OSError, ValueError):
@@ -131,20 +131,20 @@ def _kind_of(mode: int) -> str:
 
 
 def is_inside(file: Path, folder: Path) -> bool:
-    """Whether a path is a file of a folder: no link, and not out of it by another way."""
+    """Return whether a path lies in a folder: it is no link, and does not lead out of the folder."""
     return not file.is_symlink() and file.resolve().is_relative_to(folder.resolve())
 
 
 def content_checksum(table: dict[str, Any]) -> str:
-    """SHA-256 of a table as JSON with sorted keys and no spaces, without its own ``checksum``."""
+    """Return the SHA-256 of a table as JSON with sorted keys and no spaces, without its ``checksum``."""
     rest = {key: value for key, value in table.items() if key != "checksum"}
     return hashlib.sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 def dataset_digest(data: xr.Dataset) -> str:
-    """SHA-256 of a dataset: names, dimensions, values and attributes, the same before and after it was netCDF.
+    """Return the SHA-256 of names, dimensions, values and attributes of a dataset; a netCDF file does not change it.
 
-    netCDF knows no truth values and no lists of one element, and keeps none of the bits of NaN but that it is one.
+    netCDF has no booleans and no lists of one element, and does not keep the bits of a NaN.
     """
     import numpy as np
 

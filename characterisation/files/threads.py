@@ -1,11 +1,11 @@
-"""In how many threads this process computes: one setting for the renderer, and for NumPy's loops in threads of our own.
+"""Set the number of threads of this process, for the renderer and for loops over arrays.
 
-NumPy, SciPy and OpenCV let go of the interpreter in their loops, so threads share work on arrays. The number is that of
-``OMP_NUM_THREADS``, which Dask's workers read as well; without it, that of the cores that this process may use. No
+NumPy, SciPy and OpenCV release the interpreter in their loops, so threads share work on arrays. The number is that of
+``OMP_NUM_THREADS``, which Dask's workers also read; by default it is the number of cores that this process may use. No
 result depends on it.
 
 BLAS has one thread in a command: its products here are of thousands of points with a 3 x 3 matrix, or of tens of
-columns. Threads of BLAS wait for one another by spinning, and where other programs need the cores, for long.
+columns. Threads of BLAS wait for one another by spinning, which takes long if other programs use the cores.
 """
 
 from __future__ import annotations
@@ -15,29 +15,29 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-#: variables that libraries of BLAS read when they are loaded: OpenBLAS, MKL, Accelerate
+#: environment variables that BLAS libraries read when they are loaded: OpenBLAS, MKL, Accelerate
 BLAS_VARIABLES = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
 
-#: threads at most: each holds arrays of its own, and more of them wait for memory
+#: largest number of threads: each holds its arrays, and more threads wait for memory
 MOST_THREADS = 8
 
 
 def usable_cores() -> int:
-    """Return how many cores this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def asked_threads() -> int | None:
-    """Return the number in ``OMP_NUM_THREADS``, None without one."""
+    """Return the number in ``OMP_NUM_THREADS``; None if it holds no number."""
     asked = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()  # a list has a number for each level
     return int(asked) or None if asked.isdecimal() else None
 
 
 def thread_count() -> int:
-    """Return in how many threads to compute: ``OMP_NUM_THREADS`` or the usable cores, :data:`MOST_THREADS` at most."""
+    """Return the number of threads to use: ``OMP_NUM_THREADS`` or the usable cores, :data:`MOST_THREADS` at most."""
     return min(asked_threads() or usable_cores(), MOST_THREADS)
 
 

@@ -1,4 +1,4 @@
-"""Let the sample of a map that is optically nearest stand for a surface that was not characterised.
+"""Represent a surface that was not characterised by the optically nearest sample of a map.
 
 Signal chain: optical properties of a surface -> place in two coordinates that decide what a sensor receives: logarithms
 of the brightness at wide angles and of the width of the lobe -> nearest sample -> a map of that sample under the

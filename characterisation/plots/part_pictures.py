@@ -1,4 +1,4 @@
-"""Know what pictures of parts have in common: the viewer's frame, edges between shapes, places for names."""
+"""Compute the viewer's frame, the edges between shapes, and the places for names in pictures of parts."""
 
 from __future__ import annotations
 

@@ -95,7 +95,7 @@ def drawing() -> Iterator[None]:
 def axes_for(
     ax: Any, shape: tuple[int, int], size_in: tuple[float, float], **subplots: Any
 ) -> Iterator[NDArray[np.object_]]:
-    """Give (rows, columns) axes to draw into, within :func:`drawing`.
+    """Yield (rows, columns) axes to draw into, within :func:`drawing`.
 
     Parameters
     ----------

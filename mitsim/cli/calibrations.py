@@ -57,6 +57,7 @@ def rig(
     agree: the covariance is widened until they do, or refused.
 
     Example: mitsim calibrate ensenso-n10 -o n10-calibration.toml --board 11x8x30:glass --poses 20
+
     Example: mitsim calibrate boards/ -o unit-calibration.toml --board 11x8x30:glass
     """
     from mitsim.capture.grey_image import SUFFIXES

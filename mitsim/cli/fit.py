@@ -102,7 +102,7 @@ def sensor_(
         Path | None, typer.Option(help="With --study: campaign TOML file of the map; default: the one of the study.")
     ] = None,
     minutes: Annotated[
-        float | None, typer.Option(min=0.1, help="With --study: time limit for comparing views [min].")
+        float | None, typer.Option(min=0.1, help="With --study: time of the run of the study [min].")
     ] = None,
     yes: options.Yes = False,
     seed: options.Seed = 1,

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 class Journey:
     """What follows a fit: the ``study``, the ``campaign`` of its map, and the ``folder`` of map and report.
 
-    ``minutes`` limits the comparison of views; ``ask`` answers whether a missing finish may be characterised.
+    ``minutes`` limits the run of the study; ``ask`` answers whether a missing finish may be characterised.
     """
 
     study: Path
@@ -49,7 +49,7 @@ def read_journey(
     output
         The sensor file; map and report go to a folder of its name, beside it.
     minutes
-        Time limit for the comparison of views.
+        Time of the run of the study [min]; None: until it ends by its rules.
     ask
         See :class:`Journey`.
 
@@ -90,7 +90,7 @@ def map_and_run(journey: Journey, sensor: Path) -> None:
     write_map_figures(_map(journey.campaign, sensor, made), made)
     say(f"map: {made / 'map.nc'}, after {time_in_words(time.monotonic() - begun)}")
     limit = "no limit: see --minutes" if journey.minutes is None else f"at most {journey.minutes:g} min"
-    say(f"step 3 of 3: run {journey.study}; views are compared for {limit}, and the best are then stated")
+    say(f"step 3 of 3: run {journey.study}, {limit}")
     run = journey.folder / "run"
     file = read_toml(journey.study, StudyFile).model_copy(update={"sensor": str(sensor.resolve())})
     chosen = open_study(journey.study, file, performance_map=made / "map.nc", ask=journey.ask)

@@ -1,4 +1,4 @@
-"""Write what a run folder says of its run: the predicted clouds of its views, and its record ``run.json``.
+"""Write the record of a run into its folder: ``run.json``, and the predicted clouds of its views.
 
 ``mitsim run`` writes them for its study, ``mitsim study choose`` for the sensor that measures best.
 """

@@ -1,4 +1,4 @@
-"""Store what a picture of the part with its sensor needs beside the poses: faces by shape, and the sensor's eyes.
+"""Store the geometry for a picture of a part with its sensor: faces by shape, and the sensor's eyes.
 
 Signal chain: scene and sensor -> ``stand.npz``: triangles of every shape, centres of the eyes and the rays through the
 corners of their images -> read again for the picture (:mod:`mitsim.report.placement_figure`).

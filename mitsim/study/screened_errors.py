@@ -1,4 +1,4 @@
-"""Carry the uncertainty that a map predicts of a view over to the one that a statement gives.
+"""Convert the uncertainty that a map predicts for a view to the uncertainty that a statement is expected to give.
 
 Signal chain: predicted standard uncertainty of a nominal part -> times the stated share of a value that folds -> errors
 that represent it, for a decision rule.

@@ -1,4 +1,4 @@
-"""Open a study for virtual measurements, in one place for all commands: what is unknown, who measures, what is kept.
+"""Prepare the virtual measurements of a study for all commands: unknowns, measurements, finished trials.
 
 Signal chain: study -> unknowns (:mod:`mitsim.study.virtual.study_unknowns`) -> digest of all that determines a trial
 (:func:`mitsim.study.virtual.plan.trial_digest`) -> renderer or map, here or on workers -> trials in a folder,

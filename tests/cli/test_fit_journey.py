@@ -43,7 +43,7 @@ def test_map_and_report_follow_the_sensor_file(files, capsys):
     map_and_run(journey, sensor)
     told = capsys.readouterr().err
     assert "step 2 of 3: the map, " in told and " captures of about " in told
-    assert "step 3 of 3" in told and "at most 0.1 min" in told
+    assert f"step 3 of 3: run {files / 'study.toml'}, at most 0.1 min" in told
     assert (journey.folder / "map" / "map.nc").is_file()
     assert (journey.folder / "run" / "report.html").is_file()
 

@@ -8,7 +8,7 @@ differences of the clipped horizontal gradient, summed over a block. The smoothn
 pixel and P2 for larger ones. Both are scaled by the block's area, as OpenCV documents (P1 = 8 block^2, P2 = 32 block^2
 by default).
 
-Disparities have steps of 1/16 px. They are biased toward whole pixels (pixel locking) by up to 0.14 px at quarters of a
+Disparities have steps of 1/16 px. They are biased toward whole pixels (pixel locking) by up to 0.14 px at 3/8 of a
 pixel. Modes of one pass have no paths from below: where the disparity changes from row to row, they follow it late.
 """
 

@@ -1,4 +1,4 @@
-"""Bound by its budget what a change of a study can make of a measurement.
+"""Bound the uncertainty of a measurement after a change of its study, from its budget.
 
 Signal chain: statement with the budget of a measurement -> variance that is left if a change removes or scales some of
 its groups -> least standard uncertainty after the change -> whether the tolerance can be reached at all. A change whose

@@ -1,4 +1,4 @@
-"""Read what a run says of changes that would make measurements fit, and say it in words.
+"""Read the changes that would make measurements fit from ``run.json``, and describe them in words.
 
 Signal chain: ``remedies`` of ``run.json`` -> a line for every change that makes measurements fit, one for every
 measurement that no change tried makes fit, and one of what was not tried.

@@ -48,8 +48,8 @@ MOST = 1000
 #: the same within a time limit; chosen
 MOST_WITHIN_A_LIMIT = 4000
 
-#: kurtosis less 1 of normal errors. Errors have it at least, before few trials are believed to know their standard
-#: deviation
+#: kurtosis less 1 of normal errors: the least that is assumed of errors in the number of trials that determine their
+#: standard deviation
 _NORMAL_TAIL = 2.0
 
 #: the same for bare metal. A sample without the rare large errors of metal looks normal: of five seeds of view 99 of

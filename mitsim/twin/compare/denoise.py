@@ -1,4 +1,4 @@
-"""A recorded image less its noise, edges of the print kept.
+"""Remove the noise of a recorded image, and keep the edges of the print.
 
 Signal chain: image [e-] -> variance of its noise by level (:mod:`mitsim.twin.finish.fine_detail`) -> cosine transform
 of the 8 x 8 window about every pixel -> coefficients under three standard deviations of the noise are set to 0 -> back,
@@ -30,7 +30,7 @@ _COSINES = dct(np.eye(_SIDE_PX), axis=0, norm="ortho")
 
 
 def denoised(image: Floats, mask: NDArray[np.bool_]) -> Floats:
-    """An image (H, W) less its white noise, whose variance by level is found in the pixels ``mask``."""
+    """Return an image (H, W) without white noise, whose variance by level is estimated in the pixels ``mask``."""
     variance = noise_of_levels(image, mask)
     margin = _SIDE_PX - 1
     wide = np.pad(np.asarray(image, float), margin, mode="symmetric")

@@ -1,4 +1,4 @@
-"""Narrow the prior of a finish by captures of a coupon: what ``[unknowns.finish.measured]`` takes.
+"""Narrow the prior of a finish by captures of a coupon, for ``[unknowns.finish.measured]`` of a study.
 
 Signal chain: blocks of the views -> fits of alpha, power and wide-angle share at several tails of the lobe -> weight of
 each tail, from its prior and its chi-square -> mean and standard deviation of alpha, wide-angle share and tail, in
@@ -35,7 +35,7 @@ _LEAST_SIZE = 0.05
 
 @dataclass(frozen=True)
 class FinishPosterior:
-    """Centre and standard deviation of what captures say of a finish, in one-sigma ranges of the prior.
+    """Centre and standard deviation of each property of a finish after captures, in one-sigma ranges of the prior.
 
     ``name`` of the finish: the id of its BSDF. None for a property that the scene states exactly.
     """

@@ -1,4 +1,4 @@
-"""The first knee of an imager's response curve, by the noise of one image over its levels.
+"""Find the first knee of an imager's response curve, from the noise of one image over its levels.
 
 Signal chain: image -> the same without noise (:mod:`mitsim.twin.compare.denoise`) -> tiles of 32 px, and in them the
 pixels whose finest detail is noise -> likelihood of the squared finest detail for a straight curve, and for curves with
@@ -19,7 +19,7 @@ pixels. Its variance is the mean of theirs by the squares of its weights: at an 
 
 Photon noise grows with the level. Bright pixels that are quieter than dark ones therefore show a curve that is flatter
 there. Chips compand by steps of two (data sheets of the MT9V03x family: 12 bits to 10), so the first knee has g = 1/2;
-others are not looked for. Levels beyond the brightest pixel are unknown; the curve is assumed to go on with g.
+other slopes are not tried. Levels beyond the brightest pixel are unknown; the curve is assumed to go on with g.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class Knee:
     slope: float
 
     def companding(self, bits: int) -> tuple[tuple[float, float], ...]:
-        """Knees of the curve: straight to the knee, then with the slope to near full scale."""
+        """Return the knees of the curve [DN]: straight to the knee, then with the slope to near full scale."""
         full = 2.0**bits
         near = full * (1 - 1 / 64)
         reached = self.level + (near - self.level) / self.slope
@@ -117,15 +117,15 @@ class Knee:
 
 
 def quiet_pixels(image: Floats, clean: Floats, mask: Mask) -> Mask:
-    """Pixels ``mask`` of an image (H, W) whose finest detail is noise and not the edge of a print.
+    """Return the pixels of ``mask`` (H, W) whose finest detail is noise and not the edge of a print.
 
-    ``clean`` is the image without its noise.
+    ``clean`` is the image without noise.
     """
     return _quiet(noise_of_levels(image, mask), clean, mask)
 
 
 def _quiet(variance: Callable[[Floats], Floats], clean: Floats, mask: Mask) -> Mask:
-    """Pixels ``mask`` whose finest detail is noise of a variance that is known by level."""
+    """Return the pixels of ``mask`` whose finest detail is noise of a known variance by level."""
     return mask & (finest_detail(clean) ** 2 < _QUIET**2 * np.maximum(variance(clean), 1e-12))
 
 
@@ -222,17 +222,17 @@ class _Tiles:
         return cls(levels, inside, square[inside] ** 2, own[inside] ** 2, black)
 
     def away_from(self, level: float) -> _Tiles:
-        """The tiles without pixels near a level: a curve that is flat there only is no knee."""
+        """Return the tiles without pixels near a level: a curve that is flat there only is no knee."""
         far = np.abs(self.clean - level) > _NEAR_DN
         kept = far[self.inside]
         return _Tiles(self.clean, self.inside & far, self.square[kept], self.own[kept], self.black)
 
     def best(self, knee: float, slope: float) -> Floats:
-        """-2 log likelihood (n,) of the tiles with the best a and b of all of them."""
+        """Return -2 log likelihood (n,) of the tiles with the best common a and b."""
         return self.misfit(knee, slope, self.fitted(knee, slope))
 
     def fitted(self, knee: float, slope: float) -> Floats:
-        """The a and b of all tiles, by weighted least squares."""
+        """Return a and b of all tiles, by weighted least squares."""
         middle = float(np.median(self.square)) / MEDIAN_SQUARE
         numbers = np.array([0.0, middle / max(float(np.median(self.clean)), 1.0)])
         variance, excess = np.full_like(self.square, middle), self.square - 1 / 12 - self.own
@@ -246,7 +246,7 @@ class _Tiles:
         return numbers
 
     def misfit(self, knee: float, slope: float, numbers: Floats) -> Floats:
-        """-2 log likelihood (n,) of the tiles."""
+        """Return -2 log likelihood (n,) of the tiles."""
         ratio, light = self._shares(knee, slope, numbers)
         known = _of_neighbours(numbers[0] * ratio + numbers[1] * light).take(self.used)
         variance = np.maximum(known, 1e-3) + 1 / 12 + self.own
@@ -255,7 +255,7 @@ class _Tiles:
         return np.asarray(independent_share() * each.sum(axis=1), float)
 
     def uncertainty(self, knee: float, slope: float) -> float:
-        """Standard uncertainty of the knee by the jackknife: one tile after another is left out.
+        """Return the standard uncertainty [DN] of the knee by a jackknife that leaves out one tile at a time.
 
         K, a and b without a tile follow by one Newton step, from the first and second derivatives of every tile's
         likelihood. Tiles are independent samples, whether the model fits or not.
@@ -297,13 +297,13 @@ class _Tiles:
 
 
 def _cut(values: NDArray[Any], side: int) -> Floats:
-    """Tiles (n, side, side) of an image, one rim over another."""
+    """Return tiles (n, side, side) of an image, whose rims overlap."""
     tiles = sliding_window_view(values, (side, side))[::_TILE_PX, ::_TILE_PX]
     return np.asarray(tiles.reshape(-1, side, side), float)
 
 
 def _through(level: Floats, knee: float, slope: float, spread: Floats) -> tuple[Floats, Floats]:
-    """Mean (n,) behind the curve of levels with normal noise, and the share of the noise's variance there."""
+    """Return the mean (n,) behind the curve of levels with normal noise, and the remaining share of the variance."""
     t, flat = (level - (knee - _ROUNDED_DOWN_DN)) / spread, 1 - slope
     above, density = ndtr(t), np.exp(-(t**2) / 2.0) / np.sqrt(2 * np.pi)
     first, second = density + t * above, (1 + t**2) * above + t * density
@@ -311,7 +311,7 @@ def _through(level: Floats, knee: float, slope: float, spread: Floats) -> tuple[
 
 
 def _two(design: Floats, values: Floats, weight: Floats) -> Floats:
-    """Two numbers by weighted least squares, neither of them negative; the design is (2, N)."""
+    """Return two non-negative numbers by weighted least squares; the design is (2, N)."""
     weighted = design * weight
     normal, right = weighted @ design.T, weighted @ values
     found = np.linalg.solve(normal + 1e-12 * np.eye(2), right)
@@ -323,5 +323,5 @@ def _two(design: Floats, values: Floats, weight: Floats) -> Floats:
 
 
 def _of_neighbours(values: Floats) -> Floats:
-    """Mean (n, 32, 32) of the pixels about each of a tile (n, 36, 36) by the squares of their weights in detail."""
+    """Return means (n, 32, 32) over neighbours in tiles (n, 36, 36), weighted by the squares of detail's weights."""
     return np.asarray(_WEIGHTS @ values @ _WEIGHTS.T)

@@ -326,7 +326,7 @@ def test_images_that_show_different_things_are_ambiguous():
     rig = ideal_rig()
     left = draw(rig.cameras["left"], FACING)
     right = draw(rig.cameras["right"], FACING, lambda p: texture(p + 210))
-    # the default of 5 % lets about a third of such false matches pass: docs/how-to/real-captures.md
+    # the default of 5 % lets about a third of such false matches pass: docs/explanation/stereo.md
     cloud = decode(rig, (left, right), SETTINGS.model_copy(update={"uniqueness_percent": 60}))
     counts = {status: share(cloud, np.s_[5:-5, 60:-5], status) for status in Status}
     assert counts[Status.VALID] < 0.01
