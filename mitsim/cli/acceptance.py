@@ -94,7 +94,7 @@ def acceptance(
 
         targets = {name: RecordedTarget("plane", *one) for name, one in artefacts.planes.items()}
         targets |= {name: RecordedTarget("sphere", window) for name, (window, _) in artefacts.spheres.items()}
-        beside = beside_simulated(given[0].cloud, targets, simulated, figures, seed)
+        beside = beside_simulated(given[0], targets, simulated, figures, seed)
     if as_json:
         whose = [(input_cloud.path, input_cloud.cloud.sensor, input_cloud.cloud.source) for input_cloud in given]
         document = measured_document(whose, results, over) | {"all_clouds": [result_values(one) for one in together]}
