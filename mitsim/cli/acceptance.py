@@ -23,8 +23,8 @@ def acceptance(
         list[str] | None,
         typer.Option(
             metavar="NAME=COLUMN,ROW,WIDTH,HEIGHT,DISTANCE",
-            help="A flat target in a window [px] and its true distance along its normal [mm]; NAME=DISTANCE: the whole "
-            "cloud. Without DISTANCE, no depth error.",
+            help="A flat target in a window of the cloud [px] and its true distance along its normal [mm]; "
+            "NAME=DISTANCE: the whole cloud. Without DISTANCE, no depth error.",
         ),
     ] = None,
     sphere: Annotated[
