@@ -222,7 +222,8 @@ class Sensor:
         >>> height, width = sensor.rig.projector.height, sensor.rig.projector.width
         >>> dots = np.random.default_rng(1).random((height, width)) < 0.3
         >>> scene = ms.load_scene("matt_white.xml", sensor)
-        >>> capture = ms.render(scene, sensor.with_patterns(dots), ms.look_at((0, -300, 400)), samples=2, depth=1)
+        >>> sensor, pose = sensor.with_patterns(dots), ms.look_at((0, -300, 400))
+        >>> capture = ms.render(scene, sensor, pose, samples=2, depth=1, check=False)
         >>> capture.settings["pattern"]["count"]
         1
         """
