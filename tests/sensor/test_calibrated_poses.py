@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.files.errors import InputError
 from mitsim.capture.recordings.calibration_file import read_calibration
+from tests.shell import mitsim_here
 
 SIZE = (752, 480)
 K = (
@@ -228,6 +229,15 @@ def test_cameras_of_mc_calib(tmp_path, kind, lenses, model):
     assert told.notes == ()
     sees_the_points(told.rig, lenses, model)
     assert {(each.width, each.height) for each in read.rig.cameras.values()} == {SIZE}
+
+
+def test_an_import_says_the_baseline_and_the_unit_that_it_assumed(tmp_path):
+    for side in ("left", "right"):
+        cv2.imwrite(str(tmp_path / f"{side}.png"), np.full((480, 752), 90, np.uint8))
+    calibration = mc_calib(tmp_path, 0, [[*each, 0.01] for each in BENT])
+    done = mitsim_here("import", tmp_path, "--calibration", calibration, "-o", tmp_path / "capture")
+    assert "baseline: 110 mm; lengths of a calibration without a unit count as mm" in done.stderr
+    assert "if the square of MC-Calib's board was given in mm" in done.stderr
 
 
 def test_groups_of_mc_calib_are_not_posed_to_one_another(tmp_path):
