@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from characterisation.coupon.discs import disc_offsets
-from characterisation.coupon.patches import Coupon, measure_patches
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
@@ -29,11 +27,9 @@ from mitsim.twin.compare.captures_run import validate_captures
 from mitsim.twin.compare.compare_captures import compare_captures
 from mitsim.twin.compare.compared_quantities import QUANTITIES
 from mitsim.twin.compare.rebuild import check_technology, projector_was_on, rebuild
-from mitsim.twin.compare.specimen_patches import PATCH_PX, points_on_specimen, specimen_patches
+from mitsim.twin.compare.specimen_patches import PATCH_PX, specimen_patches
 from mitsim.twin.finish.electrons import linearised, pixel_noise
-from mitsim.twin.finish.place import Bend, known_place
 from mitsim.twin.finish.specimen import image_mask, specimen_place
-from tests.seen_shapes import GRID, cloud_of, plane
 from tests.smaller_sensors import narrow_search
 
 SIZE, DISTANCE = 190.0, 480.0
@@ -180,34 +176,6 @@ def test_the_same_plate_with_another_seed_agrees(n10_module, real, place, again)
     assert found.agrees
     assert rows(found)["F"].real > 0.9
     assert rows(found)["sigma in disparity"].real == pytest.approx(0.12, abs=0.04)  # docs/explanation/light.md
-
-
-def test_one_definition_of_f_for_comparisons_and_coupons(rng):
-    """Before, a comparison counted false points as recovered, and an acceptance test of the same cloud did not."""
-    truth = look_at((150.0, -100.0, 580.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 0.0)
-    from_sensor = known_place(truth, 4000.0, 4000.0)
-    at, normal = truth.inverse().points(np.zeros(3)), truth.inverse().directions(np.array([0.0, 0.0, 1.0]))
-    on_it = plane(at, normal)
-    shift = rng.choice([-0.011, -0.009, 0.0, 0.009, 0.011, np.nan], on_it.shape)
-    cloud = cloud_of(on_it * (1 + shift))
-    recovered = points_on_specimen(cloud, from_sensor)
-    np.testing.assert_array_equal(recovered, np.abs(shift) < 0.01)
-    across = np.cross(normal, [0.0, 1.0, 0.0])
-    coupon = Coupon(at, normal, across / np.linalg.norm(across), 4000.0, 4000.0)
-    patches = measure_patches(cloud, coupon)
-    discs = recovered.ravel()[pixels_of(patches["row"].values, patches["column"].values)]
-    np.testing.assert_array_equal(patches["points"].values, discs.sum(axis=-1))
-    # a sheet that bends away from its plane is no false match
-    low, half = np.array([0.0, 0.0]), np.array([300.0, 300.0])
-    bend = Bend(low, half, 1, np.array([20.0, 0.0, 0.0]), 20.0)
-    bent = cloud_of(plane(at + 20.0 * normal, normal))
-    assert points_on_specimen(bent, replace(from_sensor, bend=bend)).all()
-    assert not points_on_specimen(bent, from_sensor).any()
-
-
-def pixels_of(rows, columns, radius=6.0):
-    offsets = disc_offsets(radius)
-    return (rows[:, None] + offsets[:, 0]) * GRID.width + columns[:, None] + offsets[:, 1]
 
 
 @pytest.mark.parametrize("change", MOVED)
