@@ -23,8 +23,8 @@ def acceptance(
         list[str] | None,
         typer.Option(
             metavar="NAME=COLUMN,ROW,WIDTH,HEIGHT,DISTANCE",
-            help="A flat target in a window [px] and its true distance along its normal [mm]; NAME=DISTANCE: the whole "
-            "cloud. Without DISTANCE, no depth error.",
+            help="A flat target in a window of the cloud [px] and its true distance along its normal [mm]; "
+            "NAME=DISTANCE: the whole cloud. Without DISTANCE, no depth error.",
         ),
     ] = None,
     sphere: Annotated[
@@ -94,7 +94,7 @@ def acceptance(
 
         targets = {name: RecordedTarget("plane", *one) for name, one in artefacts.planes.items()}
         targets |= {name: RecordedTarget("sphere", window) for name, (window, _) in artefacts.spheres.items()}
-        beside = beside_simulated(given[0].cloud, targets, simulated, figures, seed)
+        beside = beside_simulated(given[0], targets, simulated, figures, seed)
     if as_json:
         whose = [(input_cloud.path, input_cloud.cloud.sensor, input_cloud.cloud.source) for input_cloud in given]
         document = measured_document(whose, results, over) | {"all_clouds": [result_values(one) for one in together]}

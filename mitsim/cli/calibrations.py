@@ -140,6 +140,7 @@ def verify(
     from mitsim.decoding.checks.checked_cloud import checked_cloud
     from mitsim.decoding.cloud import decoder_settings
     from mitsim.decoding.plate import Plate
+    from mitsim.sensor.fitted_to import shows_the_fit
     from mitsim.study.calibration import verification
     from mitsim.study.calibration.board import parse_board
     from mitsim.study.virtual.study_unknowns import calibration_covariance
@@ -164,6 +165,8 @@ def verify(
     say(f"comparing with the stated calibration of {chosen.name}")
     found = verification.verify(known, chosen, read.rig, covariance, chosen.published_lengths)
     print("\n".join([*found.rows(), found.sentence()]))
+    if fitted := shows_the_fit([*chosen.fitted_to, *covariance.fitted_to], read.images, "the calibration"):
+        say(f"warning: {fitted}")
     if not found.usable:
         raise typer.Exit(1)
 

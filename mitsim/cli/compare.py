@@ -66,6 +66,8 @@ def compare(
     page = write_capture_page(output, validation.preamble, validation.table, *validation.sides)
     print(validation.table, end="")
     say(f"page: {page}")
+    if validation.fitted:
+        say(f"warning: {validation.fitted}")
     if not validation.comparison.agrees:
         if simulated is None:
             say(f"next: mitsim fit sensor {shlex.quote(str(real))} fits the sensor file to your own camera")

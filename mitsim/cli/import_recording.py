@@ -154,6 +154,10 @@ def import_(
     for name in SETTINGS_TO_CHECK:
         if name in capture.settings:
             say(f"  {name}: {capture.settings[name]}")
+    reference, *others = [*capture.rig.cameras.values(), *([capture.rig.projector] if capture.rig.projector else [])]
+    if others and imported.kind in ("stereo-pair", "images"):
+        baseline = math.dist(others[0].centre, reference.centre)
+        say(f"  baseline: {baseline:.4g} mm; lengths of a calibration without a unit count as mm")
     if coupon is not None and capture.world_from_sensor is not None:
         place = capture.world_from_sensor.translation
         distance = math.hypot(*place)

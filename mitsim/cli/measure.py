@@ -175,7 +175,7 @@ def clouds(
             from mitsim.cli.simulated_beside import RecordedTarget, beside_simulated
 
             recorded = {name: RecordedTarget(*target) for name, target in targets.items()}
-            beside = beside_simulated(one.cloud, recorded, simulated, figures, seed)
+            beside = beside_simulated(one, recorded, simulated, figures, seed)
         if of_task is not None:
             found += of_task(one)
         if picture is not None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 from dataclasses import asdict
-from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -85,12 +84,11 @@ def render(
     assert position is not None
 
     from mitsim.capture.folder import check_free, read_capture, write_capture
-    from mitsim.capture.simulated.render_residual import LIMIT, render_residual
+    from mitsim.capture.simulated.render_residual import LIMIT, checked_rendering
     from mitsim.capture.simulated.rendering import Rendering
     from mitsim.capture.simulated.truth import encode_exr, true_images
     from mitsim.decoding import captures as interface
     from mitsim.scene.surface.scatter import Deviation
-    from mitsim.scene.visible_surfaces import sees_nothing
 
     chosen, moved = interface.load_sensor(sensor), Deviation.parse(deviation)
     loaded = interface.load_scene(scene, chosen, defined, deviation=moved)
@@ -103,15 +101,9 @@ def render(
         say(f"capture: {output}, finished before")
         return
     check_free(output)
-    capture = interface.render(loaded, chosen, pose, seed=seed, samples=samples, depth=depth, noise=noise)
+    capture = interface.render(loaded, chosen, pose, seed=seed, samples=samples, depth=depth, noise=noise, check=False)
     simulated = interface.prepared_sensor(chosen)
-    first = next(iter(chosen.rig.cameras))
-    residual = render_residual(simulated, loaded, pose, first, Rendering(samples, depth), seed=seed)
-    capture.settings["render_residual"] = asdict(residual) if isfinite(residual.noise) else None
-    blind = [name if name == "projector" else f"camera {name}" for name in sees_nothing(loaded, chosen.rig, pose)]
-    if blind:
-        unseen = f"no pixel of the {', '.join(blind)} shows the part: check --position, --target and --roll"
-        capture.settings["warnings"] = [*capture.settings.get("warnings", []), unseen]
+    residual, unseen = checked_rendering(capture, simulated, loaded, pose, Rendering(samples, depth), seed)
     capture.settings["deviation"] = asdict(moved)
     capture.settings["render"] = {"digest": digest}
     known = {}
@@ -123,7 +115,7 @@ def render(
         finishes = [finish for finish in loaded.finishes if finish and finish.scatter]
         for source in dict.fromkeys(f"{finish}: {finish.scatter.provenance}" for finish in finishes if finish.scatter):
             say(source)
-    if blind:
+    if unseen:
         say(f"warning: {unseen}")
     say(f"{residual}" + (f"; over {LIMIT}: increase --samples" if residual.worst > LIMIT else ""))
     say(f"capture: {output}; next: mitsim decode {shlex.quote(str(output))} -o cloud.ply")

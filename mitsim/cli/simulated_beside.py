@@ -17,9 +17,11 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 from characterisation.region_of_interest import Roi
 from characterisation.tasks.result import Result, failed
+from mitsim.decoding.input_clouds import InputCloud
 from mitsim.decoding.measured_document import number_with_decimals, uncertainty_text
 from mitsim.running.progress import say
 from mitsim.running.text_table import aligned
+from mitsim.sensor.fitted_to import shows_the_fit
 
 
 @dataclass(frozen=True)
@@ -36,13 +38,13 @@ Figures = Callable[[PointCloud, str, Roi | None], list[Result]]
 
 
 def beside_simulated(
-    recorded: PointCloud, targets: Mapping[str, RecordedTarget], sensor: str, figures: Figures, seed: int
+    given: InputCloud, targets: Mapping[str, RecordedTarget], sensor: str, figures: Figures, seed: int
 ) -> tuple[list[Result], list[Result]]:
     """Return the figures of every target in the recorded and in the simulated cloud, in the same order.
 
     Parameters
     ----------
-    recorded
+    given
         The recorded cloud.
     targets
         Planes and spheres by name.
@@ -61,10 +63,16 @@ def beside_simulated(
     from mitsim.sensor.preset import load_sensor
     from mitsim.twin.compare.target_twin import seen_target, simulated_target
 
+    recorded = given.cloud
     if recorded.grid.height == 1:
         raise InputError("--simulated", "", "a cloud without a grid", "a cloud with rows and columns")
     preset = load_sensor(sensor)
     preset.require("simulation")
+    if given.capture is None and preset.fitted_to:
+        names = ", ".join(one.name for one in preset.fitted_to[:3]) + ", ..." * (len(preset.fitted_to) > 3)
+        say(f"warning: {preset.name} was fitted to {names}: if {given.path} is of one of these, this shows the fit")
+    elif fitted := shows_the_fit(preset.fitted_to, given.capture.images if given.capture else {}, preset.name):
+        say(f"warning: {fitted}")
     real: list[Result] = []
     twin: list[Result] = []
     for name, target in targets.items():

@@ -14,6 +14,7 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 from mitsim.capture import folder
 from mitsim.capture.capture import Capture
+from mitsim.capture.simulated.render_residual import LIMIT, checked_rendering
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.capture.simulated.truth import Truth, true_images
@@ -132,6 +133,7 @@ def render(
     depth: int = 3,
     noise: str = "all",
     truth: Literal[False] = False,
+    check: bool = True,
 ) -> Capture: ...
 
 
@@ -146,6 +148,7 @@ def render(
     depth: int = 3,
     noise: str = "all",
     truth: Literal[True],
+    check: bool = True,
 ) -> tuple[Capture, dict[str, Truth]]: ...
 
 
@@ -159,6 +162,7 @@ def render(  # noqa: PLR0913 - options of programs, all by name
     depth: int = 3,
     noise: str = "all",
     truth: bool = False,
+    check: bool = True,
 ) -> Capture | tuple[Capture, dict[str, Truth]]:
     """Render one capture of a scene: all images that the sensor takes, with noise.
 
@@ -180,6 +184,8 @@ def render(  # noqa: PLR0913 - options of programs, all by name
         ``"all"``, ``"none"``, some sources by name (``"shot,read"``), or all but some (``"no-speckle"``).
     truth
         Return what every pixel truly sees, too.
+    check
+        Render one camera three times more to measure the error of the rendering, ``settings["render_residual"]``.
 
     Returns
     -------
@@ -194,15 +200,22 @@ def render(  # noqa: PLR0913 - options of programs, all by name
     InputError
         If a number is out of its range, ``noise`` names an unknown source, or the pose is not a rigid motion.
 
+    Warns
+    -----
+    UserWarning
+        With ``check``: if the error of the rendering exceeds a fifth of the sensor's noise, so that it would be
+        mistaken for one of the sensor, or if a camera or the projector does not see the part.
+
     Examples
     --------
     >>> import mitsim as ms
     >>> sensor = ms.load_sensor("small.toml")
     >>> scene = ms.load_scene("two_pillars.xml", sensor)
-    >>> capture = ms.render(scene, sensor, ms.look_at((0, -300, 400)), samples=2, depth=1)
+    >>> capture = ms.render(scene, sensor, ms.look_at((0, -300, 400)), samples=2, depth=1, check=False)
     >>> capture.images["left"].shape, capture.source
     ((1, 240, 320), 'simulated')
-    >>> capture, truth = ms.render(scene, sensor, ms.look_at((0, -300, 400)), samples=2, depth=1, truth=True)
+    >>> pose = ms.look_at((0, -300, 400))
+    >>> capture, truth = ms.render(scene, sensor, pose, samples=2, depth=1, check=False, truth=True)
     >>> left = truth["left"]
     >>> left.depth.shape, left.feature_names[left.feature[120, 160]]
     ((240, 320), 'plane')
@@ -213,7 +226,14 @@ def render(  # noqa: PLR0913 - options of programs, all by name
     world_from_sensor = as_pose(pose, "render")
     chosen = Noise.parse(noise, "render: noise")
     simulated = prepared_sensor(sensor)
-    capture = simulated.capture(scene, world_from_sensor, seed=seed, rendering=Rendering(samples, depth), noise=chosen)
+    rendering = Rendering(samples, depth)
+    capture = simulated.capture(scene, world_from_sensor, seed=seed, rendering=rendering, noise=chosen)
+    if check:
+        residual, unseen = checked_rendering(capture, simulated, scene, world_from_sensor, rendering, seed)
+        doubts = [unseen] if unseen else []
+        doubts += [f"{residual}; over {LIMIT}: increase samples"] if residual.worst > LIMIT else []
+        for text in doubts:
+            warnings.warn(text, stacklevel=2)
     if not truth:
         return capture
     return capture, true_images(simulated, scene, world_from_sensor, samples=samples, depth=depth, seed=seed)

@@ -62,7 +62,8 @@ def triangulate(
     >>> import mitsim as ms
     >>> sensor = ms.load_sensor("small.toml")
     >>> scene = ms.load_scene("matt_white.xml", sensor)
-    >>> capture, truth = ms.render(scene, sensor, ms.look_at((0, -300, 400)), samples=2, depth=1, truth=True)
+    >>> pose = ms.look_at((0, -300, 400))
+    >>> capture, truth = ms.render(scene, sensor, pose, samples=2, depth=1, check=False, truth=True)
     >>> seen = truth["left"]
     >>> cloud = ms.triangulate(capture, seen.projector[..., 0])
     >>> bool(abs(cloud.points[..., 2] - seen.depth)[cloud.valid].max() < 0.1)

@@ -27,6 +27,14 @@ def baseline_note(name: str, baseline_mm: float) -> str:
     )
 
 
+def board_unit_note(name: str, baseline_mm: float) -> str:
+    """Return a warning about a distance in the unit of a board that the user gave, which the file does not state."""
+    return (
+        f"{name} stands {baseline_mm:.4g} mm from the first camera, if the square of MC-Calib's board was given in mm, "
+        "which the file does not state; else say its unit in a sensor file: [calibration] with to_mm"
+    )
+
+
 def lens_note(name: str, distortion: NDArray[np.float64]) -> str:
     """Return a warning about coefficients without a model that suggest a fisheye lens; empty without doubt."""
     if len(distortion) != 4 or np.abs(distortion[2:]).max() <= _LARGEST_TANGENTIAL:

@@ -54,7 +54,7 @@ def read_documents(file: Path) -> list[dict[str, Any]]:
     InputError
         If it is missing, damaged, too large, or of no known format.
     """
-    data = read_bounded(file, _KINDS, "" if file.exists() else _beside(file), largest=_LARGEST)
+    data = read_bounded(file, _KINDS, "" if file.exists() else beside(file), largest=_LARGEST)
     if file.suffix.lower() == ".mat":
         values = read_mat(file, data, _MOST_NUMBERS, simplify_cells=True)
         plain = {name: value for name, value in values.items() if not isinstance(value, MatlabOpaque)}
@@ -226,7 +226,7 @@ def _matrix(node: Any, of_opencv: bool) -> Any:
         return "a matrix that cannot be read"
 
 
-def _beside(file: Path) -> str:
+def beside(file: Path) -> str:
     """Suggest calibration files in the folder of a missing one, the most similar first."""
     try:
         there = sorted(path.name for path in file.parent.iterdir() if path.suffix.lower() in _SUFFIXES)

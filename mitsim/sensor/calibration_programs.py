@@ -8,7 +8,9 @@ sources and the table that qualifies it (:mod:`mitsim.sensor.calibration_qualifi
 - Computer Vision Toolbox of MATLAB: a structure made by ``toStruct``. Pixels count from 1, and sizes are (rows,
   columns). ``IntrinsicMatrix``, ``RotationOfCamera2`` and ``TranslationOfCamera2`` act on row vectors, so the matrices
   are transposed; ``K`` and ``PoseCamera2`` (R2022b and later) act on column vectors.
-- Settings of ORB-SLAM3: ``Stereo.T_c1_c2`` takes coordinates of the second camera to the first.
+- Settings of ORB-SLAM3: ``Stereo.T_c1_c2`` takes coordinates of the second camera to the first. Older ones, and those
+  of ORB-SLAM2, call it ``Tlr``, or state ``Camera.bf``, focal length times baseline of rectified images; ``LEFT.K`` and
+  so on are the cameras before rectification, as in ROS.
 - Kalibr, librealsense and others, whose values stand in maps: :mod:`mitsim.sensor.calibration_eyes`.
 - ROS: a message ``sensor_msgs/CameraInfo`` has the values of a calibration file as flat lists, under one letter each.
 """
@@ -16,6 +18,7 @@ sources and the table that qualifies it (:mod:`mitsim.sensor.calibration_qualifi
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -24,6 +27,7 @@ from numpy.typing import NDArray
 from mitsim.sensor.calibration_eyes import eyes_of, usual_values
 from mitsim.sensor.calibration_numbers import Composed, dotted, vector
 from mitsim.sensor.calibration_poses import inverse
+from mitsim.sensor.calibration_qualifiers import rectified_pair
 from mitsim.sensor.calibration_quaternions import with_rotations
 
 #: endings of names in MATLAB's toolbox and similar programs: one camera, the cameras of a pair, camera and projector
@@ -40,7 +44,7 @@ _MESSAGE = {
 
 def with_usual_names(tree: dict[str, Any]) -> dict[str, Any]:
     """Return the tree of one file, with composed values under names that begin with a plus."""
-    tree = with_rotations(tree)
+    tree = _of_old_orb_slam(with_rotations(tree))
     out = _of_message(tree)
     out |= usual_values(eyes_of(out)) | _bouguet(out)
     out |= _orb_slam(out)
@@ -67,17 +71,39 @@ def _of_message(tree: dict[str, Any]) -> dict[str, Any]:
     return out | {"image_width": tree["width"], "image_height": tree["height"]}
 
 
+def _of_old_orb_slam(tree: dict[str, Any]) -> dict[str, Any]:
+    """Return the tree; cameras before rectification replace the rectified one, and the first of two gets its number."""
+    sides = [
+        {"rectification_matrix": tree.get(f"{side}.R"), "projection_matrix": tree.get(f"{side}.P")}
+        for side in ("LEFT", "RIGHT")
+    ]
+    pair = rectified_pair(sides[0], sides[1]) if {"LEFT.K", "RIGHT.K"} <= set(tree) else None
+    if pair is not None:
+        sources = ("LEFT.R", "LEFT.P", "RIGHT.R", "RIGHT.P")
+        posed = {name: Composed(value, sources, {"unit": "m"}) for name, value in zip(("+R", "+T"), pair, strict=True)}
+        return {name: value for name, value in tree.items() if not name.startswith("Camera.")} | posed
+    if "Tlr" in tree:
+        return {re.sub(r"^Camera\.(?=f[xy]$|c[xy]$|[kp]\d$)", "Camera1.", name): value for name, value in tree.items()}
+    return tree
+
+
 def _orb_slam(tree: dict[str, Any]) -> dict[str, Any]:
     """Return the values that settings of ORB-SLAM3 state once for two cameras [m]; a rectified pair has one matrix."""
     metres = {"unit": "m"}
-    step, baseline = vector(tree.get("Stereo.T_c1_c2"), 16), vector(tree.get("Stereo.b"), 1)
-    if step is not None:
-        posed = Composed(inverse(step.reshape(4, 4)), ("Stereo.T_c1_c2",), metres)
-        return {"+R": posed, "+T": posed}
-    if str(tree.get("Camera.type")).lower() != "rectified" or baseline is None or "+K" not in tree:
+    for name in ("Stereo.T_c1_c2", "Tlr"):
+        step = vector(tree.get(name))
+        if step is not None and len(step) in (12, 16):
+            posed = Composed(inverse(np.array([*step.reshape(-1, 4), (0, 0, 0, 1)])[:4]), (name,), metres)
+            return {"+R": posed, "+T": posed}
+    baseline, bf = vector(tree.get("Stereo.b"), 1), vector(tree.get("Camera.bf"), 1)
+    is_rectified, source = str(tree.get("Camera.type")).lower() == "rectified", "Stereo.b"
+    if bf is not None and not is_rectified and "+K" in tree and "DepthMapFactor" not in tree:  # not of a depth camera
+        baseline, is_rectified, source = bf / tree["+K"].value[0, 0], True, "Camera.bf"
+    if not is_rectified or baseline is None or "+K" not in tree:
         return {}
-    out = {"+K2": tree["+K"], "+T": Composed(np.array([-baseline[0], 0, 0]), ("Stereo.b",), metres)}
-    return out | {"+R": Composed(np.eye(3), ("Stereo.b",), metres)}
+    out = {"+K2": tree["+K"], "+T": Composed(np.array([-baseline[0], 0, 0]), (source,), metres)}
+    out |= {"+D2": tree["+D1"]} if "+D1" in tree else {}
+    return out | {"+R": Composed(np.eye(3), (source,), metres)}
 
 
 def _bouguet(tree: dict[str, Any]) -> dict[str, Any]:

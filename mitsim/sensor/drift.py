@@ -12,7 +12,7 @@ another and of the errors of the calibration, so covariances add.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -121,7 +121,7 @@ def with_drift(covariance: RigCovariance, rig: Rig, drift: Drift) -> RigCovarian
         step = np.array([mode.step.get(name, 0.0) for name in covariance.names])
         total += mode.sigma**2 * np.outer(step, step)
     described = ", ".join(f"{name} {value:g}" for name, value in drift.numbers().items())
-    return RigCovariance(covariance.names, total, f"{covariance.source}; drift: {described}", covariance.details)
+    return replace(covariance, covariance=total, source=f"{covariance.source}; drift: {described}")
 
 
 def _axes(eye: Camera, baseline: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:

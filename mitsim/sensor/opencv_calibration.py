@@ -22,8 +22,9 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.files.documents import Document, validate
 from characterisation.files.errors import InputError, nearest
-from mitsim.sensor.calibration_doubts import baseline_note, facing_note, lens_note, principal_note
+from mitsim.sensor.calibration_doubts import baseline_note, board_unit_note, facing_note, lens_note, principal_note
 from mitsim.sensor.calibration_eyes import size_of
+from mitsim.sensor.calibration_formats import beside
 from mitsim.sensor.calibration_names import USUAL_NAMES, Names
 from mitsim.sensor.calibration_numbers import by_rows, checked_matrix, numbers_of, rotation_matrix
 from mitsim.sensor.calibration_poses import is_motion
@@ -100,7 +101,14 @@ def with_calibration(
     for name, keys in calibration_table.keys.items():
         if keys.file is not None and keys.file not in named:
             raise InputError(path, f"calibration.keys.{name}.file", repr(keys.file), " | ".join(named))
-    tree = tree or read_tree([path.parent / name for name in named])
+    files = [path.parent / name for name in named]
+    absent = [name for name, file in zip(named, files, strict=True) if not file.exists()]
+    if tree is None and absent:
+        file, hint = path.parent / absent[0], "or copy this file beside your calibration, and write its name in it"
+        near = beside(file)
+        hint = f"{near}; {hint}" if near else hint.removeprefix("or ")
+        raise InputError(file, "", "no such file", f"the calibration that {path.name} names", hint)
+    tree = tree or read_tree(files)
     values = _Values(tree, _with_files_of_ros(calibration_table, named, tree), size)
     out = dict(table)
     out["cameras"] = {}
@@ -327,7 +335,10 @@ def _pose(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[s
     T = T * (given or stated or 1.0)
     if given is not None and stated is not None and given != stated:
         values.notes.append(f"calibration: to_mm = {given:g} is used, though the file states {stated:g} mm")
-    for note in (baseline_note(name, float(np.linalg.norm(T))), facing_note(name, R)):
+    baseline = float(np.linalg.norm(T))
+    of_mc_calib = translation is not None and given is stated is None and "camera_pose_matrix" in translation.name
+    doubt = board_unit_note if of_mc_calib else baseline_note
+    for note in (doubt(name, baseline), facing_note(name, R)):
         if note:
             values.notes.append(f"calibration: {note}")
     with warnings.catch_warnings():

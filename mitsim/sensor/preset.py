@@ -161,6 +161,7 @@ def _assemble(path: Path, table: SensorFile, missing: frozenset[str], notes: tup
         unknowns=_unknowns(path, table),
         room=table.room,
         misalignment=table.misalignment,
+        fitted_to=tuple(table.fitted_to),
         missing=missing,
         notes=notes,
     )

@@ -20,6 +20,7 @@ from characterisation.files.atomic_io import write_text
 from characterisation.files.documents import Document, read_toml
 from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Rig
+from mitsim.sensor.fitted_to import FittedCapture
 from mitsim.sensor.rig_parameters import check_names, parameter_values
 
 #: least eigenvalue of a correlation matrix that counts as 0; files contain correlations to eight decimal places
@@ -31,13 +32,15 @@ class RigCovariance:
     """Covariance of the deviations of a rig's true parameters from the nominal ones.
 
     ``names`` of the parameters (:func:`~mitsim.sensor.rig_parameters.parameter_names`); ``covariance`` (n, n) in
-    their units; ``source``: the method that gave it; ``details``: its settings.
+    their units; ``source``: the method that gave it; ``details``: its settings; ``fitted_to``: images of the board
+    that decided it.
     """
 
     names: tuple[str, ...]
     covariance: NDArray[np.float64]
     source: str
     details: Mapping[str, str | float] = field(default_factory=dict)
+    fitted_to: tuple[FittedCapture, ...] = ()
 
     def __post_init__(self) -> None:
         if self.covariance.shape != (len(self.names),) * 2:
@@ -75,6 +78,7 @@ class CovarianceFile(Document):
     nominal: dict[str, float]
     correlation: list[list[Annotated[float, Field(ge=-1, le=1)]]] = Field(default=[])
     details: dict[str, str | float] = Field(default={})
+    fitted_to: list[FittedCapture] = Field(default=[], max_length=10000)
 
 
 def read_rig_covariance(path: str | Path, rig: Rig) -> RigCovariance:
@@ -96,7 +100,9 @@ def read_rig_covariance(path: str | Path, rig: Rig) -> RigCovariance:
         hint = "write the fitted correlations to at least six decimal places"
         raise InputError(path, "correlation", f"an eigenvalue of {least:.2g}", "a matrix without negative ones", hint)
     sigma = np.array(list(table.one_sigma.values()))
-    return RigCovariance(names, correlation * np.outer(sigma, sigma), table.source, table.details)
+    return RigCovariance(
+        names, correlation * np.outer(sigma, sigma), table.source, table.details, tuple(table.fitted_to)
+    )
 
 
 def write_rig_covariance(path: str | Path, covariance: RigCovariance, rig: Rig) -> None:
@@ -116,6 +122,8 @@ def write_rig_covariance(path: str | Path, covariance: RigCovariance, rig: Rig) 
     lines += ["", "[nominal]", *_rows(dict(zip(covariance.names, nominal, strict=True)), ".10g")]
     if covariance.details:
         lines += ["", "[details]", *_rows(covariance.details, ".6g")]
+    for one in covariance.fitted_to:
+        lines += ["", "[[fitted_to]]", *_rows(one.model_dump(), "")]
     write_text(path, "\n".join(lines) + "\n")
 
 

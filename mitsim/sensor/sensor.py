@@ -16,6 +16,7 @@ from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.exposure import ExposurePolicy
+from mitsim.sensor.fitted_to import FittedCapture
 from mitsim.sensor.imager import Imager, electrons_per_radiance
 from mitsim.sensor.light_code import LightCode, patterns, roles
 from mitsim.sensor.matcher import MatcherSettings
@@ -44,7 +45,8 @@ class Sensor:
     - ``images`` of each camera in a folder of recordings, as file names or one pattern; None if the folder's names
       suffice.
     - ``unknowns`` of this type of sensor.
-    - ``room`` light and ``misalignment`` of one unit in its place, fitted to captures by ``mitsim fit sensor``.
+    - ``room`` light and ``misalignment`` of one unit in its place, fitted to captures by ``mitsim fit sensor``;
+      ``fitted_to`` lists these captures.
     - ``missing``: keys that any purpose needs and the file leaves out.
     - ``notes``: warnings about the calibration.
     """
@@ -71,6 +73,7 @@ class Sensor:
     unknowns: UnknownsTable = field(default=UnknownsTable(), repr=False)
     room: RoomTable | None = field(default=None, repr=False)
     misalignment: MisalignmentTable = field(default=MisalignmentTable(), repr=False)
+    fitted_to: tuple[FittedCapture, ...] = field(default=(), repr=False)
     missing: frozenset[str] = field(default=frozenset(), repr=False)
     notes: tuple[str, ...] = field(default=(), repr=False)
 
@@ -219,7 +222,8 @@ class Sensor:
         >>> height, width = sensor.rig.projector.height, sensor.rig.projector.width
         >>> dots = np.random.default_rng(1).random((height, width)) < 0.3
         >>> scene = ms.load_scene("matt_white.xml", sensor)
-        >>> capture = ms.render(scene, sensor.with_patterns(dots), ms.look_at((0, -300, 400)), samples=2, depth=1)
+        >>> sensor, pose = sensor.with_patterns(dots), ms.look_at((0, -300, 400))
+        >>> capture = ms.render(scene, sensor, pose, samples=2, depth=1, check=False)
         >>> capture.settings["pattern"]["count"]
         1
         """

@@ -23,6 +23,7 @@ from characterisation.files.errors import InputError
 from mitsim.sensor.calibration_qualifiers import check_intrinsics
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.decoder_settings import DecoderSettings
+from mitsim.sensor.fitted_to import FittedCapture
 from mitsim.sensor.imager import DESCRIPTION, Imager
 from mitsim.sensor.light_code import LightCode
 from mitsim.sensor.matcher import MatcherSettings
@@ -202,6 +203,7 @@ class SensorFile(Document):
     ambient_image: bool = False
     room: RoomTable | None = None
     misalignment: MisalignmentTable = MisalignmentTable()
+    fitted_to: list[FittedCapture] = Field(default=[], max_length=10000)
     matcher: MatcherSettings | None = None
     decoder: DecoderSettings | None = None
     demodulation: TimeOfFlightSettings | None = None

@@ -11,8 +11,13 @@ from characterisation.features.surfaces import Plane
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from characterisation.tasks.windows import window_points
+from mitsim.capture.folder import write_capture
+from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.scene import backend
+from mitsim.scene.test_targets import plate
+from mitsim.sensor.fitted_to import images_digest
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.transforms import Transform
 from mitsim.twin.compare.target_twin import Target, seen_target, simulated_target
 from tests.seen_shapes import GRID, cloud_of, plane, sphere
 from tests.shell import mitsim_here
@@ -79,6 +84,25 @@ def test_one_command_states_both(tmp_path, small, rng, command):
     assert simulated["wall F"]["value"] > 0.5
     table = mitsim_here(*command, *options).stdout
     assert "simulated / recorded" in table and "wall sigma" in table
+
+
+def test_a_sensor_fitted_to_the_recording_is_told(tmp_path, small):
+    """Before, the figures of a fit stood beside those of its own recording as if they predicted them."""
+    sensor, wall = load_sensor(small), plate(2000.0, "matt white", 520.0)
+    at = Transform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 600.0]))
+    captures = [SimulatedSensor(sensor).capture(wall, at, seed=seed) for seed in (1, 2)]
+    for number, capture in enumerate(captures):
+        write_capture(capture, tmp_path / f"wall_{number}")
+    listed = f'fitted_to = [{{ name = "first wall", images_sha256 = "{images_digest(captures[0].images)}" }}]\n'
+    (small.parent / "mine.toml").write_text(listed + small.read_text())
+    write_cloud(cloud_of(plane([0, 0, 600], [0, 0, -1])), tmp_path / "wall.ply")
+    told = []
+    for name in ("wall_0", "wall_1", "wall.ply"):
+        options = ("--plane", "wall=60,40,80,60", "--simulated", small.parent / "mine.toml")
+        told.append(mitsim_here("measure", "acceptance", tmp_path / name, *options).stderr)
+    assert "fitted to these images (first wall)" in told[0]
+    assert "first wall" not in told[1]
+    assert "fitted to first wall: if" in told[2]
 
 
 def test_a_simulation_needs_a_target_and_a_grid(tmp_path, small):

@@ -27,11 +27,11 @@ def capture_into(folder: Path) -> None:
     """Write ``capture``, ``cloud.ply`` and ``coupon.ply``: the small camera's, of a matt-white part and coupon."""
     sensor = ms.load_sensor(folder / "small.toml")
     scene = ms.load_scene(folder / "matt_white.xml", sensor)
-    capture = ms.render(scene, sensor, ms.look_at((0, -300, 400)), samples=8, depth=1)
+    capture = ms.render(scene, sensor, ms.look_at((0, -300, 400)), samples=8, depth=1, check=False)
     ms.write_capture(capture, folder / "capture")
     ms.write_cloud(ms.decode(capture), folder / "cloud.ply")
     coupon = ms.load_scene(folder / "coupon_white.xml", sensor, {"half_size": 150})
-    flat = ms.render(coupon, sensor, ms.look_at((0, 0, 450), up=(0, 1, 0)), samples=8, depth=1)
+    flat = ms.render(coupon, sensor, ms.look_at((0, 0, 450), up=(0, 1, 0)), samples=8, depth=1, check=False)
     ms.write_cloud(ms.decode(flat), folder / "coupon.ply")
 
 

@@ -43,7 +43,7 @@ def test_render_gives_the_images_of_the_command(workplace):
     )
     sensor = ms.load_sensor("small.toml")
     scene = ms.load_scene("two_pillars.xml", sensor)
-    capture = ms.render(scene, sensor, POSE, seed=5, samples=2, depth=1)
+    capture = ms.render(scene, sensor, POSE, seed=5, samples=2, depth=1, check=False)
     theirs = ms.read_capture("by_command")
     for camera, images in capture.images.items():
         assert np.array_equal(images, theirs.images[camera])
@@ -100,7 +100,7 @@ def test_statement_has_the_figures_of_the_command(workplace):
 
 def test_a_rendered_capture_is_decoded_by_the_sensor_that_took_it(workplace):
     sensor = ms.load_sensor("small.toml")
-    capture = ms.render(ms.load_scene("matt_white.xml", sensor), sensor, POSE, samples=8, depth=1)
+    capture = ms.render(ms.load_scene("matt_white.xml", sensor), sensor, POSE, samples=8, depth=1, check=False)
     cloud = ms.decode(capture)
     for same in (ms.decode(capture, sensor), ms.decode(capture, "small.toml")):
         assert np.array_equal(same.points, cloud.points, equal_nan=True)
@@ -121,6 +121,25 @@ def test_decode_issues_the_warnings_that_the_command_prints(workplace):
     assert [str(one.message) for one in warned] == [told]
     assert f"warning: {told}" in done.stderr
     assert np.array_equal(ms.read_cloud("moved.ply").points, cloud.points, equal_nan=True)
+
+
+def test_a_rendering_that_is_noisier_than_the_sensor_or_empty_is_told(workplace):
+    """Before, only the command told it, and a program took the error of the rendering for one of the sensor."""
+    sensor = ms.load_sensor("small.toml")
+    scene = ms.load_scene("two_pillars.xml", sensor)
+    with pytest.warns(UserWarning, match=r"^render noise .* of the sensor's noise.*over 0.2: increase samples$"):
+        capture = ms.render(scene, sensor, POSE, samples=1, depth=3)
+    assert capture.settings["render_residual"]["noise"] > 0.2
+    away = ms.look_at((0, -300, 400), (0, -4000, 400))
+    with pytest.warns(UserWarning, match="no pixel of the camera left, camera right, projector shows the part"):
+        ms.render(scene, sensor, away, samples=1, depth=1)
+    # errors of a matt part in direct light are small with many samples: no warning, which would be an error here
+    plain = ms.load_scene("matt_white.xml", sensor)
+    fine = ms.render(plain, sensor, POSE, samples=256, depth=1)
+    unchecked = ms.render(plain, sensor, POSE, samples=256, depth=1, check=False)
+    assert 0 <= fine.settings["render_residual"]["quadrature"] < 0.2
+    assert "render_residual" not in unchecked.settings
+    np.testing.assert_array_equal(fine.images["left"], unchecked.images["left"])
 
 
 def test_labels_are_those_of_the_part(workplace):

@@ -29,6 +29,8 @@ def held_against(real_data, tmp_path, recording, sensor, window, projector=None)
     write_capture(read_recording(str(path), ReadOptions(sensor=None)).capture, tmp_path / "real")
     found = validate_captures(tmp_path / "real", None, tmp_path / "out", sensor, window and Roi(*window), projector, 1)
     assert "| real | simulated |" in found.table or "| maker's simulation | simulated |" in found.table
+    # the preset of the N35 was measured on one of these recordings
+    assert ("shows the fit" in found.fitted) == recording.endswith("stereo.zip")
     return {row.quantity: row for row in found.comparison.rows}
 
 

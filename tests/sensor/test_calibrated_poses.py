@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.files.errors import InputError
 from mitsim.capture.recordings.calibration_file import read_calibration
+from tests.shell import mitsim_here
 
 SIZE = (752, 480)
 K = (
@@ -124,6 +125,72 @@ def test_a_rectified_pair_of_orb_slam3(tmp_path):
     np.testing.assert_allclose(left.project(point) - right.project(point), [[fx * 110 / 2000, 0]], atol=1e-9)
 
 
+def old_orb_slam(lines):
+    """Settings of ORB-SLAM2 and of ORB-SLAM3 before its version 1.0: no File.version, mostly no Camera.type."""
+    written = {"Camera.fx": 435.2, "Camera.fy": 435.2, "Camera.cx": 367.5, "Camera.cy": 252.2} | lines
+    text = "%YAML:1.0\nCamera.width: 752\nCamera.height: 480\nCamera.fps: 20.0\nThDepth: 35\n"
+    for name, value in written.items():
+        is_matrix = isinstance(value, np.ndarray)
+        text += matrix_text(name, np.atleast_2d(value), "!!opencv-matrix") if is_matrix else f"{name}: {value}\n"
+    return text
+
+
+def test_an_old_pair_of_orb_slam_has_the_cameras_before_rectification(tmp_path):
+    """R turns a camera's coordinates into those of the rectified pair; the right camera stands at b along its x."""
+    baseline, turns = (
+        0.110,
+        [Rotation.from_euler("xyz", each, degrees=True).as_matrix() for each in ([1, -2, 3], [2, 1, 2])],
+    )
+    P = np.array([[435.2, 0, 367.5, 0], [0, 435.2, 252.2, 0], [0, 0, 1, 0]])
+    lines = {"Camera.k1": 0.0, "Camera.k2": 0.0, "Camera.p1": 0.0, "Camera.p2": 0.0, "Camera.bf": 435.2 * baseline}
+    for number, side in enumerate(("LEFT", "RIGHT")):
+        lines |= {f"{side}.height": 480, f"{side}.width": 752, f"{side}.D": np.array([*BENT[number], 0.0])}
+        lines |= {f"{side}.K": K[number], f"{side}.R": turns[number], f"{side}.P": P.copy()}
+        P[0, 3] = -435.2 * baseline
+    (tmp_path / "a.yaml").write_text(old_orb_slam(lines))
+    read = read_calibration(tmp_path / "a.yaml")
+    assert read.notes == () and not read.unrelated
+    points = np.random.default_rng(3).uniform([-400, -250, 1500], [400, 250, 2500], (40, 3))
+    rectified = points @ turns[0].T
+    own = (points, (rectified - (1000 * baseline, 0, 0)) @ turns[1])
+    for camera, seen, matrix, lens in zip(read.rig.cameras.values(), own, K, BENT, strict=True):
+        expected, _ = cv2.projectPoints(seen[:, None], np.zeros(3), np.zeros(3), matrix, np.array(lens))
+        np.testing.assert_allclose(camera.project(points), expected[:, 0], atol=1e-6)
+        assert (camera.width, camera.height) == SIZE
+
+
+@pytest.mark.parametrize("kind", [{}, {"Camera.type": '"PinHole"'}])
+def test_an_old_rectified_pair_of_orb_slam(tmp_path, kind):
+    """A point at 2 m has the disparity bf / z, with bf in metres times pixels."""
+    (tmp_path / "a.yaml").write_text(old_orb_slam({"Camera.k1": 0.0, "Camera.bf": 47.906} | kind))
+    read = read_calibration(tmp_path / "a.yaml")
+    left, right = read.rig.cameras.values()
+    point = np.array([[100.0, 50.0, 2000.0]])
+    np.testing.assert_allclose(left.project(point) - right.project(point), [[47.906 / 2, 0]], atol=1e-9)
+    assert read.notes == ()
+
+
+def test_a_depth_camera_of_orb_slam_is_no_pair(tmp_path):
+    """Its bf is that of the depth sensor's projector, and its images are one camera's."""
+    (tmp_path / "a.yaml").write_text(old_orb_slam({"Camera.k1": 0.26, "Camera.bf": 40.0, "DepthMapFactor": 5000.0}))
+    read = read_calibration(tmp_path / "a.yaml")
+    assert list(read.rig.cameras) == ["camera"]
+    assert read.rig.reference.distortion[0] == 0.26
+
+
+def test_an_old_fisheye_pair_of_orb_slam(tmp_path):
+    """Tlr takes coordinates of the right camera to the left, 3 x 4."""
+    lines = {"Camera.type": '"KannalaBrandt8"', "Camera.bf": 40.0, "Tlr": FIRST_FROM_SECOND[:3]}
+    for prefix, matrix, lens in zip(("Camera", "Camera2"), K, ROUND, strict=True):
+        names = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
+        numbers = [*matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), *lens]
+        lines |= {f"{prefix}.{name}": number for name, number in zip(names, numbers, strict=True)}
+    (tmp_path / "a.yaml").write_text(old_orb_slam(lines))
+    read = read_calibration(tmp_path / "a.yaml")
+    sees_the_points(read.rig, ROUND, "fisheye")
+    assert read.notes == ()
+
+
 def test_a_motion_by_columns_is_refused(tmp_path):
     """Its translation would be 0."""
     (tmp_path / "a.yaml").write_text(orb_slam("PinHole", BENT, ("k1", "k2", "p1", "p2"), FIRST_FROM_SECOND.T))
@@ -150,10 +217,27 @@ def mc_calib(folder, kind, lenses, groups=(0, 0)):
     ("kind", "lenses", "model"), [(0, [[*each, 0.01] for each in BENT], "perspective"), (1, ROUND, "fisheye")]
 )
 def test_cameras_of_mc_calib(tmp_path, kind, lenses, model):
-    read = read_calibration(mc_calib(tmp_path, kind, lenses))
+    file = mc_calib(tmp_path, kind, lenses)
+    read = read_calibration(file)
     sees_the_points(read.rig, lenses, model)
-    assert read.notes == ()
+    # the unit is that of the board's square in the user's settings, which the file does not have
+    (note,) = read.notes
+    assert "right stands 110 mm from the first camera, if the square of MC-Calib's board was given in mm" in note
+    eyes = 'cameras = ["left", "right"]\nprojector = false\n'
+    (tmp_path / "pair.toml").write_text(f'[calibration]\nfile = "{file.name}"\nto_mm = 1\n{eyes}')
+    told = read_calibration(tmp_path / "pair.toml")
+    assert told.notes == ()
+    sees_the_points(told.rig, lenses, model)
     assert {(each.width, each.height) for each in read.rig.cameras.values()} == {SIZE}
+
+
+def test_an_import_says_the_baseline_and_the_unit_that_it_assumed(tmp_path):
+    for side in ("left", "right"):
+        cv2.imwrite(str(tmp_path / f"{side}.png"), np.full((480, 752), 90, np.uint8))
+    calibration = mc_calib(tmp_path, 0, [[*each, 0.01] for each in BENT])
+    done = mitsim_here("import", tmp_path, "--calibration", calibration, "-o", tmp_path / "capture")
+    assert "baseline: 110 mm; lengths of a calibration without a unit count as mm" in done.stderr
+    assert "if the square of MC-Calib's board was given in mm" in done.stderr
 
 
 def test_groups_of_mc_calib_are_not_posed_to_one_another(tmp_path):

@@ -141,7 +141,11 @@ def without(*names):
         (USUAL | {"R": 2 * R}, None, "rotation matrix"),
         (USUAL | {"T": np.zeros(2)}, None, "T: found an array of 2"),
         (without("image_size"), None, "width"),
-        (USUAL, 'file = "other.yml"', "other.yml: found no such file"),
+        (
+            USUAL,
+            'file = "other.yml"',
+            "other.yml: found no such file; .* that my.toml names.*copy this file beside",
+        ),
         (USUAL, 'file = "my.toml"', "cannot read"),
         (USUAL, 'file = "calib.yml"\nto_m = 1', "to_mm"),
         (USUAL, 'file = "calib.yml"\n[calibration.keys.beamer]\nmatrix = "K"', "keys.beamer"),

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
+from characterisation.files.documents import read_toml_table
 from characterisation.files.errors import InputError
 from mitsim.capture.npy import NPY_MAGIC
 from mitsim.capture.recordings.recording_files import BAG_MAGIC, MCAP_MAGIC, SQLITE_MAGIC
@@ -26,6 +28,9 @@ NAMES = {
     "zdf": "a cloud of Zivid",
     "npy": "a NumPy array",
 }
+
+#: suffixes of files that describe cameras, a sensor or a study, and are no recordings
+_DESCRIPTIONS = frozenset({".toml", ".yml", ".yaml", ".xml", ".json", ".mat"})
 
 #: kinds by the first bytes of a file
 _MARKS = {
@@ -130,7 +135,31 @@ def kind_of(path: str | Path, *, sensor: str | None = None, calibration: str | N
         return _SUFFIXES[path.suffix.lower()]  # damaged; its reader reports the error
     if path.suffix.lower() in _NOT_READ:
         raise InputError(path, "", *_NOT_READ[path.suffix.lower()])
+    if path.suffix.lower() in _DESCRIPTIONS:
+        raise _no_recording(path, path)
     raise InputError(path, "", "a file of an unknown kind", "; ".join(NAMES.values()), "say which with --as")
+
+
+def _no_recording(where: Path, file: Path) -> InputError:
+    """Return the error of a path without images, and how to import images with what the file describes."""
+    keys = read_toml_table(file) if file.suffix.lower() == ".toml" else {"calibration": ()}
+    found, hint = f"a TOML file with {', '.join(list(keys)[:4])}", ""
+    if "technology" in keys:
+        found, hint = "a sensor file, in mitsim's own form", f"mitsim import FOLDER_OF_IMAGES --sensor {file}"
+        named = _own_files(keys)
+        hint += f", with {named} of your rig beside it" if named else ""
+    elif {"calibration", "cameras"} & set(keys):
+        found = "a calibration, or another description"
+        hint = f"if it is that of a camera or rig: mitsim import FOLDER_OF_IMAGES --calibration {file}"
+    found = found if where == file else f"a folder with {file.name}, {found}"
+    return InputError(where, "", found, "a recording, or a folder of images", hint)
+
+
+def _own_files(keys: dict[str, Any]) -> str:
+    """Return the calibration files that a sensor file names."""
+    calibration = keys.get("calibration")
+    named = calibration.get("file") if isinstance(calibration, dict) else None
+    return named if isinstance(named, str) else " and ".join(map(str, named)) if isinstance(named, list) else ""
 
 
 def _kind_of_folder(path: Path, sensor: str | None, calibration: str | None) -> str:
@@ -155,6 +184,9 @@ def _kind_of_folder(path: Path, sensor: str | None, calibration: str | None) -> 
         return "images" if named_sensor(sensor)[1] == "structured_light" else "stereo-pair"
     if any(name == "capture.json" for name in top):
         raise InputError(path, "", "a capture folder", "a recording of another program", "it needs no import")
+    described = [file for file in _down_to(path, 1) if file.is_file()]
+    if described and all(file.suffix.lower() in _DESCRIPTIONS for file in described):
+        raise _no_recording(path, described[0])
     alone = next((file.name for file in _down_to(path, 1) if file.suffix.lower() in _RECORDED_ALONE), None)
     raise InputError(
         path,

@@ -21,6 +21,7 @@ from characterisation.files.threads import in_threads
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
+from mitsim.sensor.fitted_to import records_of
 from mitsim.sensor.image_formation import FixedPattern, converter, expose, fixed_pattern
 from mitsim.sensor.modulation import AmplitudeModulation, delay_pattern, delayed, expose_taps
 from mitsim.sensor.noise_sources import Noise
@@ -224,6 +225,7 @@ def capture_of(
         read_out={name: roi for name, roi in light.rois.items() if roi != whole[name]},
     )
     records = {"exposure_rule": sensor.exposure.rule, **light.rendered, "seed": seed, "noise": asdict(light.noise)}
+    records |= records_of(sensor.fitted_to)
     return Capture(
         sensor=sensor.name,
         technology=sensor.technology,

@@ -16,16 +16,18 @@ Either would be mistaken for an error of the sensor if it were not small.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.indirect_light import IndirectLight
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.running.progress import say
 from mitsim.scene.load import Scene
+from mitsim.scene.visible_surfaces import sees_nothing
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.roi import roi_around
 from mitsim.sensor.transforms import Transform
@@ -125,6 +127,38 @@ def render_residual(
     # subtract the noise of the three renderings: 1/2 + 1/4 of the variance of one
     error_size = np.sqrt(max(error_size**2 - 0.75 * size**2, 0.0))
     return RenderResidual(float(size), float(error_size), float(np.mean(np.maximum(np.abs(noise), np.abs(error)) > 1)))
+
+
+def checked_rendering(
+    capture: Capture,
+    simulated: SimulatedSensor,
+    scene: Scene,
+    world_from_sensor: Transform,
+    rendering: Rendering,
+    seed: int,
+) -> tuple[RenderResidual, str]:
+    """Record the errors of a capture's rendering in its settings; return them, and a warning if it sees nothing.
+
+    Parameters
+    ----------
+    capture
+        Capture whose settings get ``render_residual`` (null if nothing is lit) and the warning.
+    simulated, scene, world_from_sensor, rendering, seed
+        Those of the capture. Images of the first camera are compared.
+
+    See Also
+    --------
+    render_residual : the errors alone
+    """
+    rig = simulated.sensor.rig
+    residual = render_residual(simulated, scene, world_from_sensor, next(iter(rig.cameras)), rendering, seed=seed)
+    capture.settings["render_residual"] = asdict(residual) if np.isfinite(residual.noise) else None
+    blind = [eye if eye == "projector" else f"camera {eye}" for eye in sees_nothing(scene, rig, world_from_sensor)]
+    if not blind:
+        return residual, ""
+    unseen = f"no pixel of the {', '.join(blind)} shows the part: check position, target and roll"
+    capture.settings["warnings"] = [*capture.settings.get("warnings", []), unseen]
+    return residual, unseen
 
 
 def warn_above_limit(subject: str, residual: RenderResidual) -> RenderResidual:

@@ -49,7 +49,7 @@ def true_points(cloud: PointCloud, scene: Scene, pose: Transform | ArrayLike) ->
     >>> import numpy as np
     >>> sensor = ms.load_sensor("small.toml")
     >>> scene, pose = ms.load_scene("matt_white.xml", sensor), ms.look_at((0, -300, 400))
-    >>> cloud = ms.decode(ms.render(scene, sensor, pose, samples=2, depth=1))
+    >>> cloud = ms.decode(ms.render(scene, sensor, pose, samples=2, depth=1, check=False))
     >>> error = np.linalg.norm(cloud.points, axis=-1) - np.linalg.norm(ms.true_points(cloud, scene, pose), axis=-1)
     >>> bool(abs(np.nanmedian(error)) < 0.5)
     True

@@ -34,6 +34,7 @@ from characterisation.files.checked_files import read_text_bounded
 from characterisation.files.errors import InputError
 from mitsim.capture.grey_image import read_grey
 from mitsim.sensor.calibration_formats import read_documents
+from mitsim.sensor.fitted_to import FittedCapture, joined_digest, stack_digest
 from mitsim.study.calibration.board import Board
 from mitsim.study.calibration.recorded import RecordedBoard
 
@@ -81,8 +82,9 @@ def read_corners(path: str | Path, board: Board) -> RecordedCorners:
         If there is no such file or folder, it has another form, or corners do not belong to the board.
     """
     path = Path(path)
+    images: dict[str, FittedCapture] = {}
     if path.is_dir():
-        seen, sizes = _of_images(path, board)
+        seen, sizes, images = _of_images(path, board)
     elif path.suffix.lower() == ".csv":
         seen, sizes = _of_table(path, board)
     elif path.suffix.lower() in _OF_ARRAYS:
@@ -91,10 +93,10 @@ def read_corners(path: str | Path, board: Board) -> RecordedCorners:
     else:
         allowed = "a folder of images, or a file .csv, .npz, .yml, .yaml, .xml or .json"
         raise InputError(path, "", "a file of another kind" if path.exists() else "nothing there", allowed)
-    return _together(path, seen, sizes)
+    return _together(path, seen, sizes, images)
 
 
-def _together(path: Path, seen: Seen, sizes: Sizes) -> RecordedCorners:
+def _together(path: Path, seen: Seen, sizes: Sizes, images: Mapping[str, FittedCapture]) -> RecordedCorners:
     """Return the poses whose corners all eyes see; ``seen`` has the pixels (2,) by pose, eye and corner."""
     boards, left_out = [], []
     used: dict[str, dict[str, Floats]] = {}
@@ -112,7 +114,7 @@ def _together(path: Path, seen: Seen, sizes: Sizes) -> RecordedCorners:
             left_out.append(f"{pose}: the same as {twin}")
             continue
         used[pose] = pixels
-        boards.append(RecordedBoard(np.array(common, np.intp), pixels))
+        boards.append(RecordedBoard(np.array(common, np.intp), pixels, images.get(pose)))
     if not boards:
         found = "; ".join(left_out[:3]) or "no pose"
         raise InputError(path, "", found, f"poses with {_LEAST_CORNERS} corners or more", "check --board")
@@ -142,10 +144,11 @@ def _are_equal(first: dict[str, Floats], second: dict[str, Floats]) -> bool:
     return all(np.array_equal(places, second[eye]) for eye, places in first.items())
 
 
-def _of_images(path: Path, board: Board) -> tuple[Seen, Sizes]:
+def _of_images(path: Path, board: Board) -> tuple[Seen, Sizes, dict[str, FittedCapture]]:
     files = sorted(one for one in path.rglob("*") if one.suffix.lower() in _IMAGES and one.is_file())
     seen: Seen = {}
     sizes: Sizes = {}
+    digests: dict[str, dict[str, bytes]] = {}
     for file in files:
         camera, pose = _named(file.relative_to(path))
         image = read_grey(file)
@@ -155,6 +158,7 @@ def _of_images(path: Path, board: Board) -> tuple[Seen, Sizes]:
             raise InputError(file, "size", f"{size[0]} x {size[1]} px", others)
         corners = found_corners(image, board)
         seen.setdefault(pose, {})
+        digests.setdefault(pose, {})[camera] = stack_digest(image[None])
         if corners is not None:
             seen[pose][camera] = dict(enumerate(corners))
     for by_camera in seen.values():
@@ -166,7 +170,11 @@ def _of_images(path: Path, board: Board) -> tuple[Seen, Sizes]:
         raise InputError(path, "", "no image", f"images {', '.join(sorted(_IMAGES))} of the board")
     if len(sizes) > 2:
         raise InputError(path, "", f"images of {', '.join(sizes)}", "one or two cameras", "name them left and right")
-    return seen, dict(sorted(sizes.items()))
+    images = {
+        pose: FittedCapture(name=f"{path / pose}", images_sha256=joined_digest(own[camera] for camera in sorted(own)))
+        for pose, own in digests.items()
+    }
+    return seen, dict(sorted(sizes.items())), images
 
 
 def found_corners(image: NDArray[np.generic], board: Board) -> Floats | None:

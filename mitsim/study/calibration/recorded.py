@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.fitted_to import FittedCapture
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import eyes as all_eyes
 from mitsim.sensor.rig_parameters import parameter_names, parameter_values
@@ -63,10 +64,14 @@ LEAST_POSES = 3
 
 @dataclass(frozen=True)
 class RecordedBoard:
-    """A board at one pose: ``corners`` (n,) of :attr:`Board.corners`, and their pixels (n, 2) by eye."""
+    """A board at one pose: ``corners`` (n,) of :attr:`Board.corners`, and their pixels (n, 2) by eye.
+
+    ``images`` of the pose, if it was read from images.
+    """
 
     corners: NDArray[np.intp]
     pixels: Mapping[str, Floats]
+    images: FittedCapture | None = None
 
 
 @dataclass(frozen=True)
@@ -137,7 +142,8 @@ def calibrate_recorded(
         "corner_noise_px": float(noise[:, 0].max()),
         "coordinate_noise_px": float(noise[:, 1].max()),
     }
-    covariance = RigCovariance(parameter_names(rig), matrix, source, details)
+    shown = tuple(each.images for each in boards if each.images is not None)
+    covariance = RigCovariance(parameter_names(rig), matrix, source, details, shown)
     camera_px, coordinate_px = noise.T
     return RecordedCalibration(rig, places, covariance, camera_px, coordinate_px, effect)
 

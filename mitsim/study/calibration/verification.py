@@ -250,7 +250,7 @@ def parameters_of(covariance: RigCovariance, rig: Rig) -> RigCovariance:
     known = parameter_names(rig, rig.projector is not None)
     chosen = [index for index, name in enumerate(covariance.names) if name in known or name.startswith("path.")]
     names = tuple(covariance.names[index] for index in chosen)
-    return RigCovariance(names, covariance.covariance[np.ix_(chosen, chosen)], covariance.source)
+    return replace(covariance, names=names, covariance=covariance.covariance[np.ix_(chosen, chosen)])
 
 
 def triangulated(first: Camera, pixels: Floats, second: Camera, others: Floats) -> tuple[Floats, Floats]:

@@ -25,6 +25,7 @@ from mitsim.capture.folder import read_capture, write_capture
 from mitsim.decoding.cloud import decoder_settings
 from mitsim.running.numbers import NONE, rounded, two_digits
 from mitsim.running.progress import say
+from mitsim.sensor.fitted_to import recorded_in, shows_the_fit
 from mitsim.twin.compare.compare_captures import ComparedRow, Comparison, compare_captures
 from mitsim.twin.compare.plain_image import plain_image
 from mitsim.twin.compare.rebuild import check_technology, projector_was_on, rebuild
@@ -56,12 +57,16 @@ class Shown:
 
 @dataclass(frozen=True)
 class CaptureValidation:
-    """The ``comparison`` of two captures, its ``table`` and a ``preamble`` in Markdown, and both ``sides``."""
+    """The ``comparison`` of two captures, its ``table`` and a ``preamble`` in Markdown, and both ``sides``.
+
+    ``fitted`` says so if the simulated sensor was fitted to the real capture, else it is empty.
+    """
 
     comparison: Comparison
     table: str
     preamble: str
     sides: tuple[Shown, Shown]
+    fitted: str
 
 
 def validate_captures(
@@ -121,10 +126,13 @@ def validate_captures(
         other, where = read_capture(simulated), str(simulated)
     comparison = compare_captures(recorded, other, place, settings, where, projector_on=on, seed=seed)
     table = comparison_table(comparison.rows, _whose(recorded))
-    write_json(output / "comparison.json", comparison.numbers())
+    fitted = shows_the_fit(recorded_in(other.settings, where), recorded.images, other.sensor)
+    write_json(output / "comparison.json", comparison.numbers() | {"fitted": fitted})
     shown = _shown(_whose(recorded), recorded, place, comparison.real)
     sides = shown, _shown("simulated", other, place, comparison.simulated)
-    return CaptureValidation(comparison, table, _preamble(recorded, other, place, comparison, real, on), sides)
+    preamble = _preamble(recorded, other, place, comparison, real, on)
+    preamble += f"\n**{fitted}.**\n" if fitted else ""
+    return CaptureValidation(comparison, table, preamble, sides, fitted)
 
 
 def rendered_here(capture: Capture) -> bool:

@@ -284,7 +284,7 @@ def _histogram_row(
     """Return the row of Wasserstein's distance [DN] between the histograms of all pixels on the specimen."""
     counts = np.stack([real_patches.levels, simulated_patches.levels])
     distance = _distance(*counts.sum(axis=1))
-    rng = np.random.default_rng([seed, len(QUANTITIES)])
+    rng = np.random.default_rng([seed, len(QUANTITIES) - 1])
     exchanged = []
     every = counts.sum(axis=(0, 1))
     for _ in range(DRAWS):

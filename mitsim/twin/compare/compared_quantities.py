@@ -83,6 +83,14 @@ def _share(status: Status) -> Figure:
     return figure
 
 
+def _recovered(patches: SpecimenPatches, picked: Picked) -> Floats:
+    return np.asarray(_sums(patches.recovered, picked) / _sums(patches.status, picked).sum(axis=-1))
+
+
+def _false(patches: SpecimenPatches, picked: Picked) -> Floats:
+    return _share(Status.VALID)(patches, picked) - _recovered(patches, picked)
+
+
 def _correlation_length(patches: SpecimenPatches, picked: Picked) -> Floats:
     products, pairs = _sums(patches.products, picked), _sums(patches.pairs, picked)
     middle = products.shape[1] // 2
@@ -105,7 +113,7 @@ QUANTITIES = (
     Quantity("finest detail", "DN", "image", _median("finest"), factor=NOISE_FACTOR, needs_pattern=False),
     Quantity("contrast", "1", "image", _median("contrast"), factor=NOISE_FACTOR),
     Quantity("run length", "px", "image", _run, factor=NOISE_FACTOR),
-    Quantity("F", "1", "cloud", _share(Status.VALID), margin=_SHARE_MARGIN),
+    Quantity("F", "1", "cloud", _recovered, margin=_SHARE_MARGIN),
     Quantity("sigma, median", "mm", "cloud", _median("sigma"), factor=NOISE_FACTOR),
     Quantity("sigma, interquartile range", "mm", "cloud", _spread, factor=1.5),
     Quantity("sigma in disparity", "px", "cloud", _median("sigma_px"), factor=NOISE_FACTOR),
@@ -117,4 +125,5 @@ QUANTITIES = (
         for status in Status
         if status is not Status.VALID
     ),
+    Quantity("share false", "1", "cloud", _false, margin=_SHARE_MARGIN),
 )

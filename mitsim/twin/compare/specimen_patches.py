@@ -24,7 +24,7 @@ from scipy.ndimage import uniform_filter
 from characterisation.coupon.metrics import RayNoise, ray_noise_std
 from characterisation.coupon.residual_field import LARGEST_LAG, autocorrelation
 from characterisation.files.arrays import Floats
-from characterisation.point_cloud import PointCloud, Status
+from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, PointCloud, Status
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.decoding.cloud import Geometry, Settings, capture_cloud
@@ -33,7 +33,7 @@ from mitsim.decoding.matching.stereo import StereoGeometry
 from mitsim.twin.compare.plain_image import plain_image
 from mitsim.twin.finish.fine_detail import finest_detail
 from mitsim.twin.finish.place import Place
-from mitsim.twin.finish.specimen import MARGIN_PX, image_mask, on_specimen
+from mitsim.twin.finish.specimen import MARGIN_PX, feet_of, image_mask, on_specimen
 
 PATCH_PX = 40
 
@@ -62,11 +62,12 @@ class SpecimenPatches:
     Image: ``levels`` (P, 2^bits) are pixels of each grey level. ``contrast`` (P,) [1] is local deviation over local
     mean. ``crossings`` (P,) count crossings of the local mean in ``pixels`` (P,) pixels. ``finest`` (P,) is in DN.
 
-    Cloud: ``status`` (Q, 12) are pixels of each :class:`Status`. ``sigma`` (Q,) [mm] is along the rays, ``sigma_px``
-    [px] in disparity. ``distance`` (Q,) [mm] is that of the patch's plane along its mean ray. ``products`` and
-    ``pairs`` (Q, k, k) are those of residuals by lag. ``row_error`` (Q,) [px] is that of the right image. ``cloud`` is
-    the cloud, ``on_grid`` (H, W) are the specimen's pixels, ``residual`` (H, W) [mm] is about the planes of the
-    patches.
+    Cloud: ``status`` (Q, 12) are pixels of each :class:`Status`, ``recovered`` (Q,) those with a point on the specimen,
+    within 1 % of its distance as in F of a coupon (:mod:`characterisation.coupon.patches`). ``sigma`` (Q,) [mm] is
+    along the rays, ``sigma_px`` [px] in disparity. ``distance`` (Q,) [mm] is that of the patch's plane along its mean
+    ray. ``products`` and ``pairs`` (Q, k, k) are those of residuals by lag. ``row_error`` (Q,) [px] is that of the
+    right image. ``cloud`` is the cloud, ``on_grid`` (H, W) are the specimen's pixels, ``residual`` (H, W) [mm] is about
+    the planes of the patches.
     """
 
     levels: Floats = field(repr=False)
@@ -75,6 +76,7 @@ class SpecimenPatches:
     pixels: Floats
     finest: Floats
     status: Floats
+    recovered: Floats
     sigma: Floats
     sigma_px: Floats
     distance: Floats
@@ -123,6 +125,7 @@ def specimen_patches(
     grid = geometry.grid
     cloud, on_grid, places = _cloud_patches(capture, settings, geometry, place)
     status = _tiles(np.where(on_grid, cloud.status.astype(float), np.nan), places)
+    recovered = _tiles(np.where(on_grid, points_on_specimen(cloud, place), np.nan), places)
     points = np.where(on_grid[..., None], cloud.points, np.nan).astype(float) - grid.origin
     tiles = np.stack([_tiles(points[..., axis], places) for axis in range(3)], axis=-1)
     noise = ray_noise_std(tiles)
@@ -140,6 +143,7 @@ def specimen_patches(
         pixels=np.isfinite(crossings).sum(axis=-1).astype(float),
         finest=_MAD_TO_SIGMA * np.nanmedian(of_image(finest), axis=-1),
         status=np.stack([(status == value).sum(axis=-1) for value in Status], axis=-1).astype(float),
+        recovered=np.nansum(recovered, axis=-1),
         sigma=sigma,
         sigma_px=_in_disparity(noise, sigma, tiles, geometry),
         distance=np.where(known, noise.distance, np.nan),
@@ -193,6 +197,16 @@ def _cloud_patches(
     on_grid = on_specimen(place, grid.origin, grid.rays(), grid.angular_pitch, MARGIN_PX)
     cloud = capture_cloud(capture, settings, geometry, roi=Roi.around(on_grid))
     return cloud, on_grid, patch_corners(on_grid, PATCH_PX, LEAST_ON)
+
+
+def points_on_specimen(cloud: PointCloud, place: Place) -> NDArray[np.bool_]:
+    """Return which pixels (H, W) have a point on the specimen: within 1 % of its distance along their ray."""
+    start = float(place.world_from_sensor.points(cloud.grid.origin)[2])
+    feet, reach, _ = feet_of(place.world_from_sensor, cloud.grid.origin, cloud.grid.rays())
+    if place.bend is not None:
+        reach = reach * (1 - place.bend.heights(feet) / start)
+    distance = np.linalg.norm(cloud.points.astype(float) - cloud.grid.origin, axis=-1)
+    return np.asarray(np.abs(distance - reach) <= FALSE_SHARE_OF_DISTANCE * reach) & cloud.valid
 
 
 def _disparity(cloud: PointCloud, geometry: StereoGeometry) -> Floats:

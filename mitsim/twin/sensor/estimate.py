@@ -62,9 +62,9 @@ class FittedKey:
 
 @dataclass(frozen=True)
 class Undetermined:
-    """A number that no capture determines. It keeps the file's ``value``; ``determined_by`` is a capture that would.
+    """A number that no capture determines, its ``value`` in the first file, and a capture that would determine it.
 
-    ``contained``: it is ``value`` in the fitted file, because fitted numbers contain it.
+    ``contained``: fitted numbers contain it, so it is 0 in the fitted file, which keeps all others.
     """
 
     key: str

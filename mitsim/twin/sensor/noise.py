@@ -51,21 +51,19 @@ _ROUNDING = 1 / 12
 #: share of the specimen's pixels away from edges of the print, above which the noise is estimated from these alone
 _LEAST_QUIET = 0.2
 
-#: parts of the noise that one image of a light does not separate
-UNSEPARATED = tuple(
-    Undetermined(f"imager.{key}", 0.0, "repeats of one pose; until then read_noise_e and full_well_e include it", True)
-    for key in ("dsnu_e", "prnu", "row_noise_e", "column_pattern_e")
-)
-
 
 @dataclass(frozen=True)
 class ImagerFit:
-    """The fitted ``imager``, ``estimates`` of its numbers, undetermined numbers, and whether its noise is ``known``."""
+    """The fitted ``imager``, ``estimates`` of its numbers, undetermined numbers, and whether its noise is ``known``.
+
+    ``repeated``: it is known from repeats, which separate noise from fixed pattern.
+    """
 
     imager: Imager
     estimates: tuple[FittedKey, ...]
-    undetermined: tuple[Undetermined, ...]
-    known: bool
+    undetermined: tuple[Undetermined, ...] = ()
+    known: bool = True
+    repeated: bool = False
 
 
 def fit_imager(groups: list[list[InputCapture]], sensor: Sensor, places: dict[str, Place]) -> ImagerFit:
@@ -83,21 +81,31 @@ def fit_imager(groups: list[list[InputCapture]], sensor: Sensor, places: dict[st
         line = repeated_line([Repeats.of(images, mask, _PIXELS) for images, mask in masked], imager)
         if line is not None:
             names = tuple(source.name for group in repeated for source in group)
-            imager, found = _with_line(imager, line, names, "photon transfer of repeats")
+            imager, found = _with_line(replace(imager, row_noise=0.0), line, names, "photon transfer of repeats")
             imager, fixed, undetermined = _with_fixed(imager, sensor.imager, repeated, places)
-            return ImagerFit(imager, (*estimates, *found, *fixed), tuple(undetermined), True)
+            return ImagerFit(imager, (*estimates, *found, *fixed), tuple(undetermined), repeated=True)
     for group in groups:
         if group[0].kind == "off":
             found_one = _from_one_image(group[0], imager, places)
             if found_one is not None:
                 imager, found = found_one
-                return ImagerFit(imager, (*estimates, *found), UNSEPARATED, True)
-    return ImagerFit(imager, tuple(estimates), (), False)
+                return ImagerFit(imager, (*estimates, *found))
+    return ImagerFit(imager, tuple(estimates), known=False)
 
 
 def without_fixed_pattern(imager: Imager) -> Imager:
-    """Return the imager without fixed pattern and row noise, which one image does not separate from other noise."""
-    return replace(imager, dsnu=0.0, prnu=0.0, row_noise=0.0, column_pattern=0.0)
+    """Return the imager without the fixed pattern of pixels, which one image does not separate from other noise."""
+    return replace(imager, dsnu=0.0, prnu=0.0)
+
+
+def unseparated(imager: Imager) -> list[Undetermined]:
+    """Return the fixed pattern of pixels, which noise from single images contains.
+
+    It does not contain noise of whole rows and columns, of which finest detail has none.
+    """
+    needed = "repeats of one pose; until then read_noise_e and full_well_e include it"
+    values = {"dsnu_e": imager.dsnu, "prnu": imager.prnu}
+    return [Undetermined(f"imager.{key}", value, needed, True) for key, value in values.items()]
 
 
 def smoothing_of(image: NDArray[np.unsignedinteger], mask: NDArray[np.bool_]) -> tuple[float, float]:
@@ -192,7 +200,7 @@ def _with_line(
     imager: Imager, line: TransferLine, names: tuple[str, ...], method: str
 ) -> tuple[Imager, list[FittedKey]]:
     (well, well_u), (read, read_u) = line.full_well(imager), line.read_noise()
-    return replace(imager, full_well=well, read_noise=read, row_noise=0.0), [
+    return replace(imager, full_well=well, read_noise=read), [
         FittedKey("imager.full_well_e", well, well_u, "e-", names, method),
         FittedKey("imager.read_noise_e", read, read_u, "e-", names, method),
     ]
@@ -203,7 +211,8 @@ def _with_fixed(
 ) -> tuple[Imager, list[FittedKey], list[Undetermined]]:
     """Estimate DSNU from dark repeats, PRNU from repeats in uniform light."""
     estimates: list[FittedKey] = []
-    undetermined = [Undetermined("imager.row_noise_e", 0.0, "the mean of rows in the dark; read_noise_e includes it")]
+    needed = "the mean of rows in the dark; read_noise_e includes it"
+    undetermined = [Undetermined("imager.row_noise_e", before.row_noise, needed, True)]
     for kind, key, determined_by in (
         ("dark", "imager.dsnu_e", "repeats in the dark"),
         ("off", "imager.prnu", "repeats with the projector off"),

@@ -19,6 +19,7 @@ from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from mitsim.decoding.cloud import decoder_settings
 from mitsim.running.progress import say
+from mitsim.sensor.fitted_to import FittedCapture, images_digest
 from mitsim.sensor.light_code import LightCode
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import load_sensor
@@ -29,7 +30,7 @@ from mitsim.twin.finish.specimen import specimen_place
 from mitsim.twin.sensor.dots import DotDraws, DotsFit, fit_dots
 from mitsim.twin.sensor.estimate import FittedKey, Undetermined, pooled
 from mitsim.twin.sensor.input_captures import InputCapture, read_input_captures, repeats
-from mitsim.twin.sensor.noise import UNSEPARATED, ImagerFit, fit_imager, without_fixed_pattern
+from mitsim.twin.sensor.noise import ImagerFit, fit_imager, unseparated, without_fixed_pattern
 from mitsim.twin.sensor.parameters import (
     BLACK_LEVEL,
     CORNER_BLUR,
@@ -46,6 +47,9 @@ from mitsim.twin.sensor.rows import row_turns
 from mitsim.twin.sensor.stripes import fit_stripes
 from mitsim.twin.sensor.verdict import DotAgreement, Verdict, verdict_of
 
+#: keys of the noise that a single image determines together with the fixed pattern
+_NOISE = {FULL_WELL.key, READ_NOISE.key}
+
 
 @dataclass(frozen=True)
 class SensorFit:
@@ -59,6 +63,14 @@ class SensorFit:
     estimates: tuple[FittedKey, ...]
     undetermined: tuple[Undetermined, ...]
     agreements: tuple[DotAgreement, ...] = ()
+
+    @property
+    def fitted_to(self) -> tuple[FittedCapture, ...]:
+        """Return the captures of this fit and of the one that it starts from, each once."""
+        own = [
+            FittedCapture(name=one.name, images_sha256=images_digest(one.capture.images)) for one in self.input_captures
+        ]
+        return tuple({one.images_sha256: one for one in (*self.sensor.fitted_to, *own)}.values())
 
     @property
     def verdict(self) -> Verdict:
@@ -123,7 +135,10 @@ def fit_sensor(
         for source in on_captures:
             own = replace(like(source.capture, base, source.name), imager=base.imager)
             coded += fit_stripes(source, own, places[source.name])
-        estimates += pooled(coded)
+        known = {estimate.key for estimate in estimates}  # repeats and the dark before a single image
+        estimates += [estimate for estimate in pooled(coded) if estimate.key not in known]
+    if not imager.repeated and any(estimate.key in _NOISE for estimate in estimates):
+        undetermined += unseparated(chosen.imager)
     turned, assumed, method = list[FittedKey](), chosen.unknowns.calibration, "row errors over the field"
     for source in lit:
         settings, _ = decoder_settings(source.capture)
@@ -187,6 +202,11 @@ def _dots(
         place, terms = places[source.name], None if room is None else room.terms
         sensor = _check_exposure(sensor, source)
         found = fit_dots(source.capture, sensor, place, parameters, source.name, room=terms, draws=draws)
+        if not imager.known and not {parameter.key for parameter in found.parameters} & _NOISE:
+            # the noise stays that of the file, and so does the fixed pattern beside it
+            sensor, others = replace(sensor, imager=base.imager), [p for p in parameters if p.key not in _NOISE]
+            found = fit_dots(source.capture, sensor, place, others, source.name, room=terms, draws=draws)
+            found = replace(found, undetermined=(FULL_WELL, READ_NOISE, *found.undetermined))
         out[source.name], fit = found, found.moment_fit
         say(
             f"{source.name}: {found.patches} patches, chi-square {fit.chi_square:.1f} of {fit.freedom}, "
@@ -212,8 +232,6 @@ def _combined_estimates(
     undetermined += [
         Undetermined(p.key, p.read(base), p.determined_by) for p in parameters.values() if p.key not in known
     ]
-    if not imager.known and dots:
-        undetermined += UNSEPARATED
     if room is None and dots:
         undetermined.append(Undetermined(BLACK_LEVEL.key, BLACK_LEVEL.read(base), BLACK_LEVEL.determined_by))
     return pooled(estimates), undetermined

@@ -7,6 +7,7 @@ exposure -> text that is again a valid sensor file.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -20,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from characterisation.files.atomic_io import atomic_write
 from mitsim.running.numbers import two_digits
 from mitsim.sensor.camera import Camera
+from mitsim.sensor.fitted_to import FittedCapture
 from mitsim.sensor.preset import load_sensor
 from mitsim.twin.sensor.estimate import FittedKey
 from mitsim.twin.sensor.run import SensorFit, sensor_path
@@ -39,10 +41,9 @@ def write_sensor(fit: SensorFit, sensor: str | Path, output: Path) -> None:
     entries = {
         "name": Entry(
             f'"{output.stem}"',
-            f"fitted by `mitsim fit sensor` from {path.stem}: "
-            + ", ".join(sorted({source.name for source in fit.input_captures}))
-            + f"\nverdict: {fit.verdict.word}: {fit.verdict.why}",
-        )
+            f"fitted by `mitsim fit sensor` from {path.stem}\nverdict: {fit.verdict.word}: {fit.verdict.why}",
+        ),
+        "fitted_to": Entry(_list(fit.fitted_to), ""),
     }
     entries |= _entries(fit)
     if "[calibration]" not in text and first.capture.source != "simulated":
@@ -69,12 +70,17 @@ def fit_table(fit: SensorFit) -> str:
             f"| {estimate.key} | {estimate.value:.4g} | {low:.4g} to {high:.4g} | {estimate.unit} | "
             f"{', '.join(estimate.captures)} | {estimate.method} |"
         )
-    if fit.undetermined:
-        lines += ["", "| not determined, kept | value | a capture that would determine it |", "| --- | --- | --- |"]
+    kept = [one for one in fit.undetermined if one.value]
+    if kept:
+        lines += ["", "| not determined | in the file | a capture that would determine it |", "| --- | --- | --- |"]
         lines += [
-            f"| {undetermined.key} | {undetermined.value:.4g} | {undetermined.determined_by} |"
-            for undetermined in fit.undetermined
+            f"| {one.key} | {f'0, before {one.value:.4g}' if one.contained else f'{one.value:.4g}, kept'} "
+            f"| {one.determined_by} |"
+            for one in kept
         ]
+    absent = [f"{one.key} ({one.determined_by})" for one in fit.undetermined if not one.value]
+    if absent:
+        lines += ["", f"Not determined, and 0 before and after: {', '.join(absent)}."]
     return "\n".join(lines) + "\n"
 
 
@@ -101,7 +107,7 @@ def _entries(fit: SensorFit) -> dict[str, Entry]:
         entries[key] = Entry(numbers(np.clip(values, -limit, limit), 5), comment)
     for kept in fit.undetermined:
         if kept.contained:
-            entries[kept.key] = Entry(number(kept.value), f"not determined; needs {kept.determined_by}", True)
+            entries[kept.key] = Entry("0", f"not determined; needs {kept.determined_by}", True)
     if "misalignment.row_mrad" in entries:
         row, roll = (next(e for e in fit.estimates if e.key == f"misalignment.{key}_mrad") for key in ("row", "roll"))
         comment = "rotation of one unit's second camera off its calibration, assumed for the next unit too"
@@ -127,6 +133,11 @@ class Entry:
     value: str
     comment: str
     optional: bool = False
+
+
+def _list(captures: Sequence[FittedCapture]) -> str:
+    texts = ((json.dumps(one.name, ensure_ascii=False), one.images_sha256) for one in captures)
+    return "[\n" + "".join(f'    {{ name = {name}, images_sha256 = "{digest}" }},\n' for name, digest in texts) + "]"
 
 
 def number(value: float) -> str:

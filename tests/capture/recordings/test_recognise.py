@@ -108,6 +108,34 @@ def test_folders_are_told_by_the_names_in_them(tmp_path):
         kind_of(save(tmp_path / "x.docx", b"hello"))
 
 
+RIGS = Path(__file__).parents[3] / "scenes" / "rigs"
+
+
+@pytest.mark.parametrize(
+    ("path", "told"),
+    [
+        (
+            RIGS / "opencv.toml",
+            r"found a sensor file.*FOLDER_OF_IMAGES --sensor \S+opencv.toml, with calib.yml of your rig",
+        ),
+        (RIGS / "pair.toml", r"with intrinsics.yml and extrinsics.yml of your rig"),
+        (RIGS, r"found a folder with beat.toml, a sensor file.*--sensor \S+beat.toml"),
+        ("rig.yml", r"found a calibration, or another description.*--calibration \S+rig.yml"),
+        ("eyes.toml", r"found a calibration, or another description.*--calibration \S+eyes.toml"),
+        ("study.toml", r"found a TOML file with scene, task; allowed: a recording, or a folder of images$"),
+        ("broken.toml", r"broken.toml"),
+    ],
+)
+def test_what_describes_a_rig_is_told_from_a_recording(tmp_path, path, told):
+    """Before, these were files of an unknown kind, and the advice was --as, which no kind fits."""
+    save(tmp_path / "rig.yml", b"%YAML:1.0\n---\nK: 1\n")
+    save(tmp_path / "eyes.toml", b'[calibration]\nfile = ["a.yml"]\n')
+    save(tmp_path / "study.toml", b'scene = "a.xml"\ntask = "b.toml"\n')
+    save(tmp_path / "broken.toml", b"= 3\n")
+    with pytest.raises(InputError, match=told):
+        kind_of(tmp_path / path)
+
+
 def test_what_a_kind_does_not_heed_is_refused(tmp_path):
     path = save(tmp_path / "a.pcd", pcd(CLOUD, "binary"))
     with pytest.raises(InputError, match="--scale for a PCD cloud; allowed: --axes, --calibration"):

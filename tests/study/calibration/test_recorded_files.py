@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -9,6 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.drift import Drift, with_drift
+from mitsim.sensor.fitted_to import FittedCapture, images_digest
 from mitsim.sensor.opencv_calibration import with_calibration
 from mitsim.sensor.rig_covariance import read_rig_covariance
 from mitsim.sensor.rig_parameters import parameter_differences
@@ -118,6 +122,20 @@ def test_images_of_ros_give_the_corners_of_the_board(tmp_path):
     assert found.sizes == {"left": (640, 480), "right": (640, 480)} and len(found.boards) == 2
     for board in found.boards:  # the right image is the left one, shifted by 30 px along both axes
         np.testing.assert_allclose(board.pixels["right"] - board.pixels["left"], 30.0, atol=0.05)
+    # the same images as a capture are recognised, whichever program reads them
+    pair = [str(tmp_path / f"{name}-0001.png") for name in ("left", "right")]
+    images = {path: cv2.imread(path, cv2.IMREAD_GRAYSCALE)[None] for path in pair}
+    assert [board.images.images_sha256 == images_digest(images) for board in found.boards] == [False, True]
+
+
+def test_the_covariance_keeps_the_images_that_decided_it(tmp_path):
+    shown = [FittedCapture(name=f"boards/{k}", images_sha256=f"{k:064x}") for k in range(10)]
+    boards = [replace(board, images=one) for board, one in zip(boards_of(pixels_of(2)), shown, strict=True)]
+    checked = calibrate_checked(boards, BOARD, {"left": SIZE, "right": SIZE}, "recorded")
+    write_calibration(checked, tmp_path / "unit.toml")
+    again = read_rig_covariance(tmp_path / "unit.toml", checked.calibration.rig)
+    drifted = with_drift(again, checked.calibration.rig, Drift(temperature_k=1.0))
+    assert again.fitted_to == drifted.fitted_to == tuple(shown)
 
 
 def test_a_calibration_whose_halves_agree_is_not_widened():

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import write_capture
+from mitsim.sensor.fitted_to import images_digest
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.published_lengths import PublishedLengths
@@ -19,6 +20,7 @@ from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.transforms import Transform
 from mitsim.study.calibration.board import Board
 from mitsim.study.calibration.verification import corners_of_board, triangulated, verify
+from mitsim.twin.sensor.run import sensor_path
 from tests.shell import mitsim_here
 
 BOARD = Board(9, 6, 18.0, "glass")
@@ -117,6 +119,23 @@ def test_the_command_says_use_or_calibrate_again(good, turned, tmp_path):
     done = mitsim_here("calibrate", "verify", tmp_path / "good", "--board", "9x6x15:glass", code=1)
     assert "First check the spacing of the points: it measures 1.20" in done.stdout.splitlines()[-1]
     mitsim_here("calibrate", "verify", tmp_path / "bad", code=2)
+
+
+def test_a_capture_that_decided_the_calibration_is_told(good, turned, tmp_path):
+    """Before, `Use it` was said of the very images that the calibration was fitted to."""
+    covariance = sensor_path("ensenso-n10").parent / "calibrations" / "ensenso-n10.toml"
+    for place, (name, where) in enumerate((("rows", "sensor"), ("board 3", "covariance"))):
+        text = {"sensor": sensor_path("ensenso-n10").read_text(), "covariance": covariance.read_text()}
+        listed = f'fitted_to = [{{ name = "{name}", images_sha256 = "{images_digest(good.images)}" }}]\n'
+        text[where] = listed + text[where]
+        used = '\n[unknowns.calibration]\ncovariance = "covariance.toml"\n'
+        (tmp_path / "covariance.toml").write_text(text["covariance"])
+        (tmp_path / "sensor.toml").write_text(text["sensor"] + used)
+        for capture, told in ((good, True), (turned, False)):
+            write_capture(capture, tmp_path / f"capture_{place}", overwrite=True)
+            command = ("calibrate", "verify", tmp_path / f"capture_{place}", "--board", "9x6x18:glass")
+            done = mitsim_here(*command, "--sensor", tmp_path / "sensor.toml", code=None)
+            assert (f"fitted to these images ({name})" in done.stderr) == told
 
 
 def test_a_recording_of_a_type_names_its_preset(good, tmp_path):

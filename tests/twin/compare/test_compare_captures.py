@@ -19,6 +19,7 @@ from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.cli.program import app
 from mitsim.decoding.matching.stereo import stereo_geometry
 from mitsim.scene.test_targets import plate
+from mitsim.sensor.fitted_to import FittedCapture, images_digest
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
 from mitsim.twin.compare import compare_captures as compare_module
@@ -54,6 +55,10 @@ def taken(sensor, seed):
     return SimulatedSensor(sensor).capture(
         scene, pose(sensor), rendering=Rendering(samples=4), seed=seed, around=around
     )
+
+
+def fitted_capture(name, capture):
+    return FittedCapture(name=name, images_sha256=images_digest(capture.images))
 
 
 def as_recorded(capture):
@@ -243,6 +248,24 @@ def test_a_rebuilt_capture_is_as_bright_and_agrees(n10_module, changed, tmp_path
     assert "side_by_side.png" in page
     assert "| F |" in found.stdout
     assert (tmp_path / "out" / "side_by_side.png").stat().st_size > 10_000
+
+
+def test_a_comparison_with_the_capture_of_the_fit_says_so(n10_module, real, again, tmp_path):
+    """Before, a sensor that was fitted to a capture agreed with it without a word."""
+    mine = replace(n10_module, name="mine", fitted_to=(fitted_capture("sheet", real),))
+    write_capture(as_recorded(real), tmp_path / "real")
+    write_capture(as_recorded(again), tmp_path / "again")
+    write_capture(taken(mine, 7), tmp_path / "twin")
+    told = []
+    for name in ("real", "again"):
+        arguments = ["compare", *(str(tmp_path / one) for one in (name, "twin")), "-o", str(tmp_path / f"out_{name}")]
+        found = CliRunner().invoke(app, arguments)
+        page = (tmp_path / f"out_{name}" / "index.md").read_text()
+        stored = json.loads((tmp_path / f"out_{name}" / "comparison.json").read_text())["fitted"]
+        assert ("mine was fitted to these images (sheet)" in page) == (stored in found.stderr and stored != "")
+        told.append(stored)
+    assert "shows the fit, not a prediction" in told[0]
+    assert told[1] == ""
 
 
 def test_a_texture_stands_in_where_the_projector_was_off(n10_module, real, place):

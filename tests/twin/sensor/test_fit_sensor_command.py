@@ -11,16 +11,21 @@ import pytest
 from typer.testing import CliRunner
 
 from characterisation.files.errors import InputError
-from mitsim.capture.folder import write_capture
+from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.cli.program import app
 from mitsim.scene.load import scene_from_dict
+from mitsim.scene.test_targets import plate
+from mitsim.sensor.fitted_to import images_digest
 from mitsim.sensor.preset import load_sensor, presets
-from mitsim.sensor.transforms import look_at
+from mitsim.sensor.transforms import Transform, look_at
 from mitsim.twin.sensor import run, specimen_simulator
+from mitsim.twin.sensor.estimate import FittedKey
 from mitsim.twin.sensor.input_captures import read_input_captures, repeats
-from mitsim.twin.sensor.write import Entry, moved_paths, with_cameras, with_entries, with_exposure
+from mitsim.twin.sensor.noise import ImagerFit
+from mitsim.twin.sensor.write import Entry, moved_paths, with_cameras, with_entries, with_exposure, write_sensor
+from tests.smaller_sensors import coarse_sensor
 
 
 @pytest.mark.parametrize("name", [name for name in presets() if name != "kinect-v2"])
@@ -95,14 +100,57 @@ def test_a_file_of_ones_own_camera(recorded, tmp_path, monkeypatch):
     # repeats of dots and of the dark: well known, in spite of the 8 bits
     assert mine.imager.full_well == pytest.approx(15000, rel=0.05)
     assert mine.imager.read_noise == pytest.approx(50, rel=0.05)
-    assert "| imager.full_well_e |" in result.stdout and "not determined, kept" in result.stdout
+    # the noise of repeats contains that of rows: the 6 e- of the preset beside it would count twice
+    assert mine.imager.row_noise == 0.0
+    assert "| imager.row_noise_e | 0, before 6 |" in result.stdout
+    # nothing is called kept that the preset does not have
+    assert "imager.smoothing_px (repeats of one pose)" not in re.sub(r"(?m)^Not determined.*$", "", result.stdout)
+    assert not re.search(r"(?m)^\| [\w.]+ \| 0, kept ", result.stdout)
+    assert {one.name: one.images_sha256 for one in mine.fitted_to} == {
+        folder: images_digest(read_capture(folder).images) for folder in folders
+    }
+    assert "| imager.full_well_e |" in result.stdout and "| not determined | in the file |" in result.stdout
     assert "photon transfer of repeats" in output.read_text()
     assert result.stderr.splitlines()[-1].startswith("verdict: ")
     preset = run.sensor_path("ensenso-n10").read_text(encoding="utf-8")
-    for kept in re.findall(r"(?m)^\| ([\w.]+) \| [^|]* \| (?!repeats of one pose)[^|]* \|$", result.stdout):
+    for kept in re.findall(r"(?m)^\| ([\w.]+) \| [^|]*, kept \| [^|]* \|$", result.stdout):
         line = next((one for one in preset.splitlines() if one.startswith(f"{kept.rpartition('.')[2]} ")), None)
         assert line is None or line in output.read_text(), kept  # what is not determined is as it was
     assert mine.name == "my-camera"
+
+
+def test_the_fixed_pattern_stays_where_no_fitted_noise_contains_it(recorded, tmp_path, monkeypatch):
+    """Before, one capture of dots that left the noise undetermined took the fixed pattern out of the file."""
+    monkeypatch.setattr(specimen_simulator, "_SAMPLES", 4)
+    preset = load_sensor("ensenso-n10")
+    found = run.fit_sensor([recorded / "on_0"], "ensenso-n10", draws=1)
+    write_sensor(found, "ensenso-n10", tmp_path / "mine.toml")
+    mine = load_sensor(tmp_path / "mine.toml").imager
+    assert {"imager.full_well_e", "imager.read_noise_e"} <= {one.key for one in found.undetermined}
+    assert (mine.dsnu, mine.prnu) == (preset.imager.dsnu, preset.imager.prnu)
+    # finest detail has no noise of whole rows, so no fitted number contains it
+    assert mine.row_noise == preset.imager.row_noise
+
+
+def test_noise_of_one_image_of_stripes_takes_the_place_of_the_fixed_pattern(tmp_path, monkeypatch):
+    """Before, the fixed pattern of the preset stayed beside noise that contains it, and repeats were overwritten."""
+    path = coarse_sensor("zivid-2-m70", 4, tmp_path)
+    sensor = load_sensor(path)
+    assert sensor.imager.dsnu > 0 and sensor.imager.prnu > 0
+    wall = plate(3000.0, "matt white", sensor.wavelength_nm)
+    pose = Transform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 700.0]))
+    simulated = SimulatedSensor(sensor)
+    light = simulated.light(wall, pose, rendering=Rendering(samples=4), seed=1)
+    folders = [write_capture(simulated.expose(light, seed), tmp_path / f"wall_{seed}") for seed in (1, 2)]
+    of_stripes = [FittedKey("imager.read_noise_e", 7.0, 1.0, "e-", ("wall",), "one image")]
+    monkeypatch.setattr(run, "fit_stripes", lambda *_: of_stripes)
+    by_repeats = FittedKey("imager.read_noise_e", 5.0, 1.0, "e-", ("wall",), "photon transfer of repeats")
+    for known, read, pattern in (((), 7.0, 0.0), ((by_repeats,), 5.0, sensor.imager.prnu)):
+        imager = ImagerFit(sensor.imager, known, known=bool(known), repeated=bool(known))
+        monkeypatch.setattr(run, "fit_imager", lambda *_, imager=imager: imager)
+        write_sensor(run.fit_sensor(folders, path), path, tmp_path / "mine.toml")
+        mine = load_sensor(tmp_path / "mine.toml").imager
+        assert (mine.read_noise, mine.prnu) == (read, pattern)
 
 
 def test_what_cannot_be_is_one_message(recorded, tmp_path):

@@ -1,0 +1,70 @@
+"""Tell which captures a sensor or a calibration was fitted to: compared with one of them, it shows the fit."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from characterisation.files.documents import Document, validate
+
+
+class FittedCapture(Document):
+    """A capture that decided fitted numbers: its ``name``, and the digest of its images (:func:`images_digest`)."""
+
+    name: str = Field(min_length=1, max_length=4096)
+    images_sha256: str = Field(pattern="^[0-9a-f]{64}$")
+
+
+class _Records(Document):
+    fitted_to: tuple[FittedCapture, ...] = Field(default=(), max_length=10000)
+
+
+def images_digest(images: Mapping[str, NDArray[np.generic]]) -> str:
+    """Return the SHA-256 of the grey levels (P, H, W) of all cameras; names, calibration and folder do not count."""
+    return joined_digest(stack_digest(stack) for stack in images.values())
+
+
+def stack_digest(stack: NDArray[np.generic]) -> bytes:
+    """Return the digest of the images (P, H, W) of one camera."""
+    return hashlib.sha256(f"{stack.dtype}{stack.shape}".encode() + stack.tobytes()).digest()
+
+
+def joined_digest(stacks: Iterable[bytes]) -> str:
+    """Return the digest of a capture's images from those of its cameras (:func:`stack_digest`)."""
+    return hashlib.sha256(b"".join(stacks)).hexdigest()
+
+
+def records_of(fitted_to: Iterable[FittedCapture]) -> dict[str, Any]:
+    """Return what the settings of a simulated capture say of its sensor's fit; nothing without one."""
+    listed = [one.model_dump() for one in fitted_to]
+    return {"fitted_to": listed} if listed else {}
+
+
+def recorded_in(settings: Mapping[str, Any], where: str | Path) -> tuple[FittedCapture, ...]:
+    """Return the captures that the sensor of a simulated capture was fitted to, by its settings.
+
+    Raises
+    ------
+    InputError
+        If the settings state them in another form.
+    """
+    return validate(where, {key: settings[key] for key in ("fitted_to",) if key in settings}, _Records).fitted_to
+
+
+def shows_the_fit(fitted_to: Iterable[FittedCapture], images: Mapping[str, NDArray[np.generic]], what: str) -> str:
+    """Return a sentence if ``what`` was fitted to these images, else an empty text."""
+    fitted = tuple(fitted_to)
+    digest = images_digest(images) if fitted else ""
+    name = next((one.name for one in fitted if one.images_sha256 == digest), None)
+    if name is None:
+        return ""
+    return (
+        f"{what} was fitted to these images ({name}): agreement with them shows the fit, not a prediction; use a "
+        "capture that had no part in it"
+    )
