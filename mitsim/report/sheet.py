@@ -16,9 +16,8 @@ from matplotlib.figure import Figure
 
 from characterisation.files.atomic_io import atomic_write
 from characterisation.plots.style import INK, MUTED, drawing
-from characterisation.statements.verdict_words import shortened
 from mitsim.report.declaration import Declaration, DeclaredRow, read_declaration
-from mitsim.report.first_screen import Tone
+from mitsim.report.first_screen import FirstScreen, Tone
 from mitsim.report.placement_figure import draw_placement
 from mitsim.report.sheet_layout import ACROSS, HEIGHT, LINE, MARGIN, Columns, Page, text_width, wrapped
 from mitsim.running.numbers import NONE
@@ -148,14 +147,14 @@ def _head(page: Page, declaration: Declaration) -> None:
     page.place -= 0.22
     page.write(declaration.title, 15, weight="bold")
     page.place -= 0.03
-    page.write(_result(declaration.first.words), _RESULT, _COLOURS[declaration.first.tone], "bold")
+    page.write(_result(declaration.first), _RESULT, _COLOURS[declaration.first.tone], "bold")
     page.place -= 0.1
 
 
-def _result(words: str) -> str:
+def _result(first: FirstScreen) -> str:
     """Return the result in at most :data:`_RESULT_LINES` lines: the reasons that do not fit are in the table."""
-    for kept in range(words.count("; ") + 1, 0, -1):
-        text = shortened(words, kept)
+    for kept in range(len(first.reasons), -1, -1):
+        text = first.words(kept)
         if len(wrapped(text, _RESULT, ACROSS, "bold")) <= _RESULT_LINES:
             break
     return text

@@ -5,6 +5,7 @@ import re
 import pytest
 
 from characterisation.files.errors import InputError
+from characterisation.statements.verdict_words import Reason
 from mitsim.report.declaration import Declaration
 from mitsim.report.export.dcc import DCC, SI, Issuer, write_dcc
 from mitsim.report.first_screen import FirstScreen
@@ -80,7 +81,7 @@ FORMS = {
 
 
 def declared():
-    first = FirstScreen("fits", "good", [], None, [], {})
+    first = FirstScreen([Reason("fits")], "good", [], None, [], {})
     facts = [("Left out", "coatings"), ("Exposure", "")]
     return Declaration("sensor measures part", "2026-11-27", "0123456789abcdef", first, [], facts, ["Error = a − b."])
 
