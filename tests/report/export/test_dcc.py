@@ -6,7 +6,7 @@ import pytest
 
 from characterisation.files.errors import InputError
 from characterisation.statements.verdict_words import Reason
-from mitsim.report.declaration import Declaration
+from mitsim.report.declaration import Declaration, Note
 from mitsim.report.export.dcc import DCC, SI, Issuer, write_dcc
 from mitsim.report.first_screen import FirstScreen
 from tests.report.export.test_export_command import export
@@ -83,7 +83,9 @@ FORMS = {
 def declared():
     first = FirstScreen([Reason("fits")], "good", [], None, [], {})
     facts = [("Left out", "coatings"), ("Exposure", "")]
-    return Declaration("sensor measures part", "2026-11-27", "0123456789abcdef", first, [], facts, ["Error = a − b."])
+    return Declaration(
+        "sensor measures part", "2026-11-27", "0123456789abcdef", first, [], facts, [Note("Error = a − b.")]
+    )
 
 
 @pytest.fixture(scope="module")
