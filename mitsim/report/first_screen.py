@@ -73,9 +73,12 @@ class FirstScreen:
         return with_degree_signs(in_words(self.reasons, kept))
 
     def _brief(self) -> list[tuple[Reason, str]]:
-        """Return every reason with its words in the headline, which has as many names as :func:`named`; "" for none."""
-        kept = NAMED if sum(bool(reason.names) for reason in self.reasons) > NAMED + 1 else None
-        shown, left = divided(self.reasons, kept)
+        """Return every reason with its words in the headline, which has as many names as :func:`named`; "" for none.
+
+        Of more reasons that name measurements, it has the first only.
+        """
+        many_reasons = sum(bool(reason.names) for reason in self.reasons) > NAMED + 1
+        shown, left = divided(self.reasons, 1 if many_reasons else None)
         many = sum(len(reason.names) for reason in shown) > NAMED + 1
         said = [(reason, reason.counted if many else reason.words) for reason in shown]
         return said + [(reason, "") for reason in left]
@@ -83,7 +86,10 @@ class FirstScreen:
     @property
     def headline(self) -> str:
         """Return the result in a few words; :attr:`folded` has the reasons that it shortens or leaves out."""
-        return with_degree_signs("; ".join(words for _, words in self._brief() if words))
+        brief = self._brief()
+        more = len({name for reason, words in brief if not words for name in reason.names})
+        said = [words for _, words in brief if words] + [f"and {more} more"] * bool(more)
+        return with_degree_signs("; ".join(said))
 
     @property
     def folded(self) -> list[str]:
