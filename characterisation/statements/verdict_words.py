@@ -1,12 +1,12 @@
 """Summarise verdicts in one line: the last line of a run, and the first sentence of its report.
 
-Signal chain: verdict, standard uncertainty and needed uncertainty of every measurement -> one line.
+Signal chain: verdict, standard uncertainty and needed uncertainty of every measurement -> reasons, each with the
+measurements that it is of -> one line, of all reasons or of the first.
 """
 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -37,8 +37,34 @@ class Judged:
     bias: float = math.nan
 
 
-def result_in_words(judged: Sequence[Judged]) -> str:
-    """Return one line: how many tolerances fit, and the reasons why the others do not, worst first.
+@dataclass(frozen=True)
+class Reason:
+    """A clause of a result: the ``names`` of the measurements that it is of, then what it ``says``.
+
+    A clause without names is a summary.
+    """
+
+    says: str
+    names: tuple[str, ...] = ()
+
+    @property
+    def words(self) -> str:
+        """Return the clause with its first names, and the number of the others."""
+        return named(self.names) + self.says
+
+    @property
+    def counted(self) -> str:
+        """Return the clause with the number of its names, if it has several."""
+        return f"{len(self.names)} measurements{self.says}" if len(self.names) > 1 else self.words
+
+    @property
+    def in_full(self) -> str:
+        """Return the clause with all its names."""
+        return ", ".join(self.names) + self.says
+
+
+def result_reasons(judged: Sequence[Judged]) -> list[Reason]:
+    """Return how many tolerances fit, and the reasons why the others do not, worst first.
 
     Without tolerances: that there are none, and the measurement that most often had no value.
     """
@@ -46,44 +72,50 @@ def result_in_words(judged: Sequence[Judged]) -> str:
     if not asked:
         text = f"Uncertainty given for {len(judged)} measurement{'' if len(judged) == 1 else 's'}. "
         text += "The task has no tolerances: nothing to accept or reject"
-        return ". ".join([text, *filter(None, [losses_in_words(judged)])])
+        return [Reason(". ".join([text, *filter(None, [losses_in_words(judged)])]))]
     fitting = [one for one in asked if one.verdict == "fits"]
     rest = sorted((one for one in asked if one.verdict not in ("fits", "not decided")), key=_ratio, reverse=True)
     unsure = [one for one in asked if one.verdict == "not decided"]
     undecided = f", {len(unsure)} not decided" if unsure else ""
-    lines = [f"fits {len(fitting)} of {len(asked)} tolerances{undecided}", *_reasons(rest)]
-    if valued := [one.name for one in unsure if math.isfinite(one.uncertainty)]:
-        lines.append(f"{named(valued)}: not decided, more virtual measurements are needed")
-    if single := [one.name for one in unsure if not math.isfinite(one.uncertainty) and one.without_value < 1]:
-        lines.append(f"{named(single)}: not decided, a single virtual measurement gave a value")
-    if none := [one.name for one in unsure if one.without_value == 1]:
-        lines.append(f"{named(none)}: not decided, no value in the few virtual measurements")
-    lines += [
-        f"{one.name} fits, but has no value in {_percent(one.without_value)} of the virtual measurements"
+    reasons = [Reason(f"fits {len(fitting)} of {len(asked)} tolerances{undecided}"), *_reasons(rest)]
+    valued = [one.name for one in unsure if math.isfinite(one.uncertainty)]
+    single = [one.name for one in unsure if not math.isfinite(one.uncertainty) and one.without_value < 1]
+    none = [one.name for one in unsure if one.without_value == 1]
+    for names, why in (
+        (valued, "more virtual measurements are needed"),
+        (single, "a single virtual measurement gave a value"),
+        (none, "no value in the few virtual measurements"),
+    ):
+        reasons += [Reason(f": not decided, {why}", tuple(names))] if names else []
+    reasons += [
+        Reason(f" fits, but has no value in {_percent(one.without_value)} of the virtual measurements", (one.name,))
         for one in fitting
         if one.without_value >= OFTEN
     ]
-    return "; ".join(lines)
+    return reasons
 
 
-def shortened(words: str, kept: int) -> str:
-    """Return the first reasons of :func:`result_in_words`, and the number of measurements in those left out."""
-    reasons = words.split("; ")
-    more = sum(map(_measurements, reasons[kept:]))
-    return "; ".join(reasons[:kept]) + (f"; and {more} more, see the table" if more else "")
+def in_words(reasons: Sequence[Reason], kept: int | None = None) -> str:
+    """Return reasons as one line: the summaries and the first ``kept`` of the others, and how many are left out.
+
+    By default all are kept.
+    """
+    shown, left = divided(reasons, kept)
+    told = {name for reason in shown for name in reason.names}
+    more = {name for reason in left for name in reason.names} - told
+    return "; ".join([reason.words for reason in shown] + [f"and {len(more)} more, see the table"] * bool(more))
+
+
+def divided(reasons: Sequence[Reason], kept: int | None) -> tuple[list[Reason], list[Reason]]:
+    """Return the summaries and the first ``kept`` of the other reasons, in their order, and those left out."""
+    left = [] if kept is None else [reason for reason in reasons if reason.names][kept:]
+    return [reason for reason in reasons if reason not in left], left
 
 
 def named(names: Sequence[str]) -> str:
     """Return the names of measurements: all of up to :data:`NAMED` + 1, else the first and the number of the others."""
     shown = list(names) if len(names) <= NAMED + 1 else list(names[:NAMED])
     return ", ".join(shown) + (f" and {len(names) - len(shown)} more" if len(shown) < len(names) else "")
-
-
-def _measurements(reason: str) -> int:
-    """Return the number of measurements that a reason names."""
-    names = re.split(": not decided| are undecidable| do not fit", reason, maxsplit=1)
-    more = re.search(r" and (\d+) more$", names[0])
-    return 1 + (names[0].count(", ") if len(names) > 1 else 0) + (int(more[1]) if more else 0)
 
 
 def losses_in_words(judged: Sequence[Judged]) -> str:
@@ -111,33 +143,31 @@ def _ratio(judged: Judged) -> float:
     return math.inf if math.isnan(ratio) else ratio
 
 
-def _reasons(rest: Sequence[Judged]) -> list[str]:
+def _reasons(rest: Sequence[Judged]) -> list[Reason]:
     """Return why measurements do not fit, in their order; those without a value for the same reason in one line."""
     lost: dict[tuple[str, str], list[str]] = {}
     for one in rest:
         if not math.isfinite(one.uncertainty):
             by = "by screening, no view can make" if one.trials == 0 else "no virtual measurement gave a value"
             lost.setdefault((one.verdict, by), []).append(one.name)
-    lines = list[str]()
+    reasons = list[Reason]()
     for (verdict, by), names in lost.items():
         verb = "is" if len(names) == 1 else "are"
         words = f"{verb} undecidable" if verdict == "undecidable" else f"do{'es' * (len(names) == 1)} not fit"
         them = (" it" if len(names) == 1 else " them") if by.endswith("make") else ""
-        lines.append(f"{named(names)} {words}: {by}{them}")
-    return lines + [_why(one) for one in rest if math.isfinite(one.uncertainty)]
+        reasons.append(Reason(f" {words}: {by}{them}", tuple(names)))
+    return reasons + [Reason(_why(one), (one.name,)) for one in rest if math.isfinite(one.uncertainty)]
 
 
 def _why(judged: Judged) -> str:
     words = "is undecidable" if judged.verdict == "undecidable" else "does not fit"
     if judged.fits_corrected:
-        return f"{judged.name} {words} unless its bias is subtracted"
+        return f" {words} unless its bias is subtracted"
     biased = abs(judged.bias) > 2 * judged.uncertainty
     bias = f"bias {_two(judged.bias)} {judged.unit} and " if biased else ""
     needed = f", {_two(judged.needed)} {judged.unit} needed" if math.isfinite(judged.needed) else ""
     without = " without bias" if biased and needed else ""
-    return (
-        f"{judged.name} {words}: {bias}standard uncertainty {_two(judged.uncertainty)} {judged.unit}{needed}{without}"
-    )
+    return f" {words}: {bias}standard uncertainty {_two(judged.uncertainty)} {judged.unit}{needed}{without}"
 
 
 def _percent(share: float) -> str:

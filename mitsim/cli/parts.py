@@ -42,6 +42,9 @@ def check(
         Path | None,
         typer.Option(help="PNG picture to write: the share of interreflected light, and the face that it comes from."),
     ] = None,
+    every: Annotated[
+        bool, typer.Option("--all", help="Print every shape and finding, not the measured and first shapes only.")
+    ] = False,
     json: options.Json = False,
     html: Annotated[
         Path | None,
@@ -76,13 +79,13 @@ def check(
     if stand is None:
         ends = [" ".join(f"{round(float(v), 1) + 0.0:g}" for v in end) for end in (usual_place(chosen, centre), centre)]
         say(f"no position was given: using --position {ends[0]} --target {ends[1]}")
+    measured = checked.task.measured_shapes() if checked.task else ()
     if output:
         from mitsim.report.scene_preview import preview_figure
         from mitsim.report.style import write_png
 
         options.check_file(output)
         first = list(checked.task.features) if checked.task else []
-        measured = checked.task.measured_shapes() if checked.task else ()
         write_png(preview_figure(checked.scene, facts, chosen, placed, visible, first, measured), output)
         say(f"picture: {output}")
     if bounces:
@@ -104,7 +107,7 @@ def check(
         about = {"scene": checked.scene.where, "sensor": chosen.name, "world_from_sensor": placed.matrix().tolist()}
         print(json_module.dumps({**about, **as_data(facts, visible, found)}, indent=2))
     else:
-        print(as_text(facts, visible, found))
+        print(as_text(facts, visible, found, measured, every))
     if any(finding.severity == "error" for finding in found):
         raise typer.Exit(1)
 

@@ -288,7 +288,7 @@ def _tell_statement(
 
     Exit with code 1 without a statement; with ``require_fit`` also if a tolerance or a limit of a set is not kept.
     """
-    from characterisation.statements.verdict_words import fits_all, result_in_words
+    from characterisation.statements.verdict_words import Reason, fits_all, result_reasons
     from mitsim.report.set_words import with_sets
     from mitsim.study.statement_file import read_statement
     from mitsim.study.virtual.stated import judged, statement_table
@@ -296,10 +296,10 @@ def _tell_statement(
     if not stated:
         leads = f"view {leader} leads, but time did not suffice for a statement of uncertainty"
         none = "no view can make every measurement: there is no statement"
-        say(with_sets(none if leader is None else leads, False, sets).words)
+        say(with_sets([Reason(none if leader is None else leads)], False, sets).words)
         raise typer.Exit(1)
     print(statement_table(stated))
-    result = with_sets(result_in_words(judged(stated)), fits_all(judged(stated)), sets)
+    result = with_sets(result_reasons(judged(stated)), fits_all(judged(stated)), sets)
     say(f"statement: {output / 'statement.json'}\n{result.words}")
     document = read_statement(output / "statement.json")
     for doubt in document.doubts() if document else ():

@@ -48,6 +48,25 @@ class DeclaredRow:
 
 
 @dataclass(frozen=True)
+class Note:
+    """``words`` on the measurements of some ``names``, which have a ``mark`` in a table; without names, on all."""
+
+    words: str
+    names: tuple[str, ...] = ()
+    mark: str = ""
+
+    @property
+    def in_full(self) -> str:
+        """Return the note with its names."""
+        return f"{listed(list(self.names))}: {self.words}" if self.names else self.words
+
+    @property
+    def marked(self) -> str:
+        """Return the note with its mark in place of its names."""
+        return f"{self.mark} {self.words}".lstrip()
+
+
+@dataclass(frozen=True)
 class Declaration:
     """Content of a sheet; ``facts`` are (name, text). ``date`` is the day of the virtual measurements, ISO 8601."""
 
@@ -57,7 +76,11 @@ class Declaration:
     first: FirstScreen
     rows: list[DeclaredRow]
     facts: list[tuple[str, str]]
-    notes: list[str]
+    notes: list[Note]
+
+    def marked(self, name: str) -> str:
+        """Return the name of a measurement with the marks of its notes."""
+        return "\N{NO-BREAK SPACE}".join([name, *(note.mark for note in self.notes if name in note.names)])
 
 
 def read_declaration(folder: Path, geometry: SceneGeometry | None) -> Declaration:
@@ -148,29 +171,33 @@ def _row(result: ResultRow, measurement: StatedMeasurement | None) -> DeclaredRo
     )
 
 
-def _notes(document: StatementDocument | None) -> list[str]:
+def _notes(document: StatementDocument | None) -> list[Note]:
     """Return how to read the table, and what its numbers do not say."""
     if document is None:
         return []
-    notes = [
+    words = (
         "Error = measured − true; bias = mean error over the virtual measurements, part of the error; u = standard "
         "uncertainty, standard deviation about the bias; U = larger end of the 95 % interval, from the bias; "
         "k = U / u; N = number of virtual measurements. The interval leaves 2.5 % on either side. If y is read, the "
         "true value lies between y − (upper end) and y − (lower end)."
-    ]
-    by_part = {
-        AT_THE_LIMIT: "for a part at the limit of its tolerance",
-        FAR_FROM_NOMINAL: "for a part far from nominal",
+    )
+    known = document.measurements
+    not_settled = [name for name, one in known.items() if not one.settled and one.trials]
+    of_some = {
+        ("†", "errors for a part at the limit of its tolerance."): [
+            name for name, one in known.items() if one.errors_of == AT_THE_LIMIT
+        ],
+        ("‡", "errors for a part far from nominal."): [
+            name for name, one in known.items() if one.errors_of == FAR_FROM_NOMINAL
+        ],
+        ("*", "not settled after JCGM 101, 7.9: more virtual measurements may change a digit."): not_settled,
     }
-    for part, words in by_part.items():
-        if names := [name for name, measurement in document.measurements.items() if measurement.errors_of == part]:
-            notes.append(f"{listed(names)}: errors {words}.")
-    if names := [
-        name for name, measurement in document.measurements.items() if not measurement.settled and measurement.trials
-    ]:
-        which = "all" if len(names) == len(document.measurements) else listed(names)
-        notes.append(f"Not settled after JCGM 101, 7.9 (more virtual measurements may change a digit): {which}.")
-    return [*notes, *(f"{one}." for one in document.doubts("the influences listed below"))]
+    notes = [
+        Note(text, tuple(names), mark) if len(names) < len(known) else Note(f"All: {text}")
+        for (mark, text), names in of_some.items()
+        if names
+    ]
+    return [Note(words), *notes, *(Note(f"{one}.") for one in document.doubts("the influences listed below"))]
 
 
 def _part(scene: str, finishes: Sequence[str]) -> str:

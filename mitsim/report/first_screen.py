@@ -19,12 +19,15 @@ from numpy.typing import ArrayLike
 from characterisation.plots.statements import GROUPS
 from characterisation.statements.budget import largest_line
 from characterisation.statements.verdict_words import (
+    NAMED,
     OFTEN,
     Judged,
+    Reason,
+    divided,
     fits_all,
+    in_words,
     losses_in_words,
-    result_in_words,
-    shortened,
+    result_reasons,
 )
 from characterisation.tasks.covariance import LEAST_CHANCE
 from mitsim.report.first_rows import ResultRow, RowValues, measured_words
@@ -34,6 +37,7 @@ from mitsim.report.set_words import with_sets
 from mitsim.report.style import Picture, as_svg
 from mitsim.running.numbers import NONE, count, how_many, or_nan, with_degree_signs
 from mitsim.study.choice_document import ChoiceDocument, SensorEntry, judged
+from mitsim.study.choose.table import best_reasons
 from mitsim.study.remedies.entries import remedies_in_words
 from mitsim.study.run_folder import Run
 from mitsim.study.scene_geometry import SceneGeometry
@@ -47,14 +51,14 @@ Tone = Literal["good", "plain", "warn", "bad"]
 
 @dataclass(frozen=True)
 class FirstScreen:
-    """Content of the first screen: the result in ``words``, its ``tone``, rows and picture.
+    """Content of the first screen: the ``reasons`` of the result, its ``tone``, rows and picture.
 
     The picture shows ``poses`` (label, part_from_sensor) and ``verdicts`` by feature. ``trials`` is the largest number
     of virtual measurements behind a row. ``remedies`` say what would make the other measurements fit,
     ``doubts`` why to check the statement.
     """
 
-    words: str
+    reasons: Sequence[Reason]
     tone: Tone
     rows: list[ResultRow]
     picture: Picture | None
@@ -64,11 +68,38 @@ class FirstScreen:
     remedies: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
 
+    def words(self, kept: int | None = None) -> str:
+        """Return the result in words, by default with all its reasons."""
+        return with_degree_signs(in_words(self.reasons, kept))
+
+    def _brief(self) -> list[tuple[Reason, str]]:
+        """Return every reason with its words in the headline, which has as many names as :func:`named`; "" for none.
+
+        Of more reasons that name measurements, it has the first only.
+        """
+        many_reasons = sum(bool(reason.names) for reason in self.reasons) > NAMED + 1
+        shown, left = divided(self.reasons, 1 if many_reasons else None)
+        many = sum(len(reason.names) for reason in shown) > NAMED + 1
+        said = [(reason, reason.counted if many else reason.words) for reason in shown]
+        return said + [(reason, "") for reason in left]
+
     @property
-    def short_words(self) -> str:
-        """Return the result with its first reasons only; the table has them all."""
-        reasons = self.words.count("; ") + 1
-        return shortened(self.words, _MOST_REASONS) if reasons > _MOST_REASONS + 1 else self.words
+    def headline(self) -> str:
+        """Return the result in a few words; :attr:`folded` has the reasons that it shortens or leaves out."""
+        brief = self._brief()
+        more = len({name for reason, words in brief if not words for name in reason.names})
+        said = [words for _, words in brief if words] + [f"and {more} more"] * bool(more)
+        return with_degree_signs("; ".join(said))
+
+    @property
+    def folded(self) -> list[str]:
+        """Return the reasons that the headline shortens or leaves out, with all their names."""
+        return [with_degree_signs(reason.in_full) for reason, words in self._brief() if words != reason.in_full]
+
+    @property
+    def named(self) -> int:
+        """Return the number of measurements that these reasons name."""
+        return len({name for reason, words in self._brief() if words != reason.in_full for name in reason.names})
 
     @property
     def tolerances(self) -> bool:
@@ -91,9 +122,6 @@ class FirstScreen:
         limits = {row.share_limit for row in self.rows if row.tolerance != NONE and row.share != NONE}
         return limits.pop() if len(limits) == 1 else ""
 
-
-#: reasons in the result in words: the first says how many tolerances fit
-_MOST_REASONS = 5
 
 #: values of a measurement, and of its decision, that documents and rows hold by the same names
 _MEASURED = ("verdict", "bias", "without_value")
@@ -122,9 +150,10 @@ def of_run(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
     }
     poses: list[tuple[str, ArrayLike]] = [(f"view {document.view}", view_scores["world_from_sensor"].values)]
     verdicts = face_verdicts(asked)
-    result = with_sets(result_in_words(results), fits_all(results), run.about.view_sets)
+    result = with_sets(result_reasons(results), fits_all(results), run.about.view_sets)
+    first, *rest = result.reasons
     return FirstScreen(
-        with_degree_signs(result.words[:1].upper() + result.words[1:]),
+        [Reason(first.says[:1].upper() + first.says[1:]), *rest],
         tone_of(results) if result.good else "bad",
         [_run_row(run, view_scores, name, measurement) for name, measurement in document.measurements.items()],
         _picture(geometry, poses, verdicts, _caption(run, document.view)),
@@ -140,8 +169,8 @@ def _without_statement(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
     """Return the first screen of a run that states no uncertainty: its leading view so far, or that there is none."""
     about, leader = run.about, run.about.leader
     if leader is None:
-        words = with_sets("No view can make the measurements", False, about.view_sets).words
-        return FirstScreen(words, "bad", [], None, [], {})
+        reasons = with_sets([Reason("No view can make the measurements")], False, about.view_sets).reasons
+        return FirstScreen(reasons, "bad", [], None, [], {})
     scores = run.scores.sel(view=leader)
     poses: list[tuple[str, ArrayLike]] = [(f"view {leader}", scores["world_from_sensor"].values)]
     rows = [
@@ -163,7 +192,7 @@ def _without_statement(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
     )
     made = how_many(about.race_trials, "virtual measurement")
     return FirstScreen(
-        f"View {leader} leads so far, by {made}; no uncertainty is stated yet",
+        [Reason(f"View {leader} leads so far, by {made}; no uncertainty is stated yet")],
         "warn",
         rows,
         _picture(geometry, poses, verdicts, _caption(run, leader)),
@@ -193,9 +222,9 @@ def of_choice(
     choice: ChoiceDocument, geometry: SceneGeometry | None, statement: StatementDocument | None = None
 ) -> FirstScreen:
     """Return the first screen of the page that compares sensors, which shows the best one and its ``statement``."""
-    best = choice.best
+    best, reasons = choice.best, best_reasons(choice.sensors, choice.measurements)
     if best is None:
-        return FirstScreen(with_degree_signs(choice.words), "bad", [], None, [], {})
+        return FirstScreen(reasons, "bad", [], None, [], {})
     verdicts = face_verdicts(
         {name: (choice.measurements[name].features, cell.verdict) for name, cell in best.measurements.items()}
     )
@@ -210,7 +239,7 @@ def of_choice(
     made = [result for result in results if math.isfinite(result.uncertainty)]
     lost = losses_in_words(made) if made and all(result.verdict == "no tolerance" for result in results) else ""
     return FirstScreen(
-        with_degree_signs("; ".join(filter(None, [choice.words, lost]))),
+        [*reasons, *map(Reason, filter(None, [lost]))],
         tone_of(results),
         sensor_rows(choice, best),
         _picture(geometry, poses, verdicts, caption),

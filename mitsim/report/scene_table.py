@@ -9,20 +9,41 @@ from typing import Any
 
 import numpy as np
 
+from characterisation.statements.verdict_words import named
 from mitsim.running.numbers import or_none
 from mitsim.running.text_table import aligned
 from mitsim.scene.authoring.finding import SceneFinding
 from mitsim.scene.inspect import SceneFacts, ShapeFacts
 from mitsim.scene.visible_surfaces import VisibleSurfaces
 
+#: number of rows of the table of shapes, unless more are measured
+MOST_ROWS = 20
+
 _NONE = "-"
 
 
-def as_text(facts: SceneFacts, visible: VisibleSurfaces, found: Sequence[SceneFinding]) -> str:
-    """Return tables of features and materials, then one line for each finding."""
+def as_text(
+    facts: SceneFacts,
+    visible: VisibleSurfaces,
+    found: Sequence[SceneFinding],
+    measured: Sequence[str] = (),
+    every: bool = False,
+) -> str:
+    """Return tables of features and materials, then one line for each finding.
+
+    Parameters
+    ----------
+    facts, visible, found
+        About the scene: its shapes, what the sensor sees of them, and the findings.
+    measured
+        Names of the shapes that a task measures: they come first.
+    every
+        Whether every shape has a row and every finding a line; else other shapes than the measured ones have rows up
+        to :data:`MOST_ROWS` in all, and warnings and notes that differ in their shapes only share a line.
+    """
     features = [("feature", "material", "Ra um", "area mm2", "size mm", "from mm", "to mm", "triangles", "seen px")]
     materials = [("material", "Ra um", "alpha u, v", "1-sigma", "from")]
-    for number, shape in enumerate(facts.shapes):
+    for number, shape in sorted(enumerate(facts.shapes), key=lambda one: one[1].name not in measured):
         material, roughness = _material(shape)
         low, high = shape.bounds
         pixels = int(((visible.shape == number) & visible.front & visible.seen_by_all).sum())
@@ -43,8 +64,20 @@ def as_text(facts: SceneFacts, visible: VisibleSurfaces, found: Sequence[SceneFi
         row = (material, roughness, _alpha(shape), _number(shape.alpha_factor, "x"), shape.provenance or _NONE)
         if row not in materials:
             materials.append(row)
-    lines = [*aligned(features), "", *aligned(materials), "", *map(str, found)]
+    kept = len(features) if every else 1 + max(sum(shape.name in measured for shape in facts.shapes), MOST_ROWS)
+    more = [f"and {len(features) - kept} more shapes; --all lists them"] if len(features) > kept else []
+    told = found if every else _joined(found)
+    lines = [*aligned(features[:kept]), *more, "", *aligned(materials), "", *map(str, told)]
     return "\n".join(lines if found else [*lines, "no problems found"])
+
+
+def _joined(found: Sequence[SceneFinding]) -> list[SceneFinding]:
+    """Return warnings and notes that differ only in what they are about as one, in the place of the first."""
+    about: dict[tuple[Any, ...], list[str]] = {}
+    for one in found:
+        alone = one.about if one.severity == "error" else None
+        about.setdefault((one.severity, one.what, one.advice, alone), []).append(one.about)
+    return [SceneFinding(severity, named(names), what, advice) for (severity, what, advice, _), names in about.items()]
 
 
 def as_data(facts: SceneFacts, visible: VisibleSurfaces, found: Sequence[SceneFinding]) -> dict[str, Any]:

@@ -1,13 +1,14 @@
 """Write ``sheet.pdf``, a statement of measurement uncertainty on one A4 sheet, ready to sign.
 
 Signal chain: folder of a run or of a comparison of sensors -> declaration (:mod:`mitsim.report.declaration`) and
-picture of the part in the colours of its verdicts -> pages of PDF by matplotlib, which needs no browser. A task whose
-rows do not fit on one page continues on the next.
+picture of the part in the colours of its verdicts -> pages of PDF by matplotlib, which needs no browser. A table that
+does not fit on one page continues on the next, and the facts and the lines to sign follow it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
 
@@ -16,22 +17,18 @@ from matplotlib.figure import Figure
 
 from characterisation.files.atomic_io import atomic_write
 from characterisation.plots.style import INK, MUTED, drawing
-from characterisation.statements.verdict_words import shortened
 from mitsim.report.declaration import Declaration, DeclaredRow, read_declaration
-from mitsim.report.first_screen import Tone
+from mitsim.report.first_screen import FirstScreen, Tone
 from mitsim.report.placement_figure import draw_placement
-from mitsim.report.sheet_layout import ACROSS, HEIGHT, LINE, MARGIN, Columns, Page, text_width, wrapped
+from mitsim.report.sheet_layout import ACROSS, FOOT, GAP, HEIGHT, LINE, MARGIN, Columns, Page, text_width, wrapped
 from mitsim.running.numbers import NONE
 from mitsim.study.scene_geometry import SceneGeometry, read_scene_geometry
 
-#: smallest and largest height of the picture [in]
-_PICTURE = (1.58, 3.4)
+#: largest height of the picture [in]
+_PICTURE = 3.4
 
 #: height of the lines to sign [in]
-_SIGNATURE = 0.95
-
-#: height of the last line of a page [in]
-_FOOT = 0.22
+_SIGNATURE = 0.9
 
 #: what only the user knows, to be written by hand
 _TO_FILL_IN = (
@@ -42,17 +39,15 @@ _TO_FILL_IN = (
 #: size of small text [pt]
 _SMALL = 6.5
 
-#: sizes of facts [pt], of which the largest that gives one page is used
-_FACTS = (7.2, 6.6, 6.0)
+#: distance of the text of facts from the margin, over its size [in / pt]
+_FACT_LEFT = 0.14
 
-#: distance of the text of facts from the margin [in]
-_FACT_LEFT = 1.15
+#: distance between facts, and between rows of the table [in]
+_FACT_GAP = 0.015
+_ROW_GAP = 0.025
 
 #: size of the result in words [pt]
 _RESULT = 9.5
-
-#: largest number of its lines
-_RESULT_LINES = 4
 
 #: colour of the result by its tone
 _COLOURS: dict[Tone, str] = {"good": "#00694e", "plain": INK, "warn": "#7a5600", "bad": "#a84a00"}
@@ -70,6 +65,26 @@ _HEADS = (
     ("Without", "value"),
     ("Accepted", "readings"),
     ("Verdict",),
+)
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Largest size of the ``table`` and of ``facts`` [pt], ``lines`` of the result, least ``picture`` [in]."""
+
+    table: float
+    facts: float
+    lines: int
+    picture: float
+
+
+#: layouts, of which the first that gives one page is used, else the first of all
+_LAYOUTS = (
+    _Layout(8.0, 7.2, 4, 1.58),
+    _Layout(8.0, 6.6, 4, 1.58),
+    _Layout(8.0, 6.0, 4, 1.58),
+    _Layout(7.0, 6.0, 2, 1.3),
+    _Layout(6.5, 6.0, 2, 1.3),
 )
 
 
@@ -97,41 +112,47 @@ def write_sheet(folder: str | Path) -> Path:
 def sheet_figures(declaration: Declaration, geometry: SceneGeometry | None) -> list[Figure]:
     """Return the sheet as A4 figures: one, unless the task has too many measurements for a page."""
     with drawing():
-        columns = Columns([_cells(row) for row in declaration.rows], _HEADS)
-        pages = [Page()]
-        page = pages[0]
-        _head(page, declaration)
         shown = geometry is not None and len(geometry.corners) and declaration.first.poses
-        above = _PICTURE[0] if shown else 0.0
-        whole = above + _head_height(columns) + sum(_row_height(row, columns) for row in declaration.rows)
-        below = {size: _SIGNATURE + _FOOT + MARGIN + _facts_height(declaration, size) for size in _FACTS}
-        size = next((size for size in _FACTS if whole + below[size] <= page.place), _FACTS[0])
-        room = page.place - below[size] - above
-        rows, taken = list(declaration.rows), _head_height(columns)
-        here: list[DeclaredRow] = []
-        while rows and (taken := taken + _row_height(rows[0], columns)) <= room:
-            here.append(rows.pop(0))
+        rows = [
+            replace(row, result=replace(row.result, name=declaration.marked(row.result.name)))
+            for row in declaration.rows
+        ]
+        for layout in (*_LAYOUTS, _LAYOUTS[0]):
+            page, columns = Page(), Columns([_cells(row) for row in rows], _HEADS, layout.table)
+            _head(page, declaration, layout.lines)
+            above = layout.picture if shown else 0.0
+            below = _SIGNATURE + _facts_height(declaration, layout.facts)
+            whole = above + _table_height(rows, columns) + below
+            if whole <= page.room:
+                break
+        pages = [page]
+        here = _taken(rows, page.room - above - (below if whole <= page.room else 0.0), columns)
         if shown:
             assert geometry is not None
-            table = _head_height(columns) + sum(_row_height(row, columns) for row in here)
-            height = min(_PICTURE[1], page.place - below[size] - table)
+            free = page.room - _table_height(here, columns) - (below if whole <= page.room else 0.0)
+            height = max(above, min(_PICTURE, free))
             grid = [HEIGHT - page.place, height, page.place - height]
             _picture(page.figure, grid, declaration, geometry)
             page.place -= height
         _table(page, here, columns)
-        while rows:
-            further = Page()
-            pages.append(further)
-            further.write(f"{declaration.title}, continued", 11, weight="bold")
-            further.place -= 0.1
-            count = max(1, int((further.place - MARGIN - _FOOT - 0.4) // _row_height(rows[0], columns)))
-            _table(further, rows[:count], columns)
-            rows = rows[count:]
-        _facts(page, declaration, size)
+        while rows or below > page.room:
+            page = Page()
+            pages.append(page)
+            page.write(f"{declaration.title}, continued", 11, weight="bold")
+            page.place -= 0.1
+            _table(page, _taken(rows, page.room, columns) or [rows.pop(0) for _ in rows[:1]], columns)
+        _facts(page, declaration, layout.facts)
         _sign(page)
         for number, one in enumerate(pages, 1):
             _foot(one, number, len(pages))
     return [one.figure for one in pages]
+
+
+def _taken(rows: list[DeclaredRow], room: float, columns: Columns) -> list[DeclaredRow]:
+    """Take the first rows of which a table fits into some room [in] out of a list, and return them."""
+    count = next((k for k in range(len(rows), 0, -1) if _table_height(rows[:k], columns) <= room), 0)
+    taken, rows[:] = rows[:count], rows[count:]
+    return taken
 
 
 def _picture(figure: Figure, heights: Sequence[float], declaration: Declaration, geometry: SceneGeometry) -> None:
@@ -141,22 +162,22 @@ def _picture(figure: Figure, heights: Sequence[float], declaration: Declaration,
     draw_placement(figure.add_subfigure(cells[1, 1]), geometry, declaration.first.poses, declaration.first.verdicts)
 
 
-def _head(page: Page, declaration: Declaration) -> None:
+def _head(page: Page, declaration: Declaration, lines: int) -> None:
     page.put(0, "Statement of measurement uncertainty by virtual measurements", 8.5, MUTED)
     right = f"{declaration.date}" + (f"   No. {declaration.number}" if declaration.number else "")
     page.put(ACROSS - text_width(right, 8.5), right, 8.5, MUTED)
     page.place -= 0.22
     page.write(declaration.title, 15, weight="bold")
     page.place -= 0.03
-    page.write(_result(declaration.first.words), _RESULT, _COLOURS[declaration.first.tone], "bold")
+    page.write(_result(declaration.first, lines), _RESULT, _COLOURS[declaration.first.tone], "bold")
     page.place -= 0.1
 
 
-def _result(words: str) -> str:
-    """Return the result in at most :data:`_RESULT_LINES` lines: the reasons that do not fit are in the table."""
-    for kept in range(words.count("; ") + 1, 0, -1):
-        text = shortened(words, kept)
-        if len(wrapped(text, _RESULT, ACROSS, "bold")) <= _RESULT_LINES:
+def _result(first: FirstScreen, lines: int) -> str:
+    """Return the result in at most some lines, if its summary fits: the reasons that do not are in the table."""
+    for kept in range(len(first.reasons), -1, -1):
+        text = first.words(kept)
+        if len(wrapped(text, _RESULT, ACROSS, "bold")) <= lines:
             break
     return text
 
@@ -184,10 +205,22 @@ def _about(row: DeclaredRow) -> str:
     return ", ".join(filter(None, [row.result.about, "" if nominal == NONE else f"nominal {nominal}"]))
 
 
+def _name_lines(row: DeclaredRow, columns: Columns) -> tuple[list[str], list[str], bool]:
+    """Return the lines of a row's name and of what it is, and whether the latter follows the former in its line."""
+    across = ACROSS if columns.above else columns.widths[0]
+    names = wrapped(row.result.name, columns.size, across, "bold")
+    wide = text_width(row.result.name, columns.size, "bold") + GAP + text_width(_about(row), _small(columns))
+    return names, wrapped(_about(row), _small(columns), ACROSS), columns.above and wide <= ACROSS
+
+
 def _row_height(row: DeclaredRow, columns: Columns) -> float:
-    names = wrapped(row.result.name, columns.size, columns.widths[0], "bold")
-    small = _small(columns)
-    return (len(names) * columns.size + len(wrapped(_about(row), small, ACROSS)) * small) * LINE + 0.05
+    names, about, beside = _name_lines(row, columns)
+    lines = (len(names) + columns.above) * columns.size + (0 if beside else len(about)) * _small(columns)
+    return lines * LINE + _ROW_GAP
+
+
+def _table_height(rows: Sequence[DeclaredRow], columns: Columns) -> float:
+    return _head_height(columns) + sum(_row_height(row, columns) for row in rows)
 
 
 def _small(columns: Columns) -> float:
@@ -199,8 +232,10 @@ def _head_height(columns: Columns) -> float:
 
 
 def _table(page: Page, rows: Sequence[DeclaredRow], columns: Columns) -> None:
+    if not rows:
+        return
     top = page.place
-    for left, head in zip(columns.lefts, _HEADS, strict=True):
+    for left, head in zip(columns.lefts, columns.heads, strict=True):
         page.place = top
         for line in head:
             page.put(left, line, columns.size, MUTED)
@@ -209,41 +244,67 @@ def _table(page: Page, rows: Sequence[DeclaredRow], columns: Columns) -> None:
     page.rule(MUTED)
     page.place -= 0.04
     for row in rows:
-        cells, top = _cells(row), page.place
-        verdict = columns.lefts[-1]
-        for left, text in zip(columns.lefts[1:-1], cells[1:-1], strict=True):
-            page.put(left, text, columns.size)
-        page.put(verdict, "●", columns.size, row.result.colour)
-        page.put(verdict + text_width("● ", columns.size, "bold"), row.result.verdict, columns.size, weight="bold")
-        page.write(row.result.name, columns.size, weight="bold", across=columns.widths[0])
+        top = page.place
+        if columns.above:
+            _write_name(page, row, columns)
+            _write_values(page, row, columns)
+        else:
+            _write_values(page, row, columns)
+            page.place = top
+            _write_name(page, row, columns)
+        page.place = top - _row_height(row, columns)
+
+
+def _write_name(page: Page, row: DeclaredRow, columns: Columns) -> None:
+    names, _, beside = _name_lines(row, columns)
+    for line in names:
+        page.put(0, line, columns.size, weight="bold")
+        page.place -= columns.size * LINE * (not beside)
+    if beside:
+        page.put(text_width(row.result.name, columns.size, "bold") + GAP, _about(row), _small(columns), MUTED)
+        page.place -= columns.size * LINE
+    else:
         page.write(_about(row), _small(columns), MUTED)
-        page.place = min(page.place, top - _row_height(row, columns))
+
+
+def _write_values(page: Page, row: DeclaredRow, columns: Columns) -> None:
+    verdict = columns.lefts[-1]
+    for left, text in zip(columns.lefts[1:-1], _cells(row)[1:-1], strict=True):
+        page.put(left, text, columns.size)
+    page.put(verdict, "●", columns.size, row.result.colour)
+    page.put(verdict + text_width("● ", columns.size, "bold"), row.result.verdict, columns.size, weight="bold")
+
+
+def _notes(declaration: Declaration) -> list[str]:
+    """Return the notes on all rows, and those on some rows as one."""
+    of_some = "   ".join(note.marked for note in declaration.notes if note.mark)
+    return [*(note.words for note in declaration.notes if not note.mark), *filter(None, [of_some])]
 
 
 def _facts_height(declaration: Declaration, size: float) -> float:
     small = min(size, _SMALL)
-    lines = sum(len(wrapped(text, size, ACROSS - _FACT_LEFT)) for _, text in declaration.facts)
-    notes = sum(len(wrapped(text, small, ACROSS)) for text in declaration.notes)
-    return lines * size * LINE + 0.025 * len(declaration.facts) + notes * small * LINE + 0.16
+    lines = sum(len(wrapped(text, size, ACROSS - size * _FACT_LEFT)) for _, text in declaration.facts)
+    notes = sum(len(wrapped(note, small, ACROSS)) for note in _notes(declaration))
+    return lines * size * LINE + _FACT_GAP * len(declaration.facts) + notes * small * LINE + 0.11
 
 
 def _facts(page: Page, declaration: Declaration, size: float) -> None:
     page.place -= 0.05
-    for note in declaration.notes:
+    for note in _notes(declaration):
         page.write(note, min(size, _SMALL), MUTED)
     page.place -= 0.06
     for name, text in declaration.facts:
         if text:
             page.put(0, name, size, MUTED)
-            page.write(text, size, left=_FACT_LEFT, across=ACROSS - _FACT_LEFT)
-            page.place -= 0.025
+            page.write(text, size, left=size * _FACT_LEFT, across=ACROSS - size * _FACT_LEFT)
+            page.place -= _FACT_GAP
 
 
 def _sign(page: Page) -> None:
     """Draw the lines to fill in and to sign above the foot of a page."""
     third = ACROSS / 3
     for above, names in enumerate(reversed(_TO_FILL_IN)):
-        page.place = MARGIN + _FOOT + 0.2 + above * 0.42
+        page.place = MARGIN + FOOT + 0.2 + above * 0.42
         for number, name in enumerate(names):
             left = number * third
             page.rule(MUTED, left, left + third - (0.2 if number < 2 else 0))

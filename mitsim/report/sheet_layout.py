@@ -26,8 +26,11 @@ HEIGHT = 11.69
 #: margin of a page on each side [in]
 MARGIN = 0.6
 
+#: height of the last line of a page [in]
+FOOT = 0.22
+
 #: distance between columns [in]
-GAP = 0.1
+GAP = 0.07
 
 #: width between the margins [in]
 ACROSS = WIDTH - 2 * MARGIN
@@ -110,6 +113,11 @@ class Page:
         self.figure = Figure((WIDTH, HEIGHT), dpi=_DPI)
         self.place = HEIGHT - MARGIN
 
+    @property
+    def room(self) -> float:
+        """Return the height that is left above the last line of the page [in]."""
+        return self.place - MARGIN - FOOT
+
     def put(self, left: float, text: str, size: float = 8.0, colour: str = INK, weight: str = "normal") -> None:
         """Write one line, its top at ``place``.
 
@@ -168,11 +176,35 @@ class Columns:
     """Columns of a table as wide as their widest cell, at the largest size of text at which they fit a page.
 
     ``lefts`` [in] from the margin, ``widths`` [in], ``size`` [pt]. Cells of the first column wrap if they are wider
-    than ``first`` [in] and the others leave no more.
+    than ``first`` [in] and the others leave no more. Where one would wrap, all are ``above``: they have lines of their
+    own, over the other cells, which are a little to the right, and the first column has no head.
+
+    Parameters
+    ----------
+    rows, heads
+        Texts of the cells; of the heads, in lines.
+    largest
+        Largest size of text [pt].
+    first
+        Least width of the first column at the size that is chosen, unless no size leaves it [in].
+
+    See Also
+    --------
+    Page : what the table is written on
     """
 
-    def __init__(self, rows: Sequence[Sequence[str]], heads: Sequence[Sequence[str]], first: float = 1.3) -> None:
-        for size in _SIZES:
+    def __init__(
+        self, rows: Sequence[Sequence[str]], heads: Sequence[Sequence[str]], largest: float = 8.0, first: float = 1.3
+    ) -> None:
+        self._fit(rows, heads, largest, first)
+        names = [row[0] for row in rows]
+        self.above = any(len(wrapped(name, self.size, self.widths[0], "bold")) > 1 for name in names)
+        if self.above:
+            self._fit([["", *row[1:]] for row in rows], [[""], *heads[1:]], largest, 0.3)
+
+    def _fit(self, rows: Sequence[Sequence[str]], heads: Sequence[Sequence[str]], largest: float, first: float) -> None:
+        self.heads = heads
+        for size in _SIZES[_SIZES.index(largest) :]:
             self.size = size
             self.widths = [
                 max(text_width(line, size, "bold") for line in (*(row[k] for row in rows), *head))

@@ -7,11 +7,11 @@ import shutil
 
 import pytest
 
-from characterisation.statements.verdict_words import Judged
+from characterisation.statements.verdict_words import Judged, Reason
 from characterisation.tasks.definitions import DEFINITIONS
 from mitsim.report.choice_page import write_choice_page
 from mitsim.report.first_rows import RowValues, measured_words, tolerance_words
-from mitsim.report.first_screen import of_choice, of_run, sensor_rows, tone_of
+from mitsim.report.first_screen import FirstScreen, of_choice, of_run, sensor_rows, tone_of
 from mitsim.report.page import write_report
 from mitsim.running.numbers import with_degree_signs
 from mitsim.study.choice_document import read_choice
@@ -20,6 +20,7 @@ from mitsim.study.scene_geometry import read_scene_geometry
 from tests.plain_pages import without_pictures
 from tests.report.choice_run import write_choice
 from tests.report.conftest import MEASUREMENTS, write_run
+from tests.report.test_sheet import with_rows
 
 
 def judged(verdict: str, without_value: float = 0.0) -> Judged:
@@ -40,6 +41,47 @@ def judged(verdict: str, without_value: float = 0.0) -> Judged:
 )
 def test_the_bar_is_green_only_if_something_fits_and_nothing_is_lost(results, tone):
     assert tone_of(results) == tone
+
+
+def screen(*reasons: Reason) -> FirstScreen:
+    return FirstScreen(reasons, "bad", [], None, [], {})
+
+
+def test_a_headline_has_four_names_at_most_and_the_fold_has_all():
+    """Thirteen measurements of a part had a headline of 16 lines on a telephone."""
+    fits, names = Reason("Fits 0 of 13 tolerances"), tuple(f"bore_{k}_diameter" for k in range(9))
+    lost, loud = Reason(" are undecidable: no value", names), Reason(" does not fit: u 0.1 deg", ("angle",))
+    first = screen(fits, lost, loud)
+    assert first.headline == (
+        "Fits 0 of 13 tolerances; 9 measurements are undecidable: no value; angle does not fit: u 0.1°"
+    )
+    assert first.folded == [f"{', '.join(names)} are undecidable: no value"] and first.named == 9
+    single = [Reason(" does not fit", (name,)) for name in names]
+    many = screen(fits, *single, Reason("the set of 2 views keeps 1 of 2 limits"))
+    assert many.headline == (
+        "Fits 0 of 13 tolerances; bore_0_diameter does not fit; the set of 2 views keeps 1 of 2 limits; and 8 more"
+    )
+    assert many.folded == [reason.words for reason in single[1:]] and many.named == 8
+    few = screen(fits, *single[:2], Reason(" are undecidable", names[2:4]))
+    assert few.headline == few.words() and not few.folded
+
+
+def test_the_page_has_the_fold_only_if_the_headline_leaves_something_out(run_folder, tmp_path):
+    folder = shutil.copytree(run_folder, tmp_path / "run")
+    with without_pictures():
+        assert 'id="reasons"' not in write_report(folder).read_text(encoding="utf-8")
+    path = folder / "statement.json"
+    stated = json.loads(path.read_text(encoding="utf-8"))
+    lost = {"verdict": "undecidable", "standard_uncertainty": None, "bias": None, "without_value": 1.0}
+    one = next(iter(stated["measurements"].values())) | lost
+    with_rows(folder, 6)
+    stated["measurements"] = dict.fromkeys(json.loads(path.read_text(encoding="utf-8"))["measurements"], one)
+    path.write_text(json.dumps(stated), encoding="utf-8")
+    with without_pictures():
+        text = write_report(folder).read_text(encoding="utf-8")
+    fold = re.search(r'<details id="reasons">(.*?)</details>', text, re.DOTALL)[1]
+    said = html.unescape(re.sub(r"<[^>]*>", "", fold))
+    assert "6 measurements by name" in said and all(f"distance_{k}" in said for k in range(6))
 
 
 def values(**changed) -> RowValues:
@@ -144,7 +186,7 @@ def test_values_that_are_missing_are_told_of_a_comparison_without_tolerances(tmp
             cell |= {"verdict": "no tolerance", "without_value": 0.29}
     (folder / "choice.json").write_text(json.dumps(document), encoding="utf-8")
     first = of_choice(read_choice(folder), None)
-    assert first.tone == "warn" and "no value in up to 29 % of the virtual measurements" in first.words
+    assert first.tone == "warn" and "no value in up to 29 % of the virtual measurements" in first.words()
     assert not first.tolerances
 
 
@@ -185,7 +227,7 @@ def test_a_run_without_a_statement_shows_the_leading_view_so_far(run_folder, tmp
     view = about["leaders"]["all measurements"]
     (folder / "statement.json").unlink()
     first = of_run(read_run(folder), read_scene_geometry(folder))
-    assert first.tone == "warn" and first.words.startswith(f"View {view} leads so far, by ")
+    assert first.tone == "warn" and first.words().startswith(f"View {view} leads so far, by ")
     assert f"view {view}" in first.picture.caption and len(first.rows) == len(MEASUREMENTS)
     with without_pictures():
         page = write_report(folder).read_text()

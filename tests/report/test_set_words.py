@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from characterisation.statements.verdict_words import Reason
 from mitsim.report.first_screen import of_run
 from mitsim.report.set_words import set_result, with_sets
 from mitsim.study.run_folder import ConfirmedEntry, ViewSetEntry, read_run
@@ -56,10 +57,12 @@ def test_a_set_that_no_measurement_confirms_says_so():
 
 def test_the_result_of_a_run_is_good_only_if_its_sets_are():
     missed = entry({"apart": (0.0, 1.0, 0.0), "radius": (0.0, 0.1, 0.0)})
-    assert not with_sets("fits 6 of 6 tolerances", True, [missed]).good
-    assert with_sets("fits 6 of 6 tolerances", True, []).good
-    assert not with_sets("fits 5 of 6 tolerances", False, [entry()]).good
-    assert with_sets("fits 6 of 6 tolerances", True, [missed]).words.startswith("fits 6 of 6 tolerances; the set of 2")
+    assert not with_sets([Reason("fits 6 of 6 tolerances")], True, [missed]).good
+    assert with_sets([Reason("fits 6 of 6 tolerances")], True, []).good
+    assert not with_sets([Reason("fits 5 of 6 tolerances")], False, [entry()]).good
+    assert with_sets([Reason("fits 6 of 6 tolerances")], True, [missed]).words.startswith(
+        "fits 6 of 6 tolerances; the set of 2"
+    )
 
 
 @pytest.mark.parametrize("u", [0.01, 0.5])
@@ -74,5 +77,5 @@ def test_the_first_screen_of_a_run_says_what_its_set_misses(tmp_path, u):
     one = {"limits": {name: 0.05}, "views": [2, 7], "confirmed": {name: confirmed | {"standard_uncertainty": u}}}
     (folder / "run.json").write_text(json.dumps(about | {"view_sets": [one]}), encoding="utf-8")
     first = of_run(read_run(folder), None)
-    assert f"keeps {int(u < 0.05)} of 1 limits" in first.words
+    assert f"keeps {int(u < 0.05)} of 1 limits" in first.words()
     assert first.tone == ("plain" if u < 0.05 else "bad")

@@ -12,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from scipy.spatial.transform import Rotation
 
 from characterisation.files.atomic_io import write_netcdf
+from characterisation.statements.statement import AT_THE_LIMIT
 from mitsim.report.choice_page import write_choice_page
 from mitsim.report.declaration import pose_in_full, read_declaration
 from mitsim.report.sheet import sheet_figures, write_sheet
@@ -57,7 +58,7 @@ def with_rows(folder, count, long=False):
         write_netcdf(of_rows, path)
 
 
-@pytest.mark.parametrize(("rows", "long", "pages"), [(2, False, 1), (9, True, 1), (70, False, 3)])
+@pytest.mark.parametrize(("rows", "long", "pages"), [(2, False, 1), (13, True, 1), (20, True, 2), (70, False, 3)])
 def test_no_text_overlaps_another_or_leaves_the_page(run_folder, tmp_path, rows, long, pages):
     folder = shutil.copytree(run_folder, tmp_path / "run")
     with_rows(folder, rows, long)
@@ -82,16 +83,50 @@ def test_facts_are_set_smaller_before_a_sheet_gets_a_second_page(run_folder, tmp
     geometry = read_scene_geometry(folder)
     declaration = read_declaration(folder, geometry)
     found = []
-    for count in range(1, 30):
+    for count in range(1, 60):
         more = [(f"fact {k}", "one word after another") for k in range(count)]
         pages = sheet_figures(replace(declaration, facts=more), geometry)
-        (name,) = [one for one in pages[0].texts if one.get_text() == "fact 0"]
+        (name,) = [one for page in pages for one in page.texts if one.get_text() == "fact 0"]
         found.append((len(pages), name.get_fontsize()))
         if len(pages) > 1:
             break
     assert [pages for pages, _ in found[:-1]] == [1] * (len(found) - 1) and found[-1][0] == 2
     sizes = [size for _, size in found[:-1]]
     assert sizes == sorted(sizes, reverse=True) and len(set(sizes)) > 1 and found[-1][1] == sizes[0]
+
+
+def test_a_table_of_long_names_is_legible_and_has_its_head_on_each_page(run_folder, tmp_path):
+    """Thirteen measurements of long names took two pages, with three rows in 5.5 pt on the first."""
+    folder = shutil.copytree(run_folder, tmp_path / "run")
+    with_rows(folder, 13, long=True)
+    (page,) = figures_of(folder)
+    sizes = [one.get_fontsize() for one in page.texts if one.get_text().startswith("distance_")]
+    assert len(sizes) == 13 and min(sizes) >= 7
+    with_rows(shutil.copytree(run_folder, tmp_path / "more"), 40, long=True)
+    pages = figures_of(tmp_path / "more")
+    texts = [[one.get_text() for one in page.texts] for page in pages]
+    rows = [sum(text.startswith("distance_") for text in page) for page in texts]
+    assert len(pages) == 2 and sum(rows) == 40 and rows[0] > 15
+    assert all("Tolerance" in page for page in texts) and "Sensor" not in texts[0] and "Sensor" in texts[1]
+
+
+def test_notes_on_some_rows_mark_them_and_have_the_names_elsewhere(run_folder, tmp_path):
+    folder = shutil.copytree(run_folder, tmp_path / "run")
+    with_rows(folder, 3)
+    statement = json.loads((folder / "statement.json").read_text(encoding="utf-8"))
+    one, other, third = statement["measurements"].values()
+    statement["measurements"] = {
+        "distance_0": one | {"settled": False, "errors_of": AT_THE_LIMIT},
+        "distance_1": other | {"settled": True},
+        "distance_2": third | {"settled": False},
+    }
+    (folder / "statement.json").write_text(json.dumps(statement), encoding="utf-8")
+    declaration = read_declaration(folder, None)
+    notes = {note.mark: note.in_full for note in declaration.notes if note.mark}
+    assert notes["*"].startswith("distance_0 and distance_2: not settled after JCGM 101")
+    shown = [one.get_text().replace("\N{NO-BREAK SPACE}", " ") for one in sheet_figures(declaration, None)[0].texts]
+    assert {"distance_0 † *", "distance_1", "distance_2 *"} <= set(shown)
+    assert any(text.startswith("† errors for a part at the limit") for text in shown)
 
 
 def test_a_sheet_has_what_iso_ts_15530_4_and_jcgm_101_ask_for(run_folder, tmp_path):
@@ -150,7 +185,7 @@ def test_a_statement_far_below_the_maker_says_so_on_sheet_and_page_of_a_comparis
     for one in statement["measurements"].values():
         one["maker_sigma"] = 100.0
     path.write_text(json.dumps(statement), encoding="utf-8")
-    notes = read_declaration(folder, None).notes
+    notes = [note.in_full for note in read_declaration(folder, None).notes]
     assert "below a tenth of the accuracy that the maker" in notes[-1] and "the influences listed below" in notes[-1]
     assert "below a tenth of the accuracy that the maker" in write_choice_page(folder).read_text(encoding="utf-8")
 

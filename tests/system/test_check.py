@@ -14,7 +14,7 @@ from characterisation.files.errors import InputError
 from mitsim.report.scene_preview import preview_figure, without_leaks
 from mitsim.report.scene_table import as_data, as_text
 from mitsim.report.style import write_png
-from mitsim.scene.authoring.check import findings
+from mitsim.scene.authoring.check import findings, open_borders
 from mitsim.scene.authoring.check_task import read_features
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
@@ -163,6 +163,49 @@ def test_faults_of_a_mesh_are_told(check, tmp_path):
     ball.invert()
     ball.export(tmp_path / "ball.ply")
     assert check(mesh).says("error", "ball", "inward normals")
+
+
+def test_a_long_edge_closes_the_short_ones_along_it(check, tmp_path):
+    """A cone of which one edge of the wall is cut in eight on one side only, as CAD programs mesh a countersink."""
+    angles = 2 * np.pi * np.arange(64) / 64
+    rim = 30 * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+    tip = np.array([0.0, 0.0, 30.0])
+    wall = [[rim[i], rim[(i + 1) % 64], tip] for i in range(1, 64)]
+    cut = [rim[0] + share * (tip - rim[0]) for share in np.arange(9) / 8]
+    wall += [[cut[i], rim[1], cut[i + 1]] for i in range(8)]
+    base = [[rim[(i + 1) % 64], rim[i], np.zeros(3)] for i in range(64)]
+    shapes = ""
+    for name, triangles in (("wall", wall), ("base", base)):
+        vertices = np.reshape(triangles, (-1, 3))
+        trimesh.Trimesh(vertices, np.arange(len(vertices)).reshape(-1, 3)).export(tmp_path / f"{name}.ply")
+        shapes += f'<shape type="ply" id="{name}"><string name="filename" value="{name}.ply"/>{METAL}</shape>'
+    checked = check(shapes)
+    assert checked.facts.merged_mesh.open_edges == 9
+    assert [str(one) for one in checked.found] == []
+    alone = check(shapes[: shapes.index("</shape>") + 8])
+    assert sum(map(len, open_borders(alone.facts))) == 64
+
+
+def test_many_shapes_are_counted_and_findings_of_one_kind_share_a_line(check):
+    balls = "".join(
+        f'<shape type="sphere" id="b{i}"><point name="center" x="{20 * (i % 6)}" y="{20 * (i // 6)}" z="0"/>'
+        f'<float name="radius" value="8"/><bsdf type="diffuse"/></shape>'
+        for i in range(30)
+    )
+    task = ""
+    for i in (25, 28):
+        task += f"[features.b{i}]\nkind='sphere'\npoint_mm=[{20 * (i % 6)},{20 * (i // 6)},0]\nradius_mm=8\n"
+        task += f"[measurements.r{i}]\nkind='radius'\nfeatures=['b{i}']\nnominal=8\nunit='mm'\n"
+    checked = check(balls, task=task)
+    parts = checked.facts, checked.visible, checked.found, checked.task.measured_shapes()
+    lines = as_text(*parts).splitlines()
+    rows = lines[1 : lines.index("and 10 more shapes; --all lists them")]
+    assert [row.split()[0] for row in rows] == ["b25", "b28", *(f"b{i}" for i in range(18))]
+    assert [line[:11] for line in lines if line.startswith("error: ")] == ["error: b25:", "error: b28:"]
+    assert sum("b0, b1, b2 and 25 more: the BSDF diffuse has no finish" in line for line in lines) == 1
+    every = as_text(*parts, every=True).splitlines()
+    assert [row.split()[0] for row in every[1:31]] == ["b25", "b28", *(f"b{i}" for i in range(30) if i not in (25, 28))]
+    assert [line for line in every if ": " in line] == [str(one) for one in checked.found]
 
 
 TASK = '[features.ball]\nkind = "sphere"\npoint_mm = [0, 0, 0]\nradius_mm = 30\n'

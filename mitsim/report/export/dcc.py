@@ -153,7 +153,7 @@ def _methods(to: Element, found: RunResults, declared: Declaration) -> None:
     used = _add(_add(to, "usedMethods"), "usedMethod", refType="basic_methodMeasurementUncertainty")
     _text(used, "name", "Simulate and analyse, a virtual experiment")
     how = "rendered and decoded" if found.source == "render" else "drawn from a performance map"
-    _text(used, "description", " ".join([f"Virtual measurements {how}.", *declared.notes]))
+    _text(used, "description", " ".join([f"Virtual measurements {how}.", *(note.in_full for note in declared.notes)]))
     for norm in ("JCGM 101:2008", "ISO/TS 15530-4:2008"):
         _add(used, "norm", norm)
 

@@ -41,9 +41,6 @@ _SLIVERS = 0.01
 #: edges closer than this share of the part's size close one another; chosen
 _CLOSED = 1e-4
 
-#: number of neighbours of an edge among which the closing one is searched; chosen
-_NEIGHBOURS = 16
-
 #: spacing of single-precision lengths at the part above which it is reported [mm]; noise of sensors is 10 um and more
 _ROUNDED_MM = 1e-3
 
@@ -186,16 +183,30 @@ def open_borders(facts: SceneFacts) -> list[NDArray[np.float64]]:
     if len(every) < 2:
         return borders
     limit = max(NOMINAL_MM / 5, _CLOSED * float(np.linalg.norm(facts.bounds[1] - facts.bounds[0])))
-    middles = every.mean(axis=1)
-    near = cKDTree(middles).query(middles, k=min(_NEIGHBOURS, len(every)))[1]
-    start, along = every[near, 0], every[near, 1] - every[near, 0]
-    share = np.einsum("ijk,ijk->ij", middles[:, None] - start, along) / np.maximum((along**2).sum(-1), 1e-30)
-    foot = start + np.clip(share, 0, 1)[..., None] * along
-    apart = np.linalg.norm(foot - middles[:, None], axis=-1)
-    apart[near == np.arange(len(every))[:, None]] = np.inf
-    still = apart.min(axis=1) > limit
+    still = _apart(every, limit)
     ends = np.cumsum([0, *(len(border) for border in borders)])
     return [border[still[a:b]] for border, a, b in zip(borders, ends, ends[1:], strict=False)]
+
+
+def _apart(edges: NDArray[np.float64], limit: float) -> NDArray[np.bool_]:
+    """Return which edges (n, 2, 3) have no other edge within ``limit`` of their middle.
+
+    An edge of length L has a point within the limit only if its middle is within L / 2 + limit. Edges are searched by
+    their length, each class up to twice as long as the one before, so that a long edge among short ones is found.
+    """
+    middles, along = edges.mean(axis=1), edges[:, 1] - edges[:, 0]
+    length = np.maximum(np.linalg.norm(along, axis=1), limit)
+    of_length, apart, every = np.frexp(length / limit)[1], np.ones(len(edges), bool), cKDTree(middles)
+    for one in np.unique(of_length):
+        members = np.flatnonzero(of_length == one)
+        reach = float(length[members].max()) / 2 + limit
+        pairs = cKDTree(middles[members]).sparse_distance_matrix(every, reach, output_type="coo_matrix")
+        member, other = members[pairs.row], pairs.col
+        from_start = middles[other] - edges[member, 0]
+        share = np.einsum("ij,ij->i", from_start, along[member]) / np.maximum((along[member] ** 2).sum(-1), 1e-30)
+        away = np.linalg.norm(from_start - np.clip(share, 0, 1)[:, None] * along[member], axis=1)
+        apart[other[(away <= limit) & (member != other)]] = False
+    return apart
 
 
 def _holes(mesh: MeshFacts, border: NDArray[np.float64]) -> int:

@@ -7,7 +7,7 @@ sensor -> ``choice.json`` and lines of text, best sensor first.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +16,7 @@ from characterisation.files.atomic_io import json_values
 from characterisation.statements.decision import Verdict, decide, mostly_lost, needed
 from characterisation.statements.statement import Statement
 from characterisation.statements.tolerance import tolerance_of
-from characterisation.statements.verdict_words import result_in_words
+from characterisation.statements.verdict_words import Reason, in_words, result_reasons
 from mitsim.running.numbers import or_nan, two_digits
 from mitsim.running.text_table import aligned
 from mitsim.running.version import __version__
@@ -74,7 +74,9 @@ def document(
     sensors = [_sensor(result) for result in found]
     if all(named_measurement.tolerance is None for named_measurement in named_measurements.values()):
         sensors = _relative(sensors)
-    sensors = [sensor.model_copy(update={"words": words(sensor, named_measurements)}) for sensor in sensors]
+    sensors = [
+        sensor.model_copy(update={"words": in_words(reasons_of(sensor, named_measurements))}) for sensor in sensors
+    ]
     sensors += [
         SensorEntry(
             name=one.name, given=one.given, status="excluded", why=one.reason, ratio=None, fits=0, words=one.reason
@@ -87,7 +89,7 @@ def document(
         study=str(study.path),
         scene=study.scene.where,
         seed=study.file.seed,
-        words=sentence(sensors),
+        words=in_words(best_reasons(sensors, named_measurements)),
         finished=finished,
         seconds=round(seconds, 1),
         measurements=named_measurements,
@@ -95,47 +97,45 @@ def document(
     )
 
 
-def sentence(sensors: Sequence[SensorEntry]) -> str:
-    """Return one line: the best sensor, and its result."""
+def best_reasons(sensors: Sequence[SensorEntry], named_measurements: Mapping[str, ComparedMeasurement]) -> list[Reason]:
+    """Return the best sensor and its result, as reasons of one line."""
     able = [sensor for sensor in sensors if sensor.status != "excluded"]
     if not able or not able[0].measurements:
-        return "no sensor can measure this"
+        return [Reason("no sensor can measure this")]
     best = able[0]
     if len(best.impossible) == len(best.measurements):
-        return f"no sensor can measure this: {_reasons(best)}"
+        return [Reason("no sensor can measure this"), *_impossible_ones(best)]
     others = sum(sensor_entry.fits_all and sensor_entry.status == "stated" for sensor_entry in able[1:])
-    more = f"; so do{'es' if others == 1 else ''} {others} other{'' if others == 1 else 's'}" if others else ""
-    toleranced = any(cell.verdict != "no tolerance" for cell in best.measurements.values())
-    return f"{best.name}: {best.words}" + (more if toleranced and best.fits_all else "")
+    more = f"so do{'es' if others == 1 else ''} {others} other{'' if others == 1 else 's'}"
+    first, *rest = reasons_of(best, named_measurements)
+    return [Reason(f"{best.name}: {first.says}"), *rest] + [Reason(more)] * bool(best.fits_all and others)
 
 
-def words(sensor_entry: SensorEntry, named_measurements: dict[str, ComparedMeasurement]) -> str:
-    """Return the result of a sensor in one line."""
+def reasons_of(sensor_entry: SensorEntry, named_measurements: Mapping[str, ComparedMeasurement]) -> list[Reason]:
+    """Return the result of a sensor, as reasons of one line."""
     if len(sensor_entry.impossible) == len(sensor_entry.measurements):
-        return f"no measurement is possible: {_reasons(sensor_entry)}"
+        return [Reason("no measurement is possible"), *_impossible_ones(sensor_entry)]
     verdicts = [replace(each, unit=named_measurements[each.name].unit) for each in judged(sensor_entry)]
     toleranced = {each.name for each in verdicts if each.verdict != "no tolerance"}
-    if toleranced:
-        result = (
-            result_in_words(verdicts)
-            if sensor_entry.status == "stated"
-            else _expected_in_words(sensor_entry, named_measurements)
-        )
+    by = "by screening alone: " * (sensor_entry.status == "screened")
+    if toleranced and not by:
+        reasons = result_reasons(verdicts)
+    elif toleranced:
+        reasons = [Reason(by + _expected_in_words(sensor_entry, named_measurements))]
     elif sensor_entry.ratio is not None and sensor_entry.ratio > 1:
-        result = f"{two_digits(sensor_entry.ratio)} times the least uncertainty of all sensors at worst"
+        reasons = [Reason(f"{by}{two_digits(sensor_entry.ratio)} times the least uncertainty of all sensors at worst")]
     else:
-        result = (
-            "the least uncertainty of all sensors in every "
-            + "possible " * bool(sensor_entry.impossible)
-            + "measurement"
-        )
-    result = "by screening alone: " * (sensor_entry.status == "screened") + result
-    return "; ".join(
-        filter(None, [result, sensor_entry.possible_in_words, _reasons(sensor_entry, toleranced), sensor_entry.lacks])
-    )
+        possible = "possible " * bool(sensor_entry.impossible)
+        reasons = [Reason(f"{by}the least uncertainty of all sensors in every {possible}measurement")]
+    return [
+        *reasons,
+        *map(Reason, filter(None, [sensor_entry.possible_in_words])),
+        *_impossible_ones(sensor_entry, toleranced),
+        *map(Reason, filter(None, [sensor_entry.lacks])),
+    ]
 
 
-def _expected_in_words(sensor_entry: SensorEntry, named_measurements: dict[str, ComparedMeasurement]) -> str:
+def _expected_in_words(sensor_entry: SensorEntry, named_measurements: Mapping[str, ComparedMeasurement]) -> str:
     """Return how many tolerances a sensor is expected to fit by screening, and its largest demand."""
     cells = {name: cell for name, cell in sensor_entry.measurements.items() if cell.verdict != "no tolerance"}
     text = f"{sensor_entry.expected_fits} of {len(cells)} tolerances are expected to fit"
@@ -148,13 +148,13 @@ def _expected_in_words(sensor_entry: SensorEntry, named_measurements: dict[str, 
     return f"{text}; the hardest is {name}: standard uncertainty {two_digits(or_nan(u))} {unit}{limit}"
 
 
-def _reasons(sensor_entry: SensorEntry, but: Collection[str] = ()) -> str:
+def _impossible_ones(sensor_entry: SensorEntry, but: Collection[str] = ()) -> list[Reason]:
     """Return the reasons of impossible measurements, measurements of one reason together, ``but`` some."""
     by_reason = dict[str, list[str]]()
     for name, why in sensor_entry.impossible.items():
         if name not in but or sensor_entry.status == "screened":
             by_reason.setdefault(why, []).append(name)
-    return "; ".join(f"{', '.join(names)} impossible ({why})" for why, names in by_reason.items())
+    return [Reason(f" impossible ({why})", tuple(names)) for why, names in by_reason.items()]
 
 
 def as_text(choice: ChoiceDocument) -> str:
@@ -185,7 +185,7 @@ def as_text(choice: ChoiceDocument) -> str:
         reasons = f"fewer measurements are possible there, its demand there is above {LARGEST_DEMAND:g}{least}"
         lines.append(f"* by screening alone, (n of m) expected to fit: {reasons}, or time was over")
     lines += [
-        f"{sensor.name}: {sensor.possible_in_words}; {_reasons(sensor)}"
+        f"{sensor.name}: {sensor.possible_in_words}; {'; '.join(one.in_full for one in _impossible_ones(sensor))}"
         for sensor in choice.sensors
         if sensor.status != "excluded" and sensor.impossible
     ]

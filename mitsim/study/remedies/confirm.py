@@ -23,7 +23,7 @@ from mitsim.running.progress import say
 from mitsim.running.time_limit import OutOfTimeError, TimeLimit
 from mitsim.study.remedies.change import Change, Shortfall
 from mitsim.study.remedies.changes import changes
-from mitsim.study.remedies.entries import CHANGES_FOR
+from mitsim.study.remedies.entries import ANY, UntriedChange
 from mitsim.study.remedies.sensors import other_sensors
 
 #: first trials of a change, and those of the next steps while a verdict is open, over the trials of the study's table
@@ -63,13 +63,13 @@ class Remedies:
     """What was tried for the measurements that do not fit.
 
     ``missed`` are their statements by name, ``failed`` the changes that are impossible with the reason. ``untried`` are
-    the words of changes for which time did not suffice.
+    those for which time did not suffice.
     """
 
     missed: dict[str, Statement]
     tried: list[TriedChange] = field(default_factory=list)
     failed: list[tuple[Change, str]] = field(default_factory=list)
-    untried: list[str] = field(default_factory=list)
+    untried: list[UntriedChange] = field(default_factory=list)
 
     @property
     def open(self) -> list[str]:
@@ -116,15 +116,16 @@ def find_remedies(
         wanted = [name for name in change.expected if name in found.open]
         if not wanted or change.words in done:
             continue
+        untried = UntriedChange(change=change.kind, words=change.words, measurements=wanted)
         own = limit.part(_CHANGE_SHARE)
         if own.left <= (_FEWEST * trial_s if change.needs_trials else 0.0):
-            found.untried.append(change.words)
+            found.untried.append(untried)
             continue
         began = time.monotonic()
         try:
             stated = _stated(change, wanted, trials, own)
         except OutOfTimeError:
-            found.untried.append(change.words)
+            found.untried.append(untried)
             continue
         except InputError as error:
             found.failed.append((change, str(error)))
@@ -135,7 +136,7 @@ def find_remedies(
         seconds = time.monotonic() - began
         tried = TriedChange(change, stated, seconds)
         if tried.trials < _FEWEST:
-            found.untried.append(change.words)
+            found.untried.append(untried)
             continue
         found.tried.append(tried)
         fits = ", ".join(name for name in wanted if name in tried.fits) or "no measurement"
@@ -155,14 +156,18 @@ def of_missed(found: Remedies | None, missed: dict[str, Statement], proposed_all
         return None
     now = Remedies(missed) if found is None else replace(found, missed=missed)
     known = () if found is None else found.missed
-    now = replace(now, untried=[*now.untried, *(f"{CHANGES_FOR}{name}" for name in now.open if name not in known)])
+    if new := [name for name in now.open if name not in known]:
+        any_change = UntriedChange(change=ANY, words="any change", measurements=new)
+        now = replace(now, untried=[*now.untried, any_change])
     return now if proposed_all else _without_sensors(now)
 
 
 def _without_sensors(found: Remedies) -> Remedies:
     """Return remedies that name other sensors among what was not tried, if a measurement is open."""
-    words = "with another sensor"
-    return replace(found, untried=[*found.untried, words]) if found.open and words not in found.untried else found
+    if not found.open:
+        return found
+    sensors = UntriedChange(change="sensor", words="with another sensor", measurements=found.open)
+    return replace(found, untried=[*(one for one in found.untried if one.change != "sensor"), sensors])
 
 
 def all_changes(now: Shortfall, limit: TimeLimit) -> Iterator[Change]:
@@ -210,7 +215,7 @@ def remedies_document(found: Remedies) -> dict[str, Any]:
         },
         "tried": [_entry(change, found.missed) for change in found.tried],
         "impossible": [{"words": change.words, "reason": why} for change, why in found.failed],
-        "untried": list(found.untried),
+        "untried": [one.model_dump() for one in found.untried],
     }
 
 

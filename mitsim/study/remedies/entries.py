@@ -9,17 +9,14 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from characterisation.statements.verdict_words import named
+from characterisation.statements.verdict_words import NAMED, named
 from mitsim.running.numbers import listed, or_nan, two_digits
 from mitsim.study.statement_file import PartialDocument
 
-#: what was not tried: any change for a measurement, whose name follows
-CHANGES_FOR = "changes for "
-
-#: why no change makes a measurement fit, if time did not suffice for any
-_NOT_TRIED = "not tried"
+#: kind of what was not tried, if no change of any kind was
+ANY = "any"
 
 
 class MissedEntry(PartialDocument):
@@ -53,12 +50,33 @@ class TriedChangeEntry(PartialDocument):
     measurements: dict[str, ChangedMeasurement]
 
 
+class UntriedChange(PartialDocument):
+    """A kind of ``change`` that was not tried for lack of time, in words, and the ``measurements`` that it was for."""
+
+    change: str
+    words: str
+    measurements: list[str]
+
+
 class RemediesEntry(PartialDocument):
     """``remedies`` of ``run.json``."""
 
     measurements: dict[str, MissedEntry]
     tried: list[TriedChangeEntry]
-    untried: list[str] = Field(default_factory=list)
+    untried: list[UntriedChange] = Field(default_factory=list)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_older_runs(cls, found: Any) -> Any:
+        """Take the words alone, as older versions wrote them, as changes for every measurement."""
+        if not isinstance(found, dict) or not isinstance(found.get("untried"), list):
+            return found
+        names = list(found["measurements"]) if isinstance(found.get("measurements"), dict) else []
+        untried = [
+            {"change": "", "words": one, "measurements": names} if isinstance(one, str) else one
+            for one in found["untried"]
+        ]
+        return {**found, "untried": untried}
 
 
 def remedies_in_words(found: RemediesEntry | None) -> list[str]:
@@ -71,23 +89,24 @@ def remedies_in_words(found: RemediesEntry | None) -> list[str]:
         if names:
             changed = [_changed(name, found.measurements[name], tried.measurements[name]) for name in names]
             verb = "fits" if len(names) == 1 else "fit"
+            if len(names) > NAMED + 1:
+                changed = [*changed[:NAMED], f"{len(names) - NAMED} more"]
             lines.append(f"{tried.words}: {listed(changed)} {verb} ({tried.trials} virtual measurements)")
+    still = [name for name, measurement in found.measurements.items() if measurement.fits_by is None]
+    waiting = {name for one in found.untried for name in one.measurements}
     unsolved: dict[str, list[str]] = {}
-    for name, measurement in found.measurements.items():
-        if measurement.fits_by is None:
-            told, why = _unsolved(found, name)
-            unsolved.setdefault(why, []).append(told)
-    open_ones = [one.removeprefix(CHANGES_FOR) for one in found.untried if one.startswith(CHANGES_FOR)]
-    for why, entries in unsolved.items():
-        if why == _NOT_TRIED and not found.tried:
-            continue  # the last line says so
-        names = [entry for entry in entries if why != _NOT_TRIED or entry not in open_ones]
-        lines += [f"{named(names)}: {why}"] if names else []
-    if found.untried and any(measurement.fits_by is None for measurement in found.measurements.values()):
-        others = [one for one in found.untried if not one.startswith(CHANGES_FOR)]
-        untried = ([f"{CHANGES_FOR}{named(open_ones)}"] if open_ones else []) + others
-        lines.append(f"not tried for lack of time: {'; '.join(untried)}")
-    return lines
+    for name in still:
+        told, why = _unsolved(found, name)
+        if why or name not in waiting:
+            unsolved.setdefault(why or "by its budget, no single change that mitsim knows suffices", []).append(told)
+    lines += [f"{named(entries)}: {why}" for why, entries in unsolved.items()]
+    of_any = {name for one in found.untried if one.change == ANY for name in one.measurements}
+    untried = list[str]()
+    for one in found.untried:
+        names = [name for name in one.measurements if name in still and (one.change == ANY or name not in of_any)]
+        if names:
+            untried.append(one.words if set(names) == set(still) else f"{one.words} for {named(names)}")
+    return lines + [f"not tried for lack of time: {'; '.join(untried)}"] * bool(untried)
 
 
 def _plain(value: float | None, unit: str) -> str:
@@ -103,17 +122,19 @@ def _changed(name: str, before: MissedEntry, after: ChangedMeasurement) -> str:
 
 
 def _unsolved(found: RemediesEntry, name: str) -> tuple[str, str]:
-    """Return a measurement with the nearest uncertainty that was reached, and why no change makes it fit."""
+    """Return a measurement with the nearest uncertainty that was reached, and why no change tried makes it fit.
+
+    The reason is empty if none was tried.
+    """
     one = found.measurements[name]
     rows = [(or_nan(tried.measurements[name].demand), tried) for tried in found.tried if name in tried.measurements]
-    rows = [row for row in rows if math.isfinite(row[0])]
     if not rows:
-        return name, _NOT_TRIED if found.untried else "by its budget, no single change that mitsim knows suffices"
-    demand, best = min(rows, key=lambda row: row[0])
-    helps = one.demand is None or demand < one.demand
+        return name, ""
+    demand, best = min(rows, key=lambda row: math.inf if math.isnan(row[0]) else row[0])
+    helps = math.isfinite(demand) and (one.demand is None or demand < one.demand)
     nearest = best.measurements[name].standard_uncertainty if helps else one.standard_uncertainty
     needed = "" if one.needed is None else f", {_plain(one.needed, one.unit)} needed"
-    told = f"{name} (u {_plain(nearest, one.unit)}{needed})"
+    told = name if nearest is None else f"{name} (u {_plain(nearest, one.unit)}{needed})"
     if best.measurements[name].verdict == "not decided" and demand <= 1:
         return told, f"perhaps {best.words}, not decided by {best.trials} virtual measurements"
     if len(rows) == 1:

@@ -5,7 +5,8 @@ import re
 import pytest
 
 from characterisation.files.errors import InputError
-from mitsim.report.declaration import Declaration
+from characterisation.statements.verdict_words import Reason
+from mitsim.report.declaration import Declaration, Note
 from mitsim.report.export.dcc import DCC, SI, Issuer, write_dcc
 from mitsim.report.first_screen import FirstScreen
 from tests.report.export.test_export_command import export
@@ -80,9 +81,11 @@ FORMS = {
 
 
 def declared():
-    first = FirstScreen("fits", "good", [], None, [], {})
+    first = FirstScreen([Reason("fits")], "good", [], None, [], {})
     facts = [("Left out", "coatings"), ("Exposure", "")]
-    return Declaration("sensor measures part", "2026-11-27", "0123456789abcdef", first, [], facts, ["Error = a − b."])
+    return Declaration(
+        "sensor measures part", "2026-11-27", "0123456789abcdef", first, [], facts, [Note("Error = a − b.")]
+    )
 
 
 @pytest.fixture(scope="module")

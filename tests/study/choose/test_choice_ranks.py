@@ -17,7 +17,7 @@ from mitsim.study.choice_document import ChoiceDocument
 from mitsim.study.choose import read_candidates, rounds, selection
 from mitsim.study.choose.ranking import rank_key, rank_keys, relative_to_least, unpromising
 from mitsim.study.choose.sensor_result import SensorResult, ordered
-from mitsim.study.choose.table import as_text, document, sentence
+from mitsim.study.choose.table import as_text, best_reasons, document
 from mitsim.study.virtual.race import combined_cost, first_of_each, possible_measurements
 from mitsim.study.virtual.stated import StatedView
 from tests.report.choice_run import choice as made_choice
@@ -137,7 +137,7 @@ def test_the_better_sensor_leads_where_one_measurement_is_impossible_for_all(can
     screen = of_choice(choice, None)
     lost = {row.name: row.without_value for row in screen.rows}[MEASUREMENTS[0]]
     assert ("%" in lost) == (make is measured)
-    assert ("100 %" in screen.words) is False
+    assert ("100 %" in screen.words()) is False
     if make is screened:
         promising = selection._promising(found)
         assert [each.candidate.name for each in promising] == [other.name, one.name]
@@ -211,7 +211,7 @@ def test_sensors_that_can_measure_nothing_are_last_and_none_is_named_best(candid
     choice = documented([screened(one, nothing), screened(other, FIRST)])
     assert choice.sensors[-1].name == one.name and choice.sensors[-1].ratio is None
     choice = documented([screened(one, nothing), screened(other, nothing)])
-    assert choice.words.startswith("no sensor can measure this: ") and "by screening" in choice.words
+    assert choice.words.startswith("no sensor can measure this; ") and "by screening" in choice.words
 
 
 def test_no_sensor_fits_all_where_one_measurement_is_impossible(candidates):
@@ -224,13 +224,15 @@ def test_no_sensor_fits_all_where_one_measurement_is_impossible(candidates):
 def test_a_sensor_with_a_tolerance_that_is_not_decided_does_not_fit_all(candidates):
     """Its demand is below the limit, but more trials may put it above."""
     one, other = (with_tolerances(each, 1.0) for each in candidates)
-    sensors = documented([measured(each, (0.01, 0.01, 0.01), tolerance=1.0) for each in (one, other)]).sensors
-    assert sentence(sensors).endswith("; so does 1 other")
+    choice = documented([measured(each, (0.01, 0.01, 0.01), tolerance=1.0) for each in (one, other)])
+    sensors = choice.sensors
+    assert choice.words.endswith("; so does 1 other")
     cells = dict(sensors[1].measurements)
     cells[MEASUREMENTS[1]] = cells[MEASUREMENTS[1]].model_copy(update={"verdict": "not decided"})
     open_one = sensors[1].model_copy(update={"measurements": cells})
     assert open_one.ratio < 1 and not open_one.fits_all
-    assert sentence([sensors[0], open_one]) == f"{sensors[0].name}: fits 3 of 3 tolerances"
+    (told,) = best_reasons([sensors[0], open_one], choice.measurements)
+    assert told.words == f"{sensors[0].name}: fits 3 of 3 tolerances"
 
 
 def test_a_later_sensor_that_fits_more_is_named_with_the_reason(candidates, tmp_path):

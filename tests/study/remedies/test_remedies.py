@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from scipy.stats import norm
 
 from characterisation.files.errors import InputError
@@ -19,7 +20,7 @@ from mitsim.running.time_limit import OutOfTimeError, TimeLimit
 from mitsim.study.remedies.bounds import EXPOSURE, Effect, can_fit, least_shares, least_uncertainty
 from mitsim.study.remedies.change import Change, changed_file
 from mitsim.study.remedies.confirm import Remedies, find_remedies, of_missed, remedies_document
-from mitsim.study.remedies.entries import CHANGES_FOR, MissedEntry, RemediesEntry, remedies_in_words
+from mitsim.study.remedies.entries import MissedEntry, RemediesEntry, UntriedChange, remedies_in_words
 from mitsim.study.tables import StudyFile
 
 #: equally likely errors of a standard normal distribution
@@ -117,6 +118,10 @@ def missed(*names: str) -> dict[str, Statement]:
     return {name: stated(name, 0.8) for name in names}
 
 
+def untried(found: Remedies) -> dict[str, list[str]]:
+    return {one.words: one.measurements for one in found.untried}
+
+
 def test_the_least_effort_is_tried_first_and_no_change_for_a_measurement_that_fits_already() -> None:
     view = Fake("view", ("a", "b"), a=0.02, b=0.7)
     spray = Fake("spray", ("a",), a=0.01, b=0.01)
@@ -165,7 +170,7 @@ def test_a_change_that_time_cannot_confirm_takes_none() -> None:
     """Of a part of two million pixels, a change took 72 s and had seven trials: the statement stayed at thirteen."""
     spray, bias = Fake("spray", ("a",), a=0.02), Fake("bias", ("a",), a=0.7)
     found = find_remedies(missed("a"), [bias.change, spray.change], 40, TimeLimit(60.0), trial_s=5.0)
-    assert bias.asked and not spray.asked and found.untried == ["with spray"]
+    assert bias.asked and not spray.asked and untried(found) == {"with spray": ["a"]}
     find_remedies(missed("a"), [spray.change], 40, TimeLimit(60.0), trial_s=3.0)
     assert spray.asked
 
@@ -178,7 +183,7 @@ def test_a_longer_statement_takes_remedies_away_and_names_what_was_not_tried() -
     assert longer is not None
     assert remedies_in_words(RemediesEntry.model_validate(remedies_document(longer))) == [
         "with spray: c (u 0.020 mm, before 0.80 mm) fits (40 virtual measurements)",
-        "not tried for lack of time: changes for d",
+        "not tried for lack of time: any change",
     ]
 
 
@@ -188,7 +193,7 @@ def test_a_change_that_cannot_be_prepared_in_time_is_not_tried() -> None:
 
     planned, good = Change("exposure", "with exposures", {}, (1,), {"a": 0.0}, too_long), Fake("spray", ("a",), a=0.02)
     found = find_remedies(missed("a"), [planned, good.change], 40)
-    assert found.untried == ["with exposures"] and [one.change.kind for one in found.tried] == ["spray"]
+    assert untried(found) == {"with exposures": ["a"]} and [one.change.kind for one in found.tried] == ["spray"]
 
 
 def test_the_nearest_of_insufficient_changes_is_named() -> None:
@@ -225,8 +230,59 @@ def test_measurements_with_no_change_tried_are_one_line() -> None:
             for name in names
         },
         tried=[],
-        untried=[*(f"{CHANGES_FOR}{name}" for name in names), "with another sensor"],
+        untried=[
+            UntriedChange(change="any", words="any change", measurements=list(names)),
+            UntriedChange(change="sensor", words="with another sensor", measurements=list(names)),
+        ],
     )
+    assert remedies_in_words(found) == ["not tried for lack of time: any change"]
+    found.untried[0].measurements.remove("f")
     assert remedies_in_words(found) == [
-        "not tried for lack of time: changes for a, b, c and 3 more; with another sensor"
+        "not tried for lack of time: any change for a, b, c and 2 more; with another sensor for f"
     ]
+
+
+def test_a_change_tried_without_a_value_was_tried() -> None:
+    """Its line said "not tried", and the last line said it again of the changes that were left."""
+    lost = Change("view", "from view 3", {}, (3,), {"a": 0.0}, lambda count, _: [stated("a", math.nan, count=count)])
+    found = find_remedies(missed("a"), [lost, Fake("spray", ("a",), a=0.02).change], 40, TimeLimit(60.0), trial_s=0.0)
+    assert [one.change.words for one in found.tried] == ["from view 3", "with spray"]
+    found.tried.pop()
+    found.untried.append(UntriedChange(change="spray", words="with spray", measurements=["a"]))
+    assert remedies_in_words(RemediesEntry.model_validate(remedies_document(found))) == [
+        "a (u 0.80 mm, 0.12 mm needed): the one change tried, from view 3, does not help",
+        "not tried for lack of time: with spray",
+    ]
+
+
+def test_what_was_not_tried_is_told_of_the_measurements_that_it_was_for() -> None:
+    good = Fake("spray", ("a",), a=0.02)
+    found = find_remedies(missed("a", "b", "c"), [good.change], 40)
+    found.untried.append(UntriedChange(change="light", words="in a dark cell", measurements=["b", "a"]))
+    assert remedies_in_words(RemediesEntry.model_validate(remedies_document(found))) == [
+        "with spray: a (u 0.020 mm, before 0.80 mm) fits (40 virtual measurements)",
+        "c: by its budget, no single change that mitsim knows suffices",
+        "not tried for lack of time: in a dark cell for b",
+    ]
+
+
+def test_remedies_of_an_older_run_still_read() -> None:
+    document = remedies_document(Remedies(missed("a", "b"))) | {"untried": ["changes for a", "with another sensor"]}
+    assert remedies_in_words(RemediesEntry.model_validate(document)) == [
+        "not tried for lack of time: changes for a; with another sensor"
+    ]
+    for wrong in ("spray", [1], [{"words": "with spray"}]):
+        with pytest.raises(ValidationError, match="untried"):
+            RemediesEntry.model_validate(document | {"untried": wrong})
+    with pytest.raises(ValidationError, match="measurements"):
+        RemediesEntry.model_validate(document | {"measurements": 3})
+
+
+def test_more_than_four_measurements_that_fit_are_counted() -> None:
+    names = "abcdef"
+    spray = Fake("spray", tuple(names), a=0.02, b=0.02, c=0.02, d=0.02, e=0.02, f=0.02)
+    (line,) = remedies_in_words(
+        RemediesEntry.model_validate(remedies_document(find_remedies(missed(*names), [spray.change], 40)))
+    )
+    one = "(u 0.020 mm, before 0.80 mm)"
+    assert line == f"with spray: a {one}, b {one}, c {one} and 3 more fit (40 virtual measurements)"
