@@ -20,7 +20,7 @@ from characterisation.files.atomic_io import json_values
 from characterisation.files.errors import InputError
 from characterisation.statements.statement import Statement
 from mitsim.running.progress import say
-from mitsim.running.time_limit import OutOfTimeError, TimeLimit
+from mitsim.running.time_limit import TimeLimit
 from mitsim.study.remedies.change import Change, Shortfall
 from mitsim.study.remedies.changes import changes
 from mitsim.study.remedies.entries import ANY, UntriedChange
@@ -124,9 +124,6 @@ def find_remedies(
         began = time.monotonic()
         try:
             stated = _stated(change, wanted, trials, own)
-        except OutOfTimeError:
-            found.untried.append(untried)
-            continue
         except InputError as error:
             found.failed.append((change, str(error)))
             continue

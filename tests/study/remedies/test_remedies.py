@@ -16,7 +16,7 @@ from characterisation.statements.decision import demand
 from characterisation.statements.statement import Statement, statement
 from characterisation.statements.tolerance import plus_minus
 from characterisation.tasks.decision_table import Decision
-from mitsim.running.time_limit import OutOfTimeError, TimeLimit
+from mitsim.running.time_limit import TimeLimit
 from mitsim.study.remedies.bounds import EXPOSURE, Effect, can_fit, least_shares, least_uncertainty
 from mitsim.study.remedies.change import Change, changed_file
 from mitsim.study.remedies.confirm import Remedies, find_remedies, of_missed, remedies_document
@@ -185,15 +185,6 @@ def test_a_longer_statement_takes_remedies_away_and_names_what_was_not_tried() -
         "with spray: c (u 0.020 mm, before 0.80 mm) fits (40 virtual measurements)",
         "not tried for lack of time: any change",
     ]
-
-
-def test_a_change_that_cannot_be_prepared_in_time_is_not_tried() -> None:
-    def too_long(_count: int, _limit: TimeLimit) -> list[Statement]:
-        raise OutOfTimeError
-
-    planned, good = Change("exposure", "with exposures", {}, (1,), {"a": 0.0}, too_long), Fake("spray", ("a",), a=0.02)
-    found = find_remedies(missed("a"), [planned, good.change], 40)
-    assert untried(found) == {"with exposures": ["a"]} and [one.change.kind for one in found.tried] == ["spray"]
 
 
 def test_the_nearest_of_insufficient_changes_is_named() -> None:
