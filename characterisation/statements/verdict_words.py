@@ -103,7 +103,8 @@ def in_words(reasons: Sequence[Reason], kept: int | None = None) -> str:
     shown, left = divided(reasons, kept)
     told = {name for reason in shown for name in reason.names}
     more = {name for reason in left for name in reason.names} - told
-    return "; ".join([reason.words for reason in shown] + [f"and {len(more)} more, see the table"] * bool(more))
+    rest = f"and {len(more)} more, see the table" if told else "see the table"
+    return "; ".join([reason.words for reason in shown] + [rest] * bool(more))
 
 
 def divided(reasons: Sequence[Reason], kept: int | None) -> tuple[list[Reason], list[Reason]]:

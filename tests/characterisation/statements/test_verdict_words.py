@@ -50,6 +50,7 @@ def test_measurements_left_out_of_a_summary_are_counted_one_by_one():
     judged = [Judged("top", "mm", "does not fit", 0.2, 0.1), *many]
     words = words_of(judged)
     assert words_of(judged, 1).endswith("0.10 mm needed; and 11 more, see the table")
+    assert words_of(judged, 0) == "fits 0 of 12 tolerances, 11 not decided; see the table"
     assert words_of(judged, 2) == words
     assert "; a, b, c and 8 more: not decided, no value" in words
 
