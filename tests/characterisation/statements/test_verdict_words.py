@@ -63,7 +63,7 @@ def test_measurements_without_a_value_are_one_reason():
         "fits 0 of 12 tolerances; a, b, c and 8 more are undecidable: no virtual measurement gave a value; top does "
         "not fit: standard uncertainty 0.20 mm, 0.10 mm needed"
     )
-    assert words_of(judged, 0) == "fits 0 of 12 tolerances; and 12 more, see the table"
+    assert words_of(judged, 0) == "fits 0 of 12 tolerances; see the table"
     four = words_of([replace(one, trials=0) for one in lost[:4]])
     assert four.endswith("; a, b, c, d are undecidable: by screening, no view can make them")
 
@@ -103,4 +103,4 @@ def test_words_within_a_name_or_a_reason_change_no_count_and_summaries_stay():
         "sensor, new: fits 0 of 4 tolerances; a, b, c; d are undecidable: no value; and 3 more; the set of 2 views "
         "keeps 0 of 4 limits; and 1 more, see the table"
     )
-    assert in_words(reasons, 0).endswith("keeps 0 of 4 limits; and 3 more, see the table")
+    assert in_words(reasons, 0).endswith("keeps 0 of 4 limits; see the table")
