@@ -75,7 +75,7 @@ def check(
             raise InputError("--pose", "", "--position too", "one of them")
         stand = read_pose(pose, view)
     checked, visible, placed = _inspected(scene, chosen, options.definitions(define), task, stand, roll)
-    facts, found, centre = checked.facts, checked.found, checked.scene.centre
+    facts, found, centre = checked.facts, checked.findings, checked.scene.centre
     if stand is None:
         ends = [" ".join(f"{round(float(v), 1) + 0.0:g}" for v in end) for end in (usual_place(chosen, centre), centre)]
         say(f"no position was given: using --position {ends[0]} --target {ends[1]}")
@@ -239,7 +239,7 @@ def _edit(scene: Path, sensor: str | None, port: int) -> None:
             scene.parent,
             names,
             lambda token: author_page(authored(), token),
-            lambda: findings_data(authored().found),
+            lambda: findings_data(authored().findings),
             port,
         )
     except OSError as error:

@@ -90,7 +90,7 @@ def page_data(about: Authored, served: str) -> dict[str, Any]:
         "general": {"linear": LINEAR, "angles": ANGLES, "zones": ZONES},
         "colours": COLOURS,
         "served": served,
-        "findings": findings_data(about.found),
+        "findings": findings_data(about.findings),
         "solid": solid(about.scene, {shape.name for shape in about.facts.shapes if np.isnan(shape.area)}),
     }
 

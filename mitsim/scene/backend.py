@@ -91,12 +91,12 @@ def find_llvm() -> list[Llvm]:
     """Return all candidates for libLLVM, in order of preference."""
     if chosen := os.environ.get(LLVM_VARIABLE):
         return [_inspect(Path(chosen), f"the environment variable {LLVM_VARIABLE}")]
-    found = [_inspect(path, "pip package karellen-llvm-core") for path in _from_pip()]
+    candidates = [_inspect(path, "pip package karellen-llvm-core") for path in _from_pip()]
     for folder in _SYSTEM_FOLDERS:
         names = [path for path in Path(folder).glob("*LLVM*") if _LIBRARY_NAME.fullmatch(path.name)]
-        found += [_inspect(path, "system") for path in sorted(names, reverse=True)]
+        candidates += [_inspect(path, "system") for path in sorted(names, reverse=True)]
     unique: dict[Path, Llvm] = {}
-    for candidate in found:
+    for candidate in candidates:
         unique.setdefault(candidate.path.resolve(), candidate)
     return list(unique.values())
 
@@ -163,8 +163,8 @@ def choose_variant(requested: str | None = None) -> str:
     candidates = find_llvm()
     best = next((c for c in candidates if c.usable), None)
     if best is None:
-        found = "".join(f"\n  found: {c.path} ({c.fault or 'LLVM ' + str(c.version)})" for c in candidates)
-        raise MissingEnvironmentError(HELP + found)
+        inspected = "".join(f"\n  found: {c.path} ({c.fault or 'LLVM ' + str(c.version)})" for c in candidates)
+        raise MissingEnvironmentError(HELP + inspected)
     os.environ[LLVM_VARIABLE] = str(best.path)
     return "llvm_ad_mono"
 

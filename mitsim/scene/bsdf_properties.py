@@ -8,14 +8,14 @@ from typing import Any
 from characterisation.files.errors import InputError, nearest
 
 
-def only_known(props: Any, where: str, known: Sequence[str]) -> None:
-    """Raise :class:`InputError` if a BSDF has a property that is not ``known``."""
+def only_known(props: Any, where: str, names: Sequence[str]) -> None:
+    """Raise :class:`InputError` if a BSDF has a property that is not ``names``."""
     for key in props.keys():  # noqa: SIM118 - not a dict
-        if key not in known:
-            raise InputError(where, str(key), "an unknown property", ", ".join(known), nearest(str(key), list(known)))
+        if key not in names:
+            raise InputError(where, str(key), "an unknown property", ", ".join(names), nearest(str(key), list(names)))
 
 
-def choice(props: Any, where: str, key: str, default: str, known: list[str]) -> str:
+def choice(props: Any, where: str, key: str, default: str, choices: list[str]) -> str:
     """Return a text property of a BSDF.
 
     Parameters
@@ -24,21 +24,21 @@ def choice(props: Any, where: str, key: str, default: str, known: list[str]) -> 
         Mitsuba's properties of the BSDF, and its name for messages.
     key, default
         Of the property; the default is for a BSDF without it.
-    known
+    choices
         Allowed values.
 
     Raises
     ------
     InputError
-        If the value is not one of ``known``.
+        If the value is not one of ``choices``.
 
     See Also
     --------
     number_within : a number
     """
     value = props.get(key, default)
-    if value not in known:
-        raise InputError(where, key, repr(value), ", ".join(known), nearest(str(value), known))
+    if value not in choices:
+        raise InputError(where, key, repr(value), ", ".join(choices), nearest(str(value), choices))
     return str(value)
 
 

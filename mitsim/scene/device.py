@@ -50,10 +50,10 @@ def vectors_to_device(vectors: NDArray[np.floating]) -> Any:
 
 def known_to_device(vectors: NDArray[np.floating]) -> tuple[Any, Any]:
     """Return unit vectors (n, 3) on the device, and a mask of those that are not NaN, or True for all."""
-    known = np.isfinite(vectors).all(axis=1)
-    if known.all():
+    finite = np.isfinite(vectors).all(axis=1)
+    if finite.all():
         return vectors_to_device(vectors), True
-    return vectors_to_device(np.where(known[:, None], vectors, [0.0, 0.0, 1.0])), mi.Bool(known)
+    return vectors_to_device(np.where(finite[:, None], vectors, [0.0, 0.0, 1.0])), mi.Bool(finite)
 
 
 def vectors_to_host(vectors: Any, kind: DTypeLike = np.float32) -> NDArray[Any]:

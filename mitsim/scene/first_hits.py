@@ -41,7 +41,7 @@ def first_hits(scene: Any, origins: NDArray[np.floating], directions: NDArray[np
     two_sided = (surface.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.BackSide))) != 0
     front = ~behind | two_sided
     normal = dr.select(behind, -surface.n, surface.n)
-    inside, instance = (dr.reinterpret_array(mi.UInt32, one) for one in (surface.shape, surface.instance))
+    inside, instance = (dr.reinterpret_array(mi.UInt32, pointer) for pointer in (surface.shape, surface.instance))
     shape_id_of_ray = dr.select(surface.is_valid(), dr.select(instance != 0, instance, inside), 0)
     distance = dr.select(surface.is_valid(), surface.t, dr.nan)
     dr.eval(front, normal, shape_id_of_ray, distance)

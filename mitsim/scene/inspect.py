@@ -283,9 +283,11 @@ def _types_in_xml(path: Path) -> dict[str, tuple[str, str]]:
     types = {str(e.get("id")): str(e.get("type")) for e in every if e.tag == "bsdf"}
     out = {}
     for shape in (e for e in every if e.tag == "shape"):
-        own = shape.find("bsdf")
+        child = shape.find("bsdf")
         references = [types[str(r.get("id"))] for r in shape.iter("ref") if r.get("id") in types]
-        bsdf = str(own.get("type")) if own is not None else references[0] if references else "diffuse (Mitsuba's own)"
+        bsdf = (
+            str(child.get("type")) if child is not None else references[0] if references else "diffuse (Mitsuba's own)"
+        )
         if shape.get("type") == "instance":
             bsdf = "as in its group"
         out[str(shape.get("id"))] = (str(shape.get("type")), bsdf)

@@ -250,9 +250,9 @@ def _prepare() -> None:
         _registered = True
 
 
-def bounds_of(one: Any) -> NDArray[np.float64]:
+def bounds_of(scene_object: Any) -> NDArray[np.float64]:
     """Return the corners (2, 3) of the bounding box [mm] of a Mitsuba scene or shape."""
-    box = one.bbox()
+    box = scene_object.bbox()
     return np.array([np.ravel(box.min), np.ravel(box.max)], float).reshape(2, 3)
 
 
@@ -293,11 +293,11 @@ def _check_xml(path: Path, parameters: dict[str, str]) -> None:
     root, *_ = trees = checked_trees(path)
     if root.tag != "scene":
         raise InputError(path, "", f"the root element <{root.tag}>", "<scene version='3.0.0'>")
-    known = [str(d.get("name")) for d in root.iter("default")]
+    names = [str(d.get("name")) for d in root.iter("default")]
     for name in parameters:
-        if name not in known:
-            allowed = ", ".join(known) or "none: the scene has no <default>"
-            raise InputError(path, name, "a parameter that the scene does not have", allowed, nearest(name, known))
+        if name not in names:
+            allowed = ", ".join(names) or "none: the scene has no <default>"
+            raise InputError(path, name, "a parameter that the scene does not have", allowed, nearest(name, names))
     check_rotations(path, trees, parameters)
 
 

@@ -61,9 +61,9 @@ def draw_scene(scene: Any, names: tuple[str, ...], bounds: Floats, ax: Any, pose
     low, high = seen.min(axis=0), seen.max(axis=0)
     step = float((high - low)[:2].max()) / _RAYS
     x, y = (np.arange(low[k] - 2 * step, high[k] + 2 * step, step) for k in (0, 1))
-    places = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), high[2] + 1.0)], axis=-1)
-    hits = first_hits(scene, places.reshape(-1, 3) @ frame, np.broadcast_to(-frame[2], (places[..., 0].size, 3)))
-    shape = hits.shape.reshape(places.shape[:2])
+    points = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), high[2] + 1.0)], axis=-1)
+    hits = first_hits(scene, points.reshape(-1, 3) @ frame, np.broadcast_to(-frame[2], (points[..., 0].size, 3)))
+    shape = hits.shape.reshape(points.shape[:2])
     extent = (x[0] - step / 2, x[-1] + step / 2, y[0] - step / 2, y[-1] + step / 2)
     with axes_for(ax, (1, 1), (_WIDTH_IN, _WIDTH_IN)) as grid:
         axes: Axes = grid[0, 0]
@@ -99,11 +99,11 @@ def _shaded(hits: Hits, shape: NDArray[np.int16], frame: Floats) -> Floats:
 def _label_places(names: tuple[str, ...], shape: NDArray[np.int16], x: Floats, y: Floats) -> dict[str, Floats]:
     """Return the point of each visible shape that is farthest from its edges, largest shapes first."""
     numbers, counts = np.unique(shape[shape >= 0], return_counts=True)
-    places = {}
+    points = {}
     for number in numbers[np.argsort(-counts, kind="stable")]:
         row, column = innermost_pixel(shape == number)
-        places[names[number]] = np.array([x[column], y[row]])
-    return places
+        points[names[number]] = np.array([x[column], y[row]])
+    return points
 
 
 def _directions(axes: Axes, frame: Floats, corner: tuple[float, float], size: float) -> None:

@@ -50,9 +50,9 @@ def explain_error(error: InputError, path: Path) -> InputError:
     where = f"{path}: line {line}" if line else str(path)
     if match := re.search(r'unreferenced propert(?:y|ies) in (\w+) plugin of type "(\w+)": - \w+ "([^"]+)"', text):
         kind, plugin, name = match.groups()
-        known = list(_PROPERTIES.get(plugin, ()))
-        allowed = ", ".join(known) or f"the properties that Mitsuba's manual has for {plugin}"
-        return InputError(where, f"{kind} {plugin}: {name}", "an unknown property", allowed, nearest(name, known))
+        properties = list(_PROPERTIES.get(plugin, ()))
+        allowed = ", ".join(properties) or f"the properties that Mitsuba's manual has for {plugin}"
+        return InputError(where, f"{kind} {plugin}: {name}", "an unknown property", allowed, nearest(name, properties))
     if match := re.search(r'Plugin "([^"]+)" not found', text):
         allowed = ", ".join(_PLUGINS) + " and the other plugins of Mitsuba 3"
         hint = "mitsim part turns an STL, STEP or other CAD file into a scene" if match[1] in ("stl", "step") else ""

@@ -46,11 +46,15 @@ def from_z_axis(frame: Any, direction: Any) -> Any:
     return mi.Vector3f(*_turned(sine, cosine, direction))
 
 
-def _turned(sine: Any, cosine: Any, one: Any) -> tuple[Any, Any, Any]:
+def _turned(sine: Any, cosine: Any, direction: Any) -> tuple[Any, Any, Any]:
     """Return a direction's coordinates in axes that are turned about z by an angle."""
     from mitsim.scene.backend import dr
 
-    return dr.fma(cosine, one.x, sine * one.y), dr.fma(cosine, one.y, -sine * one.x), one.z
+    return (
+        dr.fma(cosine, direction.x, sine * direction.y),
+        dr.fma(cosine, direction.y, -sine * direction.x),
+        direction.z,
+    )
 
 
 def _reference(frame: Any) -> tuple[Any, Any]:
@@ -114,11 +118,11 @@ def register_turned_lay() -> None:
             cosine = dr.fma(zero_cosine, turn_cosine, -zero_sine * turn_sine)
             sine = dr.fma(zero_sine, turn_cosine, zero_cosine * turn_sine)
 
-            def to_lobe(one: Any) -> Any:
-                return mi.Vector3f(*_turned(sine, cosine, one))
+            def to_lobe(direction: Any) -> Any:
+                return mi.Vector3f(*_turned(sine, cosine, direction))
 
-            def from_lobe(one: Any) -> Any:
-                return mi.Vector3f(*_turned(-sine, cosine, one))
+            def from_lobe(direction: Any) -> Any:
+                return mi.Vector3f(*_turned(-sine, cosine, direction))
 
             turned = mi.SurfaceInteraction3f(surface)
             turned.wi = to_lobe(surface.wi)

@@ -80,7 +80,7 @@ def check_rotations(path: Path, trees: Sequence[ElementTree.Element], parameters
             continue  # Mitsuba reports it
         length = math.hypot(*axis)
         if abs(length - 1) > _UNIT and 0 < length < math.inf:
-            unit = " ".join(f'{name}="{one / length:.7g}"' for name, one in zip("xyz", axis, strict=False))
+            unit = " ".join(f'{name}="{component / length:.7g}"' for name, component in zip("xyz", axis, strict=False))
             raise InputError(path, "rotate", f"an axis of length {length:.6g}", f"a unit vector: {unit}")
 
 
@@ -100,12 +100,12 @@ def scene_files(path: Path, parameters: Mapping[str, str]) -> list[Path]:
     values = {str(e.get("name")): str(e.get("value")) for e in elements if e.tag == "default"} | dict(parameters)
     folders = [path.parent]
     folders += [path.parent / _filled_in(str(e.get("value")), values) for e in elements if e.tag == "path"]
-    found = dict.fromkeys(file for file, _ in trees)
+    files = dict.fromkeys(file for file, _ in trees)
     for element in elements:
         name = _filled_in(str(element.get("value" if element.tag == "string" else "filename", "")), values)
         beside = [folder / name for folder in folders if name and is_file(folder / name)]
-        found |= dict.fromkeys(beside or ([Path(name)] if is_file(name) else []))
-    return list(found)
+        files |= dict.fromkeys(beside or ([Path(name)] if is_file(name) else []))
+    return list(files)
 
 
 def named_digests(path: Path, parameters: Mapping[str, str]) -> list[str]:

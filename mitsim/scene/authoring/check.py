@@ -61,7 +61,7 @@ class Authored:
     scene: Scene
     facts: SceneFacts
     sensor: Sensor
-    found: Sequence[SceneFinding]
+    findings: Sequence[SceneFinding]
     task_path: Path | None
     task: TaskFeatures | None
 
@@ -88,22 +88,22 @@ def findings(
         The features to measure, if any.
     """
     measured = set(task.features) if task else set()
-    found: list[SceneFinding] = []
+    all_findings: list[SceneFinding] = []
     borders = open_borders(facts)
     for number, shape in enumerate(facts.shapes):
         if shape.emitter:
             continue
-        found += _named(shape)
-        found += _material(shape, shape.name in measured)
-        found += _mesh(shape, borders[number])
-        found += _facing(shape, number, visible)
+        all_findings += _named(shape)
+        all_findings += _material(shape, shape.name in measured)
+        all_findings += _mesh(shape, borders[number])
+        all_findings += _facing(shape, number, visible)
         if posed:
-            found += _placed(shape, number, sensor, pose, visible)
-    found += _whole(facts, sensor, sum(len(border) for border in borders))
+            all_findings += _placed(shape, number, sensor, pose, visible)
+    all_findings += _whole(facts, sensor, sum(len(border) for border in borders))
     if task:
-        found += task_findings(facts, task)
+        all_findings += task_findings(facts, task)
     order = ("error", "warning", "note")
-    return sorted(found, key=lambda one: order.index(one.severity))
+    return sorted(all_findings, key=lambda finding: order.index(finding.severity))
 
 
 def _named(shape: ShapeFacts) -> Iterator[SceneFinding]:
@@ -119,16 +119,16 @@ def _named(shape: ShapeFacts) -> Iterator[SceneFinding]:
 def _material(shape: ShapeFacts, measured: bool) -> Iterator[SceneFinding]:
     severity: Severity = "error" if measured else "warning"
     if shape.delta:
-        what = f"a {shape.bsdf} only mirrors or refracts: black under a point-like projector"
-        yield SceneFinding(severity, shape.name, what, "Use machined_metal, or a rough BSDF")
+        problem = f"a {shape.bsdf} only mirrors or refracts: black under a point-like projector"
+        yield SceneFinding(severity, shape.name, problem, "Use machined_metal, or a rough BSDF")
     elif shape.kind == "instance":
-        what = "an instance has no finish of its own, so no performance map covers it"
+        problem = "an instance has no finish of its own, so no performance map covers it"
         advice = "Write the shape itself if it is measured; as it is, it occludes, but has no predicted points"
-        yield SceneFinding(severity, shape.name, what, advice)
+        yield SceneFinding(severity, shape.name, problem, advice)
     elif shape.finish is None:
-        what = f"the BSDF {shape.bsdf} has no finish, so no performance map covers it"
+        problem = f"the BSDF {shape.bsdf} has no finish, so no performance map covers it"
         advice = "Use machined_metal, gloss_paint, powder_coat or matt_white; as it is, it occludes but gives no points"
-        yield SceneFinding(severity, shape.name, what, advice)
+        yield SceneFinding(severity, shape.name, problem, advice)
     else:
         name, roughness = shape.finish.name.partition("/")[2], shape.finish.roughness
         process = PROCESSES.get(name)
@@ -140,9 +140,9 @@ def _material(shape: ShapeFacts, measured: bool) -> Iterator[SceneFinding]:
             yield SceneFinding("warning", shape.name, f"Ra {roughness:g} um is unusual for {name}", advice)
     u, v = shape.alpha
     if abs(u - v) > 0.01 * (u + v) and shape.mesh is not None and not shape.mesh.texture:
-        what = f"a lay (alpha {u:.3g} along u, {v:.3g} along v) on a mesh without u, v: its direction is arbitrary"
+        problem = f"a lay (alpha {u:.3g} along u, {v:.3g} along v) on a mesh without u, v: its direction is arbitrary"
         advice = "Export the mesh with texture coordinates; mitsim part writes them for planes and cylinders"
-        yield SceneFinding("warning", shape.name, what, advice)
+        yield SceneFinding("warning", shape.name, problem, advice)
 
 
 def _mesh(shape: ShapeFacts, border: NDArray[np.float64]) -> Iterator[SceneFinding]:
@@ -150,8 +150,8 @@ def _mesh(shape: ShapeFacts, border: NDArray[np.float64]) -> Iterator[SceneFindi
     if mesh is None or shape.kind in _STOCK:
         return
     if mesh.duplicate or mesh.degenerate > _SLIVERS * len(mesh.triangles):
-        what = f"{mesh.degenerate} triangles without area, {mesh.duplicate} duplicates"
-        yield SceneFinding("warning", shape.name, what, "Clean the mesh: mitsim part leaves them out")
+        problem = f"{mesh.degenerate} triangles without area, {mesh.duplicate} duplicates"
+        yield SceneFinding("warning", shape.name, problem, "Clean the mesh: mitsim part leaves them out")
     if mesh.nonmanifold_edges:
         yield SceneFinding(
             "warning",
@@ -230,17 +230,17 @@ def _facing(shape: ShapeFacts, number: int, visible: VisibleSurfaces) -> Iterato
     turn = 'Reverse its triangles, or write <boolean name="flip_normals" value="true"/>'
     mesh, mine = shape.mesh, visible.shape == number
     if mesh is not None and mesh.closed and mesh.volume < 0:
-        what = f"inward normals: a closed mesh of {mesh.volume:.4g} mm^3, black from outside"
-        yield SceneFinding("error", shape.name, what, turn)
+        problem = f"inward normals: a closed mesh of {mesh.volume:.4g} mm^3, black from outside"
+        yield SceneFinding("error", shape.name, problem, turn)
     elif shape.front_hits + shape.back_hits == 0:
-        what = "visible from nowhere: it lies inside the part, or is very small"
-        yield SceneFinding("note", shape.name, what, "Leave it out if it is not needed")
+        problem = "visible from nowhere: it lies inside the part, or is very small"
+        yield SceneFinding("note", shape.name, problem, "Leave it out if it is not needed")
     elif shape.front_hits < 0.02 * shape.back_hits:
-        what = "inward normals: only its black back is visible, from all directions"
-        yield SceneFinding("error", shape.name, what, turn)
+        problem = "inward normals: only its black back is visible, from all directions"
+        yield SceneFinding("error", shape.name, problem, turn)
     elif mine.sum() > _CRACK_PX and not visible.front[mine].any():
-        what = "shows only its black back in this view"
-        yield SceneFinding("warning", shape.name, what, f"{turn}; or look from the other side")
+        problem = "shows only its black back in this view"
+        yield SceneFinding("warning", shape.name, problem, f"{turn}; or look from the other side")
 
 
 def _placed(
@@ -253,22 +253,22 @@ def _placed(
     points, normals = pose.inverse().points(shape.points), pose.inverse().directions(shape.normals)
     facing = np.einsum("ij,ij->i", normals, sensor.rig.reference.centre - points) > 0
     if not (facing.any() or shape.two_sided):
-        what = "faces away from the sensor in this pose"
-        yield SceneFinding("note", shape.name, what, "Look from another side if it is measured")
+        problem = "faces away from the sensor in this pose"
+        yield SceneFinding("note", shape.name, problem, "Look from another side if it is measured")
         return
     shown = points if shape.two_sided else points[facing]
     share = float(in_working_volume(sensor, shown).mean())
     if share == 0:
-        what = f"outside the working volume in this pose: {_why_outside(sensor, shown)}"
-        yield SceneFinding("warning", shape.name, what, "Move the sensor")
+        problem = f"outside the working volume in this pose: {_why_outside(sensor, shown)}"
+        yield SceneFinding("warning", shape.name, problem, "Move the sensor")
         return
     if share < 0.99:
-        what = f"{100 * share:.0f} % of the facing area lies in the working volume: {_why_outside(sensor, shown)}"
-        yield SceneFinding("note", shape.name, what, "Move the sensor if the rest is measured")
+        problem = f"{100 * share:.0f} % of the facing area lies in the working volume: {_why_outside(sensor, shown)}"
+        yield SceneFinding("note", shape.name, problem, "Move the sensor if the rest is measured")
     if not (mine & visible.seen_by_all).any():
         why = "another camera or the projector does not see it" if mine.any() else "other faces occlude it"
-        what = f"cameras and projector see no point in common: {why}"
-        yield SceneFinding("warning", shape.name, what, "Look from another side if it is measured")
+        problem = f"cameras and projector see no point in common: {why}"
+        yield SceneFinding("warning", shape.name, problem, "Look from another side if it is measured")
 
 
 def _why_outside(sensor: Sensor, points: np.ndarray) -> str:
@@ -290,23 +290,27 @@ def _whole(facts: SceneFacts, sensor: Sensor, open_edges: int) -> Iterator[Scene
     yield from _size(sorted((facts.bounds[1] - facts.bounds[0]).tolist(), reverse=True), sensor)
     far = float(np.abs(facts.bounds).max())
     if (rounded := float(np.spacing(np.float32(far)))) > _ROUNDED_MM:
-        what = f"the part lies up to {far / 1000:.0f} m from the origin, where lengths are rounded to {rounded:.2g} mm"
-        yield SceneFinding("warning", "", what, "Export the part with an origin near it, before it becomes a mesh")
+        problem = (
+            f"the part lies up to {far / 1000:.0f} m from the origin, where lengths are rounded to {rounded:.2g} mm"
+        )
+        yield SceneFinding("warning", "", problem, "Export the part with an origin near it, before it becomes a mesh")
     parts = [shape for shape in facts.shapes if not shape.emitter]
     cut = all(shape.kind not in _STOCK for shape in parts)
     each_closed = all(shape.mesh is not None and shape.mesh.closed for shape in parts)
     if facts.merged_mesh is not None and cut and open_edges and not each_closed:
-        what = f"all meshes together are not closed ({open_edges} open edges)"
+        problem = f"all meshes together are not closed ({open_edges} open edges)"
         advice = "Correct if only one side of the part is modelled: light passes through the openings"
-        yield SceneFinding("note", "", what, advice)
+        yield SceneFinding("note", "", problem, advice)
     if facts.emitters:
-        known = [flux for _, flux in facts.emitters if np.isfinite(flux)]
+        fluxes = [flux for _, flux in facts.emitters if np.isfinite(flux)]
         kinds = ", ".join(sorted({kind for kind, _ in facts.emitters}))
-        total = f", {sum(known):.3g} W in all" if known else ""
-        rest = f", {len(facts.emitters) - len(known)} without a flux" if len(known) < len(facts.emitters) else ""
-        what = f"ambient light, {len(facts.emitters)} emitter{'s'[: len(facts.emitters) > 1]} ({kinds}{total}{rest})"
+        total = f", {sum(fluxes):.3g} W in all" if fluxes else ""
+        unstated = f", {len(facts.emitters) - len(fluxes)} without a flux" if len(fluxes) < len(facts.emitters) else ""
+        problem = (
+            f"ambient light, {len(facts.emitters)} emitter{'s'[: len(facts.emitters) > 1]} ({kinds}{total}{unstated})"
+        )
         advice = f"It is added to every image; the projector emits {sensor.projector.flux:g} W"
-        yield SceneFinding("note", "", what, advice)
+        yield SceneFinding("note", "", problem, advice)
 
 
 def _size(sizes: list[float], sensor: Sensor) -> Iterator[SceneFinding]:
@@ -321,11 +325,13 @@ def _size(sizes: list[float], sensor: Sensor) -> Iterator[SceneFinding]:
             for unit, factor in _UNITS.items()
             if SMALL_PX * pixel <= factor * sizes[0] <= largest
         ]
-        what = f"the part is {sizes[0]:.4g} mm across, {sizes[0] / pixel:.0f} px at {middle:g} mm"
-        yield SceneFinding("warning", "", what, f"Lengths are mm; {'; '.join(guesses) or 'check the unit of the file'}")
+        problem = f"the part is {sizes[0]:.4g} mm across, {sizes[0] / pixel:.0f} px at {middle:g} mm"
+        yield SceneFinding(
+            "warning", "", problem, f"Lengths are mm; {'; '.join(guesses) or 'check the unit of the file'}"
+        )
     view = sorted(field_of_view(sensor, near), reverse=True)
     if sizes[0] > view[0] or sizes[1] > view[1]:
         part = " x ".join(f"{size:.0f}" for size in sizes)
-        what = f"the part is {part} mm, the common view at {near:g} mm is {view[0]:.0f} x {view[1]:.0f} mm"
+        problem = f"the part is {part} mm, the common view at {near:g} mm is {view[0]:.0f} x {view[1]:.0f} mm"
         unit = "; or its unit is not mm" if sizes[0] > 10 * view[0] else ""
-        yield SceneFinding("warning", "", what, f"Increase the distance, or plan several views{unit}")
+        yield SceneFinding("warning", "", problem, f"Increase the distance, or plan several views{unit}")

@@ -114,24 +114,24 @@ def _figure(face: ShapeFacts, name: str, feature: Feature) -> Iterator[SceneFind
     """Yield a finding if a circle or a point of an edge does not lie on the edge of its face."""
     if feature.kind not in ("circle", "edge_point") or face.mesh is None or not face.mesh.open_edges:
         return
-    places, share = np.array([feature.point_mm], float), 1.0
+    points, share = np.array([feature.point_mm], float), 1.0
     if feature.kind == "circle":
         normal = face.normals.mean(axis=0)
         angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)[:, None]
         along, across = tangents(normal / np.linalg.norm(normal))
-        places = places + float(feature.radius_mm or 0.0) * (np.cos(angle) * along + np.sin(angle) * across)
+        points = points + float(feature.radius_mm or 0.0) * (np.cos(angle) * along + np.sin(angle) * across)
         share = _ON_EDGE
     start, end = np.moveaxis(face.mesh.open_edge_ends, 1, 0)
     way = end - start
-    local = places[:, None] - start
+    local = points[:, None] - start
     at = np.clip(np.einsum("ijk,jk->ij", local, way) / np.maximum((way**2).sum(axis=1), 1e-30), 0, 1)
     off = np.linalg.norm(local - at[..., None] * way, axis=-1).min(axis=1)
     worst = float(np.quantile(off, share))
     if worst > NOMINAL_MM:
         severity: Severity = "error" if worst > MISTAKE_MM else "warning"
-        what = f"the {feature.kind.replace('_', ' ')} is {worst:.3g} mm off the edge of {face.name}"
+        problem = f"the {feature.kind.replace('_', ' ')} is {worst:.3g} mm off the edge of {face.name}"
         advice = "Correct its point" + (" or radius_mm, half the diameter" if feature.kind == "circle" else "")
-        yield SceneFinding(severity, name, what, advice)
+        yield SceneFinding(severity, name, problem, advice)
 
 
 def _outline(shape: ShapeFacts, feature: Feature) -> Iterator[SceneFinding]:
@@ -150,11 +150,11 @@ def _outline(shape: ShapeFacts, feature: Feature) -> Iterator[SceneFinding]:
     ratio = spans[0] / np.maximum(spans[1], 1e-9)
     worst = int(np.abs(np.log(np.maximum(ratio, 1e-9))).argmax())
     if ratio.min() < _SHORTER or ratio.max() > _LONGER:
-        what = (
+        problem = (
             f"outline_mm spans {spans[0][worst]:.4g} mm in a direction in which the shape has {spans[1][worst]:.4g} mm"
         )
         yield SceneFinding(
-            "warning", shape.name, what, "Zones are evaluated over the outline: give the corners or ends"
+            "warning", shape.name, problem, "Zones are evaluated over the outline: give the corners or ends"
         )
 
 
@@ -169,16 +169,16 @@ def _nominal(shape: ShapeFacts, feature: Feature) -> Iterator[SceneFinding]:
     worst = float(np.abs(surface_distance(surface, _corners(shape))).max(initial=0.0))
     if worst > NOMINAL_MM:
         severity: Severity = "error" if worst > MISTAKE_MM else "warning"
-        what = f"the shape is up to {worst:.3g} mm off the nominal {feature.kind} of the task"
+        problem = f"the shape is up to {worst:.3g} mm off the nominal {feature.kind} of the task"
         advice = "All errors would be measured from there: correct its position, direction or radius"
-        yield SceneFinding(severity, shape.name, what, advice)
+        yield SceneFinding(severity, shape.name, problem, advice)
     elif shape.mesh is not None:
         middles = shape.mesh.vertices[shape.mesh.triangles].mean(axis=1)
         sag = float(np.abs(surface_distance(surface, middles)).max(initial=0.0))
         if sag > NOMINAL_MM:
-            what = f"facets deviate by up to {sag:.2g} mm from the nominal {feature.kind}"
+            problem = f"facets deviate by up to {sag:.2g} mm from the nominal {feature.kind}"
             advice = "Mesh the part more finely: this is an error of the part, not of the sensor"
-            yield SceneFinding("warning", shape.name, what, advice)
+            yield SceneFinding("warning", shape.name, problem, advice)
 
 
 def _bore(shape: ShapeFacts, feature: Feature, task: TaskFeatures) -> Iterator[SceneFinding]:
@@ -192,12 +192,12 @@ def _bore(shape: ShapeFacts, feature: Feature, task: TaskFeatures) -> Iterator[S
     across = shape.points - surface.point
     across -= np.outer(across @ surface.axis, surface.axis)
     if np.einsum("ij,ij->i", shape.normals, across).mean() >= 0 or any(
-        _rim(one, surface) for one in task.features.values()
+        _rim(candidate, surface) for candidate in task.features.values()
     ):
         return
-    what = "a measurement uses the wall of this bore, of which a camera sees little"
+    problem = "a measurement uses the wall of this bore, of which a camera sees little"
     advice = 'If it has too few points, measure its rim, a feature of the kind "circle" in the face around it'
-    yield SceneFinding("note", shape.name, what, advice)
+    yield SceneFinding("note", shape.name, problem, advice)
 
 
 def _rim(feature: Feature, bore: Cylinder) -> bool:

@@ -83,9 +83,9 @@ class DrawnTask:
         lines = [f"The file's own dimensions and tolerances: {len(self.measurements)} measurements."]
         lines += [f"Datum {letter}: {', '.join(faces) or 'no face'}." for letter, faces in self.datums.items()]
         if self.in_part:
-            lines += ["Converted, with a remark:", *(f"  {one}" for one in self.in_part)]
+            lines += ["Converted, with a remark:", *(f"  {remark}" for remark in self.in_part)]
         if self.left_out:
-            lines += ["Not converted:", *(f"  {one}" for one in self.left_out)]
+            lines += ["Not converted:", *(f"  {omission}" for omission in self.left_out)]
         return lines
 
 
@@ -105,7 +105,7 @@ def drawn_task(information: ProductInformation, faces: Sequence[Face]) -> DrawnT
 
 
 def _what(target: DrawnTarget) -> str:
-    return f"on {', '.join(target.others)}, no face" if target.others else "on no face of the part"
+    return f"on {', '.join(target.other_types)}, no face" if target.other_types else "on no face of the part"
 
 
 class _TaskBuilder:
@@ -131,38 +131,46 @@ class _TaskBuilder:
             name = f"{base}_{count}"
         self.task.measurements[name] = measurement
 
-    def dimension(self, one: Dimension) -> None:
+    def dimension(self, dimension: Dimension) -> None:
         """Convert a size or a location."""
-        described = f"#{one.number} {one.kind}" + (f" {one.nominal:g}" if one.nominal is not None else "")
-        first, second = self.faces(one.first), self.faces(one.second) if one.second else []
+        described = f"#{dimension.number} {dimension.kind}" + (
+            f" {dimension.nominal:g}" if dimension.nominal is not None else ""
+        )
+        first, second = self.faces(dimension.first), self.faces(dimension.second) if dimension.second else []
         on = f" of {', '.join(f.name for f in [*first, *second])}" if first or second else ""
 
         def left_out(why: str) -> None:
             self.task.left_out.append(f"{described}{on}: {why}")
 
-        if one.nominal is None:
+        if dimension.nominal is None:
             return left_out("it has no value in the file")
-        if not first or (one.second is not None and not second):
-            return left_out(f"it is {_what(one.first if not first else one.second or DrawnTarget())}")
-        remarks = list(one.notes)
-        tolerance = _deviations(one)
-        if one.limits is not None and tolerance is None:
-            remarks.append(f"its limits {one.limits[0]:g} and {one.limits[1]:g} are not in increasing order")
+        if not first or (dimension.second is not None and not second):
+            return left_out(f"it is {_what(dimension.first if not first else dimension.second or DrawnTarget())}")
+        remarks = list(dimension.notes)
+        tolerance = _deviations(dimension)
+        if dimension.limits is not None and tolerance is None:
+            remarks.append(
+                f"its limits {dimension.limits[0]:g} and {dimension.limits[1]:g} are not in increasing order"
+            )
             self.task.in_part.append(f"{described}{on}: without its tolerance, because {remarks[-1]}")
         made: list[tuple[str, str, tuple[Face, ...], float]] = []
-        if one.second is None:
-            made = self._sizes(one, first)
+        if dimension.second is None:
+            made = self._sizes(dimension, first)
         else:
-            kind, value = _between(first[0], second[0], one.angular) if len(first) == len(second) == 1 else ("", 0.0)
+            kind, value = (
+                _between(first[0], second[0], dimension.angular) if len(first) == len(second) == 1 else ("", 0.0)
+            )
             if kind:
-                short = "angle" if one.angular else "distance"
+                short = "angle" if dimension.angular else "distance"
                 made = [(f"{first[0].name}_to_{second[0].name}_{short}", kind, (first[0], second[0]), value)]
         if not made:
             return left_out("a task has no such measurement between such faces")
         for name, kind, members, model in made:
-            nominal = one.nominal
+            nominal = dimension.nominal
             allowed = tolerance
-            if one.angular and kind != "cone_angle" and nominal > 90:  # a task has angles between lines, 0 to 90 deg
+            if (
+                dimension.angular and kind != "cone_angle" and nominal > 90
+            ):  # a task has angles between lines, 0 to 90 deg
                 nominal = 180.0 - nominal
                 allowed = (-tolerance[1], -tolerance[0]) if isinstance(tolerance, tuple) else tolerance
             said = list(remarks)
@@ -170,10 +178,12 @@ class _TaskBuilder:
                 said.append(f"the drawing states {nominal:g}, the model has {model:.6g}")
                 nominal, allowed = _about(model, nominal, allowed)
             ordered = members[::-1] if kind in _FIRST and members[0].kind != _FIRST[kind] else members
-            unit = "deg" if one.angular else "mm"
+            unit = "deg" if dimension.angular else "mm"
             self.add(
                 name,
-                DrawnMeasurement(kind, tuple(f.name for f in ordered), nominal, unit, allowed, one.number, tuple(said)),
+                DrawnMeasurement(
+                    kind, tuple(f.name for f in ordered), nominal, unit, allowed, dimension.number, tuple(said)
+                ),
             )
         return None
 
@@ -212,7 +222,7 @@ class _TaskBuilder:
             return
         datums = {letter: [self.by_name[name] for name in names] for letter, names in self.task.datums.items()}
         made = zones(geometric_tolerance, faces, datums)
-        for zone in made.found:
+        for zone in made.zones:
             for side in (zone.of, *zone.datums):
                 if side.derived:
                     self.task.middles[side.name] = side
@@ -267,23 +277,23 @@ def _half_angle(face: Face) -> float:
 
 def _between(first: Face, second: Face, angular: bool) -> tuple[str, float]:
     """Return kind and model value of a distance [mm] or an angle [deg] between two faces; an empty kind if none."""
-    one, other = first.surface, second.surface
+    surface, other = first.surface, second.surface
     if angular:
-        if isinstance(one, Plane) and isinstance(other, Plane):
-            return "plane_angle", float(np.rad2deg(plane_angle(one, other)))
-        if isinstance(one, Cylinder | Cone) and isinstance(other, Plane):
-            one, other = other, one
-        if isinstance(one, Plane) and isinstance(other, Cylinder | Cone):
-            return "plane_axis_angle", float(np.rad2deg(plane_axis_angle(one, other)))
+        if isinstance(surface, Plane) and isinstance(other, Plane):
+            return "plane_angle", float(np.rad2deg(plane_angle(surface, other)))
+        if isinstance(surface, Cylinder | Cone) and isinstance(other, Plane):
+            surface, other = other, surface
+        if isinstance(surface, Plane) and isinstance(other, Cylinder | Cone):
+            return "plane_axis_angle", float(np.rad2deg(plane_axis_angle(surface, other)))
         return "", 0.0
-    if isinstance(one, Plane) and isinstance(other, Plane) and abs(float(one.normal @ other.normal)) > 0.9999:
-        return "plane_distance", plane_distance(one, other, nominal=(one, other))
-    if isinstance(one, Cylinder | Cone) and isinstance(other, Cylinder | Cone):
-        return "axis_distance", axis_distance(one, other)
-    if isinstance(one, Sphere) and isinstance(other, Sphere):
-        return "point_distance", float(np.linalg.norm(one.centre - other.centre))
-    if isinstance(one, Plane) and isinstance(other, Sphere):
-        one, other = other, one
-    if isinstance(one, Sphere) and isinstance(other, Plane):
-        return "point_plane_distance", point_plane_distance(one, other)
+    if isinstance(surface, Plane) and isinstance(other, Plane) and abs(float(surface.normal @ other.normal)) > 0.9999:
+        return "plane_distance", plane_distance(surface, other, nominal=(surface, other))
+    if isinstance(surface, Cylinder | Cone) and isinstance(other, Cylinder | Cone):
+        return "axis_distance", axis_distance(surface, other)
+    if isinstance(surface, Sphere) and isinstance(other, Sphere):
+        return "point_distance", float(np.linalg.norm(surface.centre - other.centre))
+    if isinstance(surface, Plane) and isinstance(other, Sphere):
+        surface, other = other, surface
+    if isinstance(surface, Sphere) and isinstance(other, Plane):
+        return "point_plane_distance", point_plane_distance(surface, other)
     return "", 0.0

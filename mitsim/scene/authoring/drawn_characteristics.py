@@ -13,7 +13,7 @@ class DrawnTarget:
     """The object of a dimension, tolerance or datum: faces by number, and anything else by its type."""
 
     faces: tuple[int, ...] = ()
-    others: tuple[str, ...] = ()
+    other_types: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ class Zone:
 class Zones:
     """The zones of one tolerance, and reasons for faces without one: (name of the face or "", reason)."""
 
-    found: list[Zone] = field(default_factory=list)
+    zones: list[Zone] = field(default_factory=list)
     left_out: list[tuple[str, str]] = field(default_factory=list)
 
 
@@ -81,7 +81,7 @@ def zones(tolerance: GeometricTolerance, faces: Sequence[Face], datum_faces: Map
             continue
         zone = _zone(tolerance, side, datums)
         if isinstance(zone, Zone):
-            out.found.append(zone)
+            out.zones.append(zone)
         else:
             out.left_out.append((side.name, zone))
     return out
@@ -123,15 +123,15 @@ def _zone(tolerance: GeometricTolerance, side: Side, datums: Sequence[Side | Non
         case "angularity" if flat:
             return _oriented(tolerance, "angularity", side, datums)
         case "coaxiality" | "concentricity" if axis:
-            found = _oriented(tolerance, "coaxiality", side, datums)
-            if isinstance(found, Zone) and isinstance(found.datums[0].surface, Plane):
-                return f"its datum {found.datums[0].name} has no axis"
-            return found
+            zone = _oriented(tolerance, "coaxiality", side, datums)
+            if isinstance(zone, Zone) and isinstance(zone.datums[0].surface, Plane):
+                return f"its datum {zone.datums[0].name} has no axis"
+            return zone
         case "symmetry" if side.derived or axis:
-            found = _oriented(tolerance, "symmetry", side, datums)
-            if isinstance(found, Zone) and not isinstance(found.datums[0].surface, Plane):
-                return f"its datum {found.datums[0].name} is not a plane"
-            return found
+            zone = _oriented(tolerance, "symmetry", side, datums)
+            if isinstance(zone, Zone) and not isinstance(zone.datums[0].surface, Plane):
+                return f"its datum {zone.datums[0].name} is not a plane"
+            return zone
         case "position":
             frame = _frame(tolerance, datums)
             if not isinstance(frame, str):
@@ -160,11 +160,11 @@ def _oriented(tolerance: GeometricTolerance, kind: str, side: Side, datums: Sequ
 
 def _frame(tolerance: GeometricTolerance, datums: Sequence[Side | None]) -> tuple[Side, ...] | str:
     """Return three datums that define a frame, or the condition that is not met."""
-    known = [datum for datum in datums if datum is not None]
-    surfaces: list[Datum] = [datum.surface for datum in known if not isinstance(datum.surface, Sphere)]
-    if len(tolerance.datums) != 3 or len(surfaces) != 3 or len({datum.name for datum in known}) != 3:
+    frame_datums = [datum for datum in datums if datum is not None]
+    surfaces: list[Datum] = [datum.surface for datum in frame_datums if not isinstance(datum.surface, Sphere)]
+    if len(tolerance.datums) != 3 or len(surfaces) != 3 or len({datum.name for datum in frame_datums}) != 3:
         return "three datums that are planes or axes"
-    return frame_fault(surfaces) or tuple(known)
+    return frame_fault(surfaces) or tuple(frame_datums)
 
 
 def middle_outline(side: Side, spread: np.ndarray) -> np.ndarray:

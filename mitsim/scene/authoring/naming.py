@@ -82,7 +82,7 @@ def _unique(names: dict[int, str], faces: Sequence[Face]) -> list[str]:
     """
     taken: dict[str, int] = {}
     out: dict[int, str] = {}
-    for number in sorted(names, key=lambda one: (names[one], _place(faces[one]).round(4).tolist()[::-1])):
+    for number in sorted(names, key=lambda index: (names[index], _place(faces[index]).round(4).tolist()[::-1])):
         base = name = f"face_{names[number]}" if _FINISH.fullmatch(names[number]) else names[number]
         while name.casefold() in taken:
             taken[base.casefold()] += 1
@@ -100,7 +100,7 @@ def _in_order(faces: list[Face]) -> list[Face]:
 def _given(face: Face) -> str:
     """Return the name in the CAD file if a person wrote it: it contains a word and is not the program's counter."""
     name = face.drawn_name
-    letters = "".join(one for one in name if not _is_mark(one))
+    letters = "".join(character for character in name if not _is_mark(character))
     # an ideograph or a syllable is a word; a single letter of an alphabet is not
     word = re.search(r"[^\W\d_]{2}", letters) or any(unicodedata.category(letter) == "Lo" for letter in letters)
     return identifier(name) if word and not _NO_NAME.fullmatch(letters) else ""
@@ -112,14 +112,16 @@ def identifier(name: str, longest: int = _LONGEST) -> str:
     Letters keep their marks. ``longest`` is in bytes, since a name may become part of a file's name.
     """
     composed = unicodedata.normalize("NFC", name)
-    kept = "".join(one if one.isalnum() or one in "_-" or _is_mark(one) else " " for one in composed)
+    kept = "".join(
+        character if character.isalnum() or character in "_-" or _is_mark(character) else " " for character in composed
+    )
     plain = re.sub(r" +", "_", kept).strip("_-").encode()[:longest].decode("utf-8", "ignore").rstrip("_-")
     return plain if plain[:1].isalpha() else f"face_{plain}".rstrip("_")
 
 
-def _is_mark(one: str) -> bool:
+def _is_mark(character: str) -> bool:
     """Return whether a character is a mark on the letter before it."""
-    return unicodedata.category(one).startswith("M")
+    return unicodedata.category(character).startswith("M")
 
 
 def _part_names(faces: Sequence[Face]) -> list[str]:
@@ -132,7 +134,7 @@ def _part_names(faces: Sequence[Face]) -> list[str]:
     names: dict[int, str] = {}
     for body in order:
         name = identifier(bodies[body] or "part", _LONGEST_PART)
-        alike = [one for one in order if identifier(bodies[one] or "part", _LONGEST_PART) == name]
+        alike = [part for part in order if identifier(bodies[part] or "part", _LONGEST_PART) == name]
         names[body] = name if len(alike) == 1 else f"{name}_{alike.index(body) + 1}"
     return [f"{names[face.body]}_" for face in faces]
 
@@ -207,9 +209,9 @@ def degrees(value: float) -> str:
     return f"{_rounded(value, 0):.0f}"
 
 
-def _rounded(value: float, places: int) -> Decimal:
+def _rounded(value: float, decimals: int) -> Decimal:
     """Round a number half away from zero, so that noise of the file does not decide."""
-    return Decimal(f"{value:.{_PLACES}f}").quantize(Decimal(1).scaleb(-places), ROUND_HALF_UP)
+    return Decimal(f"{value:.{_PLACES}f}").quantize(Decimal(1).scaleb(-decimals), ROUND_HALF_UP)
 
 
 def _place(face: Face) -> Floats:
@@ -225,22 +227,22 @@ def _distinguished(faces: list[Face], extent: Floats) -> list[str]:
     """Return suffixes that distinguish faces with equal descriptions: sides if sufficient, else numbers by z, y, x."""
     if len(faces) == 1:
         return [""]
-    places = np.array([_place(face) for face in faces])
-    spread = np.ptp(places, axis=0)
+    positions = np.array([_place(face) for face in faces])
+    spread = np.ptp(positions, axis=0)
     far = spread > np.maximum(_APART * extent, 1e-3)
     words: list[list[str]] = [[] for _ in faces]
     for along in (2, 1, 0):
-        if far[along] and _form_two_clusters(places[:, along]):
-            middle = (places[:, along].max() + places[:, along].min()) / 2
-            for word, place in zip(words, places, strict=True):
-                word.append(SIDES[along][bool(place[along] > middle)])
-    suffixes = ["".join(f"_{one}" for one in word) for word in words]
+        if far[along] and _form_two_clusters(positions[:, along]):
+            middle = (positions[:, along].max() + positions[:, along].min()) / 2
+            for word, position in zip(words, positions, strict=True):
+                word.append(SIDES[along][bool(position[along] > middle)])
+    suffixes = ["".join(f"_{side}" for side in word) for word in words]
     out: dict[int, str] = {}
     groups = defaultdict(list)
     for number, suffix in enumerate(suffixes):
         groups[suffix].append(number)
     for suffix, members in groups.items():
-        order = sorted(members, key=lambda member: (places[member].round(3) + 0.0).tolist()[::-1])
+        order = sorted(members, key=lambda member: (positions[member].round(3) + 0.0).tolist()[::-1])
         for count, number in enumerate(order, 1):
             out[number] = suffix if len(members) == 1 else f"{suffix}_{count}"
     return [out[number] for number in range(len(faces))]

@@ -100,9 +100,9 @@ class StepText:
         wanted = re.compile(r"(?<![A-Z0-9_])(?:" + "|".join(types) + r")\s*\(")
         for number, text in self.record.items():
             if wanted.search(text):
-                found = self.entity(number)
-                if found is not None and found.has(*types):
-                    yield found
+                entity = self.entity(number)
+                if entity is not None and entity.has(*types):
+                    yield entity
 
 
 def read_step_text(path: str | Path) -> StepText:
@@ -122,9 +122,9 @@ def read_step_text(path: str | Path) -> StepText:
         raise InputError(path, "", "no ISO-10303-21 in its head", "a STEP file (Part 21)")
     records = {}
     for statement in _statements(text, max(text.find("DATA"), 0)):
-        found = _RECORD.match(statement)
-        if found is not None:
-            records[int(found.group(1))] = statement[found.end() :]
+        match = _RECORD.match(statement)
+        if match is not None:
+            records[int(match.group(1))] = statement[match.end() :]
     return StepText(records)
 
 
@@ -132,10 +132,10 @@ def _statements(text: str, at: int) -> Iterator[str]:
     """Yield the text before each semicolon outside strings and comments, without comments, in one pass."""
     pieces: list[str] = []
     start, ends = at, {"'": "'", "/*": "*/"}
-    while (found := _STOP.search(text, at)) is not None:
-        mark, at = found.group(), found.end()
+    while (stop := _STOP.search(text, at)) is not None:
+        mark, at = stop.group(), stop.end()
         if mark == ";":
-            yield "".join([*pieces, text[start : found.start()]])
+            yield "".join([*pieces, text[start : stop.start()]])
             pieces, start = [], at
             continue
         end = text.find(ends[mark], at) if mark in ends else -1
@@ -144,7 +144,7 @@ def _statements(text: str, at: int) -> Iterator[str]:
             continue
         at = end + len(ends[mark])
         if mark == "/*":
-            pieces += [text[start : found.start()], " "]
+            pieces += [text[start : stop.start()], " "]
             start = at
 
 
@@ -153,19 +153,19 @@ def _parts(text: str) -> tuple[Typed, ...] | None:
     tokens, at = [], 0
     text = text.strip()
     while at < len(text):
-        found = _TOKEN.match(text, at)
-        if found is None or found.end() == at:
+        match = _TOKEN.match(text, at)
+        if match is None or match.end() == at:
             return None
-        tokens.append((str(found.lastgroup), found.group(str(found.lastgroup))))
-        at = found.end()
+        tokens.append((str(match.lastgroup), match.group(str(match.lastgroup))))
+        at = match.end()
     try:
         if tokens[:1] == [("mark", "(")]:
-            parts, place = [], 1
-            while tokens[place] != ("mark", ")"):
-                value, place = _value(tokens, place, 0)
+            parts, position = [], 1
+            while tokens[position] != ("mark", ")"):
+                value, position = _value(tokens, position, 0)
                 parts.append(value)
         else:
-            value, place = _value(tokens, 0, 0)
+            value, position = _value(tokens, 0, 0)
             parts = [value]
     except (IndexError, ValueError):
         return None
@@ -212,20 +212,20 @@ def decoded(text: str) -> str:
     if "\\" not in text:
         return text
 
-    def wide(found: re.Match[str]) -> str:
-        data = bytes.fromhex(found.group(2)) if len(found.group(2)) % 2 == 0 else b""
-        return data.decode("utf-16-be" if found.group(1) == "2" else "utf-32-be", "replace")
+    def wide(match: re.Match[str]) -> str:
+        data = bytes.fromhex(match.group(2)) if len(match.group(2)) % 2 == 0 else b""
+        return data.decode("utf-16-be" if match.group(1) == "2" else "utf-32-be", "replace")
 
     text = re.sub(r"\\X([24])\\([0-9A-Fa-f]*)\\X0\\", wide, text)
-    text = re.sub(r"\\X\\([0-9A-Fa-f]{2})", lambda found: chr(int(found.group(1), 16)), text)
+    text = re.sub(r"\\X\\([0-9A-Fa-f]{2})", lambda match: chr(int(match.group(1), 16)), text)
     page = 1
 
-    def shifted(found: re.Match[str]) -> str:
+    def shifted(match: re.Match[str]) -> str:
         nonlocal page
-        if found.group(1):
-            page = ord(found.group(1)) - ord("A") + 1
+        if match.group(1):
+            page = ord(match.group(1)) - ord("A") + 1
             return ""
-        return bytes([ord(found.group(2)) | 0x80]).decode(f"iso8859-{page}", "replace")
+        return bytes([ord(match.group(2)) | 0x80]).decode(f"iso8859-{page}", "replace")
 
     text = re.sub(r"\\P([A-I])\\|\\S\\([\x20-\x7e])", shifted, text)
     return text.replace("\\\\", "\\")

@@ -64,10 +64,10 @@ class Finishing:
                 raise InputError(f"--{key}", "", f"{value:g}", f"together with one of these --finish: {has}")
             if not limits[0] <= value <= limits[1]:
                 raise InputError(f"--{key}", "", f"{value:g}", f"{limits[0]:g} to {limits[1]:g}")
-        for option, value, known in (("--metal", self.metal, CONSTANTS), ("--process", self.process, PROCESSES)):
-            if value not in known:
+        for option, value, names in (("--metal", self.metal, CONSTANTS), ("--process", self.process, PROCESSES)):
+            if value not in names:
                 base = "an alloy goes by its base metal" if option == "--metal" else ""
-                raise InputError(option, "", repr(value), ", ".join(known), nearest(value, list(known)) or base)
+                raise InputError(option, "", repr(value), ", ".join(names), nearest(value, list(names)) or base)
         if not 0.005 <= self.roughness <= 10:
             raise InputError("--Ra", "", f"{self.roughness:g}", "0.005 to 10 um")
 
@@ -77,9 +77,9 @@ class Finishing:
         if self.named is None:
             written: dict[str, str | float] = {"metal": self.metal, "process": self.process, "Ra": self.roughness}
             return NamedFinish("machined_metal", written, "")
-        one = NAMED_FINISHES[self.named]
-        given = {"reflectance": self.reflectance, "gloss": self.gloss}
-        return replace(one, properties=one.properties | {k: v for k, v in given.items() if v is not None})
+        finish = NAMED_FINISHES[self.named]
+        overrides = {"reflectance": self.reflectance, "gloss": self.gloss}
+        return replace(finish, properties=finish.properties | {k: v for k, v in overrides.items() if v is not None})
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,7 @@ def ply(face: Face) -> bytes:
     Other faces of a CAD file have the file's normals. Planes and cylinders also have lengths u, v [mm], as a lay
     requires. In these cases triangles share no vertices.
     """
-    normals, places = face.corner_normals(), face.corner_places()
+    normals, coordinates = face.corner_normals(), face.corner_places()
     if normals is None:
         mesh = trimesh.Trimesh(face.vertices, face.triangles, process=False)
         return _exported(mesh.export(file_type="ply", vertex_normal=False))
@@ -198,8 +198,8 @@ def ply(face: Face) -> bytes:
         vertex_normals=normals.reshape(-1, 3),
         process=False,
     )
-    if places is not None:
-        for name, values in zip("uv", np.moveaxis(places.reshape(-1, 2), -1, 0), strict=True):
+    if coordinates is not None:
+        for name, values in zip("uv", np.moveaxis(coordinates.reshape(-1, 2), -1, 0), strict=True):
             mesh.vertex_attributes[name] = values.astype(np.float32)
     return _exported(mesh.export(file_type="ply", vertex_normal=True, include_attributes=True))
 
@@ -269,25 +269,29 @@ def finish_names(faces: list[Face]) -> dict[tuple[float, float, float] | None, s
 
 def hexadecimal(colour: tuple[float, float, float] | None) -> str:
     """Return a colour as ``#rrggbb``; ``#none`` for none."""
-    return "#none" if colour is None else "#" + "".join(f"{round(255 * one):02x}" for one in colour)
+    return "#none" if colour is None else "#" + "".join(f"{round(255 * channel):02x}" for channel in colour)
 
 
 def described(face: Face) -> str:
     """Describe a face in one line: kind, position, size."""
     surface = face.surface
     if isinstance(surface, Plane):
-        what = f"normal {numbers(surface.normal, 3)}, at {numbers(surface.point, 3)}"
+        description = f"normal {numbers(surface.normal, 3)}, at {numbers(surface.point, 3)}"
     elif isinstance(surface, Cylinder):
-        what = f"{'boss' if face.convex else 'bore'}, radius {number(surface.radius)}, axis {numbers(surface.axis, 3)}"
+        description = (
+            f"{'boss' if face.convex else 'bore'}, radius {number(surface.radius)}, axis {numbers(surface.axis, 3)}"
+        )
     elif isinstance(surface, Cone):
         angle = number(float(np.rad2deg(2 * surface.half_angle)), 3)
-        what = f"cone of {angle} deg, radius {number(surface.radius)} at its wide end, axis {numbers(surface.axis, 3)}"
+        description = (
+            f"cone of {angle} deg, radius {number(surface.radius)} at its wide end, axis {numbers(surface.axis, 3)}"
+        )
     elif isinstance(surface, Sphere):
-        what = f"radius {number(surface.radius)}, centre {numbers(surface.centre, 3)}"
+        description = f"radius {number(surface.radius)}, centre {numbers(surface.centre, 3)}"
     elif isinstance(surface, Torus):
-        what = f"torus of radius {number(surface.radius)}, its tube {number(surface.tube)}, not measured"
+        description = f"torus of radius {number(surface.radius)}, its tube {number(surface.tube)}, not measured"
     elif face.normals is not None:
-        what = "free form, with the normals of the CAD file"
+        description = "free form, with the normals of the CAD file"
     else:
-        what = "neither plane, cylinder nor sphere; flat facets"
-    return f"{what}; {face.area:.4g} mm^2"
+        description = "neither plane, cylinder nor sphere; flat facets"
+    return f"{description}; {face.area:.4g} mm^2"

@@ -28,12 +28,14 @@ def check_placements(path: Path, text: StepText) -> None:
         *_, first, second, _, scale, third = (None,) * 5 + sum((entity.of(kind) or () for kind in _BOTH), ())
         axes = np.eye(3)
         for number, way in enumerate((first, second, third)):
-            found = text.follow(way)
-            ratios = found.of("DIRECTION") if found is not None else None
+            direction = text.follow(way)
+            ratios = direction.of("DIRECTION") if direction is not None else None
             if ratios and isinstance(ratios[-1], tuple) and [type(ratio) for ratio in ratios[-1]] == [float] * 3:
                 axes[number] = ratios[-1]
         mirrored = np.linalg.det(axes) < 0
         if mirrored or (isinstance(scale, float) and not math.isclose(scale, 1.0)):
-            what = "mirrored" if mirrored else f"scaled by {scale:g}"
+            distortion = "mirrored" if mirrored else f"scaled by {scale:g}"
             hint = "save it as one part, or with a part of its own for each hand and size"
-            raise InputError(path, f"#{entity.number}", f"a component that is placed {what}", "rigid placements", hint)
+            raise InputError(
+                path, f"#{entity.number}", f"a component that is placed {distortion}", "rigid placements", hint
+            )

@@ -99,34 +99,34 @@ class _Reader:
             of, form = (None, None, *(zone.of("TOLERANCE_ZONE") or ()))[-2:]
             shape = text.follow(form)
             zone_form = shape.of("TOLERANCE_ZONE_FORM") if shape else None
-            for one in of if isinstance(of, tuple) else ():
-                if isinstance(one, Reference) and zone_form and isinstance(zone_form[0], str):
-                    self.zones[one.number] = zone_form[0]
+            for member in of if isinstance(of, tuple) else ():
+                if isinstance(member, Reference) and zone_form and isinstance(zone_form[0], str):
+                    self.zones[member.number] = zone_form[0]
 
     def target(self, reference: Any) -> DrawnTarget:
         """Return the object of a shape aspect, through its members and the aspects it was derived from."""
         faces: dict[int, None] = {}
-        others: dict[str, None] = {}
+        other_types: dict[str, None] = {}
         seen: set[int] = set()
 
         def item(value: Any, depth: int) -> None:
             if isinstance(value, tuple):
-                for one in value:
-                    item(one, depth)
+                for member in value:
+                    item(member, depth)
             elif isinstance(value, Typed):
                 item(value.values, depth)
             elif (entity := self.text.follow(value)) is not None:
                 if entity.has(*_FACES):
                     faces[entity.number] = None
                 else:
-                    others[entity.types.replace("_", " ").lower()] = None
+                    other_types[entity.types.replace("_", " ").lower()] = None
 
         def aspect(number: int, depth: int) -> None:
             if number in seen or depth > _DEEPEST:
                 return
             seen.add(number)
-            for one in self.items.get(number, ()):
-                item(one, depth)
+            for item_reference in self.items.get(number, ()):
+                item(item_reference, depth)
             for member in self.members.get(number, ()):
                 aspect(member, depth + 1)
             entity = self.text.entity(number)
@@ -136,7 +136,7 @@ class _Reader:
 
         if isinstance(reference, Reference):
             aspect(reference.number, 0)
-        return DrawnTarget(tuple(faces), tuple(others))
+        return DrawnTarget(tuple(faces), tuple(other_types))
 
     def dimension(self, entity: Entity) -> Dimension:
         """Read one size or location."""
@@ -148,14 +148,14 @@ class _Reader:
         else:
             values = entity.of("SHAPE_ASPECT_RELATIONSHIP") or entity.of(*_LOCATIONS) or ()
             name = values[0] if values and isinstance(values[0], str) else ""
-            first, second = (self.target(one) for one in (*values[2:4], None, None)[:2])
+            first, second = (self.target(aspect) for aspect in (*values[2:4], None, None)[:2])
         kind = name.strip().lower() or ("angle" if angular else "size" if second is None else "linear distance")
         measured: dict[str, float] = {}
         notes: list[str] = []
         for shown in self.values.get(entity.number, ()):
             parts = shown.of("SHAPE_DIMENSION_REPRESENTATION", "REPRESENTATION") or ()
-            for one in parts[1] if len(parts) > 1 and isinstance(parts[1], tuple) else ():
-                self.value(one, measured, notes)
+            for reference in parts[1] if len(parts) > 1 and isinstance(parts[1], tuple) else ():
+                self.value(reference, measured, notes)
         nominal = measured.get("nominal")
         limits = (measured["lower"], measured["upper"]) if {"lower", "upper"} <= set(measured) else None
         if nominal is None and limits is not None:
@@ -163,12 +163,12 @@ class _Reader:
         band = self.limits.get(entity.number)
         if band is not None and nominal is not None:
             if (ends := band.of("TOLERANCE_VALUE")) is not None:
-                low, high = (self.measure(one) for one in (*ends, None, None)[:2])
+                low, high = (self.measure(end) for end in (*ends, None, None)[:2])
                 if low is not None and high is not None:
                     limits = (nominal + low, nominal + high)
             elif (fit := band.of("LIMITS_AND_FITS")) is not None:
                 notes.append(
-                    f"the fit {''.join(str(one) for one in fit[:3:2] if one)}, whose limits are not in the file"
+                    f"the fit {''.join(str(word) for word in fit[:3:2] if word)}, whose limits are not in the file"
                 )
         return Dimension(entity.number, kind, first, second, nominal, limits, angular, tuple(notes))
 
@@ -179,12 +179,12 @@ class _Reader:
             return
         described = entity.of("DESCRIPTIVE_REPRESENTATION_ITEM")
         if described is not None:
-            notes.append(" ".join(str(one) for one in described if one))
+            notes.append(" ".join(str(word) for word in described if word))
             return
         span = entity.of("VALUE_RANGE")
         if span is not None:
-            for one in span[-1] if isinstance(span[-1], tuple) else ():
-                self.value(one, measured, notes)
+            for bound in span[-1] if isinstance(span[-1], tuple) else ():
+                self.value(bound, measured, notes)
             return
         name = next((v for part in entity.parts for v in part.values if isinstance(v, str)), "").lower()
         value = self.measure(reference)
@@ -213,9 +213,12 @@ class _Reader:
         referred = entity.of("GEOMETRIC_TOLERANCE_WITH_DATUM_REFERENCE")
         named = referred[0] if referred else values[4] if len(entity.parts) == 1 else None
         notes = [note for kind_, note in _RESTRICTIONS.items() if entity.has(kind_)]
-        for one in (entity.of(kind_) for kind_ in _MODIFIERS):
+        for modifiers in (entity.of(kind_) for kind_ in _MODIFIERS):
             words = [
-                w.name for v in one or () for w in (v if isinstance(v, tuple) else (v,)) if isinstance(w, Enumeration)
+                w.name
+                for v in modifiers or ()
+                for w in (v if isinstance(v, tuple) else (v,))
+                if isinstance(w, Enumeration)
             ]
             notes += [word.replace("_", " ").lower() for word in words]
         aspect = self.text.follow(values[3])
@@ -233,13 +236,13 @@ class _Reader:
         if depth > _DEEPEST:
             return ()
         if isinstance(value, tuple):
-            references = [self.text.follow(one) for one in value]
+            references = [self.text.follow(reference) for reference in value]
             old = [reference for reference in references if reference is not None and reference.has("DATUM_REFERENCE")]
             if old and len(old) == len(references):  # older editions number datums instead of using datum systems
-                given = [one.of("DATUM_REFERENCE") or (0.0, None) for one in old]
-                ordered = sorted(given, key=lambda values: float(values[0] or 0.0))
+                numbered = [reference.of("DATUM_REFERENCE") or (0.0, None) for reference in old]
+                ordered = sorted(numbered, key=lambda values: float(values[0] or 0.0))
                 return tuple(letter for values in ordered for letter in self.letters(values[1], depth + 1))
-            return tuple(letter for one in value for letter in self.letters(one, depth + 1))
+            return tuple(letter for member in value for letter in self.letters(member, depth + 1))
         if isinstance(value, Typed):  # a common datum
             return ("-".join(self.letters(value.values, depth + 1)),)
         entity = self.text.follow(value)
@@ -253,7 +256,7 @@ class _Reader:
             return self.letters(system[-1], depth + 1)
         part = entity.of("DATUM_REFERENCE_COMPARTMENT", "DATUM_REFERENCE_ELEMENT", "GENERAL_DATUM_REFERENCE")
         if part is not None and len(part) >= 2:
-            bases = [one for one in part[-2:] if one is not None]
+            bases = [base for base in part[-2:] if base is not None]
             return self.letters(bases[0], depth + 1) if bases else ()
         return ()
 
@@ -266,8 +269,8 @@ class _Reader:
                 continue
             targets = [self.target(Reference(owner)) for owner in self.owners.get(datum.number, ())]
             faces = tuple(dict.fromkeys(face for target in targets for face in target.faces))
-            others = tuple(dict.fromkeys(other for target in targets for other in target.others))
-            out[values[-1]] = DrawnTarget(faces, others)
+            other_types = tuple(dict.fromkeys(kind for target in targets for kind in target.other_types))
+            out[values[-1]] = DrawnTarget(faces, other_types)
         return out
 
     def unread(self) -> list[str]:
@@ -279,13 +282,15 @@ class _Reader:
         textures = sum(1 for _ in self.text.all(*_TEXTURES))
         if textures:
             out.append(f"{textures} surface textures: give Ra in the scene")
-        known = {entity.number for entity in self.text.all(*_SIZES, *_LOCATIONS, *TOLERANCES, "DATUM_FEATURE", "DATUM")}
+        read_numbers = {
+            entity.number for entity in self.text.all(*_SIZES, *_LOCATIONS, *TOLERANCES, "DATUM_FEATURE", "DATUM")
+        }
         tied: set[int] = set()
         for link in self.text.all("DRAUGHTING_MODEL_ITEM_ASSOCIATION"):
             values = link.of("DRAUGHTING_MODEL_ITEM_ASSOCIATION") or ()
             if len(values) < 5 or not isinstance(values[2], Reference) or not isinstance(values[4], Reference):
                 continue
-            if values[2].number in known:
+            if values[2].number in read_numbers:
                 tied.add(values[4].number)
         callouts = {entity.number for entity in self.text.all("DRAUGHTING_CALLOUT")}
         if callouts - tied:

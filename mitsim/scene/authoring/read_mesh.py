@@ -163,10 +163,12 @@ def _folded(points: Floats, triangles: Ints) -> int:
     normals /= np.where(flat, np.inf, length)[:, None]
     pairs = mesh.face_adjacency
     across = defaultdict(list)
-    for one, other in pairs[flat[pairs].any(axis=1)].tolist():
-        across[one].append(other)
-        across[other].append(one)
-    linked = [(one, other) for at in np.flatnonzero(flat) for one in across[at] for other in across[at] if one < other]
+    for facet, other in pairs[flat[pairs].any(axis=1)].tolist():
+        across[facet].append(other)
+        across[other].append(facet)
+    linked = [
+        (facet, other) for at in np.flatnonzero(flat) for facet in across[at] for other in across[at] if facet < other
+    ]
     every = np.concatenate([pairs, np.array(linked, int).reshape(-1, 2)])
     return int((np.einsum("ij,ij->i", normals[every[:, 0]], normals[every[:, 1]]) < _FOLDED).sum())
 

@@ -230,7 +230,7 @@ def _scale(path: Path, text: StepText, units: str | None) -> tuple[float, list[s
         if units is None:
             return 1.0, [unit_assumed(path.name)]
         return LENGTHS_MM[units], []
-    if units is not None and not all(math.isclose(one, LENGTHS_MM[units]) for one in stated):
+    if units is not None and not all(math.isclose(length, LENGTHS_MM[units]) for length in stated):
         words = " and ".join(map(unit_words, stated))
         hint = "leave out --units: the file's dimensions and tolerances have units of their own, too"
         raise InputError("--units", "", repr(units), f"{words}, the unit that {path.name} states", hint)
@@ -239,12 +239,12 @@ def _scale(path: Path, text: StepText, units: str | None) -> tuple[float, list[s
 
 def _names(text: StepText) -> dict[int, str]:
     """Return the names of the faces by the number of their entity."""
-    found = {}
+    names = {}
     for entity in text.all("ADVANCED_FACE", "FACE_SURFACE"):
         values = entity.of("ADVANCED_FACE", "FACE_SURFACE")
         if values and isinstance(values[0], str):
-            found[entity.number] = values[0].strip()
-    return found
+            names[entity.number] = values[0].strip()
+    return names
 
 
 def _face(record: dict[str, Any], vertices: Floats, normals: Floats, triangles: Ints) -> Face:
@@ -279,8 +279,8 @@ def _face(record: dict[str, Any], vertices: Floats, normals: Floats, triangles: 
 
 def _distances(surface: Surface, vertices: Floats, triangles: Ints) -> tuple[float, float]:
     middles = vertices[triangles].mean(axis=1)
-    one, other = (float(np.abs(surface_distance(surface, points)).max()) for points in (vertices, middles))
-    return one, other
+    at_vertices, at_middles = (float(np.abs(surface_distance(surface, points)).max()) for points in (vertices, middles))
+    return at_vertices, at_middles
 
 
 def _surface(record: dict[str, Any], vertices: Floats) -> Surface | None:

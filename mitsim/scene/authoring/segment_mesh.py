@@ -88,17 +88,17 @@ def _outside_out(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, list[str]]:
     bodies = components(mesh.face_adjacency, np.arange(len(triangles)))
     open_bodies, inward = 0, 0
     for body in bodies:
-        one = trimesh.Trimesh(mesh.vertices, triangles[body], process=False)
-        if not one.is_watertight:
+        shell = trimesh.Trimesh(mesh.vertices, triangles[body], process=False)
+        if not shell.is_watertight:
             open_bodies += 1
-        elif one.volume < 0 and not _inside_another(mesh, body, bodies):
+        elif shell.volume < 0 and not _inside_another(mesh, body, bodies):
             triangles[body] = triangles[body][:, ::-1]
             inward += 1
     if inward:
         remarks.append(f"{inward} of {len(bodies)} bodies had inward normals: turned outward")
     if open_bodies:
-        what = "the mesh is" if len(bodies) == 1 else f"{open_bodies} of {len(bodies)} bodies are"
-        remarks.append(f"{what} not closed, so the outward direction is unknown: mitsim check reports visible backs")
+        subject = "the mesh is" if len(bodies) == 1 else f"{open_bodies} of {len(bodies)} bodies are"
+        remarks.append(f"{subject} not closed, so the outward direction is unknown: mitsim check reports visible backs")
     return trimesh.Trimesh(mesh.vertices, triangles, process=False), remarks
 
 
@@ -116,10 +116,10 @@ def _inside_another(mesh: trimesh.Trimesh, body: Ints, bodies: list[Ints]) -> bo
 
 def components(pairs: NDArray[np.integer], members: Ints) -> list[Ints]:
     """Return connected sets of ``members`` (n,) numbers, of which ``pairs`` (k, 2) are neighbours."""
-    place = np.full(int(members.max(initial=-1)) + 1, -1)
-    place[members] = np.arange(len(members))
-    inside = pairs[(pairs < len(place)).all(axis=1)]
-    inside = place[inside]
+    index = np.full(int(members.max(initial=-1)) + 1, -1)
+    index[members] = np.arange(len(members))
+    inside = pairs[(pairs < len(index)).all(axis=1)]
+    inside = index[inside]
     inside = inside[(inside >= 0).all(axis=1)]
     graph = coo_matrix((np.ones(len(inside), bool), (inside[:, 0], inside[:, 1])), shape=(len(members),) * 2)
     _, label = connected_components(graph, directed=False)
@@ -138,8 +138,8 @@ def _without_flats(
     flats = [patch for patch in patches if area[patch].sum() > _FLAT_SHARE * area[piece].sum()]
     if not flats:
         return [piece]
-    rest = np.setdiff1d(piece, np.concatenate(flats))
-    return [*flats, *components(pairs[bend < angle_deg], rest)]
+    remainder = np.setdiff1d(piece, np.concatenate(flats))
+    return [*flats, *components(pairs[bend < angle_deg], remainder)]
 
 
 def _joined(mesh: trimesh.Trimesh, pieces: list[Ints], pairs: NDArray[np.integer]) -> list[Face]:

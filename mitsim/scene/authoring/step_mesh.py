@@ -88,7 +88,7 @@ def radius_uncertainty(normals: np.ndarray, areas: np.ndarray) -> float:
     return float(1 / np.sqrt(areas.sum() * max(left, 1e-9)))
 
 
-def fitted_chords(faces: list[Any], kinds: list[str], chord: float, others: float, fitted: float) -> np.ndarray:
+def fitted_chords(faces: list[Any], kinds: list[str], chord: float, largest_chord: float, fitted: float) -> np.ndarray:
     """Return the chord (n,) of each meshed face: ``chord``, or more where a radius is fitted with a larger uncertainty.
 
     Chords differ in steps of a factor sqrt(2), since faces of one chord are meshed together.
@@ -97,7 +97,7 @@ def fitted_chords(faces: list[Any], kinds: list[str], chord: float, others: floa
     ----------
     faces, kinds
         Meshed faces, and the kinds of their surfaces.
-    chord, others
+    chord, largest_chord
         Least and largest chord.
     fitted
         Chord of a face whose radius has the standard uncertainty 1, as for :func:`mesh`.
@@ -117,25 +117,25 @@ def fitted_chords(faces: list[Any], kinds: list[str], chord: float, others: floa
         facets = length > 0
         if facets.any():
             normals = across[facets] / length[facets, None]
-            wanted = np.clip(fitted * radius_uncertainty(normals, length[facets] / 2), chord, others)
+            wanted = np.clip(fitted * radius_uncertainty(normals, length[facets] / 2), chord, largest_chord)
             out[number] = chord * 2.0 ** (np.floor(2 * np.log2(wanted / chord)) / 2)
     return out
 
 
 def chords(
-    kinds: list[str], counts: np.ndarray, coarse: float, chord: float | np.ndarray, others: float, most: int
+    kinds: list[str], counts: np.ndarray, coarse: float, chord: float | np.ndarray, other_chord: float, most: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the chord (n,) of each face, and about how many triangles (n,) it will have.
 
     The number is inversely proportional to the chord, and to its square root for planes and cylinders, whose triangles
     are long. If all faces would have over ``most``, the chords of the faces with the most triangles are doubled: of
-    measured faces up to ``others``, then of all.
+    measured faces up to ``other_chord``, then of all.
 
     Parameters
     ----------
     kinds, counts, coarse
         Kinds (n,) of the surfaces, and their triangles (n,) at the chord ``coarse``.
-    chord, others
+    chord, other_chord
         Of faces that a task can measure, one or for each face, and of other faces.
     most
         Triangles of all faces.
@@ -146,13 +146,13 @@ def chords(
     """
     straight = np.array([kind in ("plane", "cylinder") for kind in kinds])
     measured = np.array([kind in MEASURED for kind in kinds])
-    out = np.where(measured, chord, others)
+    out = np.where(measured, chord, other_chord)
 
     def expected() -> np.ndarray:
         return np.maximum(counts * (coarse / out) ** np.where(straight, 0.5, 1.0), 1.0)
 
     while most and (now := expected()).sum() > most:
-        finer = measured & (2 * out <= others)
+        finer = measured & (2 * out <= other_chord)
         chosen = finer if finer.any() else now > 2
         if not chosen.any():
             break
@@ -166,7 +166,7 @@ def mesh(  # noqa: PLR0913 - one number each
     kinds: list[str],
     chord: float,
     bend: float,
-    others: float,
+    other_chord: float,
     most: int,
     fitted: float = 0.0,
 ) -> float:
@@ -178,7 +178,7 @@ def mesh(  # noqa: PLR0913 - one number each
     ----------
     shapes, faces, kinds, bend
         To be meshed, all faces of them, the kinds of their surfaces, and the angle between facets [rad].
-    chord, others, most
+    chord, other_chord, most
         As for :func:`chords`; 0 triangles is no limit.
     fitted
         Chord [mm] of a sphere or cylinder whose radius a fit determines with the standard uncertainty 1, for one point
@@ -191,29 +191,31 @@ def mesh(  # noqa: PLR0913 - one number each
     if not faces:
         return chord
     measured = np.array([kind in MEASURED for kind in kinds])
-    chord_of, planned, coarsened = np.where(measured, chord, others), np.ones(len(faces)), 1.0
+    chord_of, planned, coarsened = np.where(measured, chord, other_chord), np.ones(len(faces)), 1.0
     if most:
         from OCP.BRepTools import BRepTools
 
         mesh_together(faces, _COARSER * chord, _FLAT)
         counts = np.array([triangle_count(face) for face in faces], float)
-        wanted = fitted_chords(faces, kinds, chord, others, fitted) if fitted else np.full(len(faces), chord)
+        wanted = fitted_chords(faces, kinds, chord, other_chord, fitted) if fitted else np.full(len(faces), chord)
         for shape in shapes:
             BRepTools.Clean_s(shape)
-        chord_of, planned = chords(kinds, counts, _COARSER * chord, wanted, others, most)
+        chord_of, planned = chords(kinds, counts, _COARSER * chord, wanted, other_chord, most)
         coarsened = float((chord_of / wanted)[measured].max(initial=1.0))
     order = np.lexsort((planned, chord_of))
     made, told = np.cumsum(planned[order]), 0.0
     for number, here in enumerate(order):
         last = number + 1 == len(order)
         if last or chord_of[order[number + 1]] != chord_of[here] or (most and made[number] - told > _STEP):
-            mesh_together([faces[one] for one in order[: number + 1]], float(chord_of[here]), bend)
+            mesh_together([faces[index] for index in order[: number + 1]], float(chord_of[here]), bend)
             told = float(made[number])
             if most:
                 print(f"{TOLD}{told:.0f} {made[-1]:.0f}", flush=True)
     for number, face in enumerate(faces):
         if not triangle_count(face):
-            mesh_together([*(one for one in faces if triangle_count(one)), face], float(chord_of[number]), bend, False)
+            mesh_together(
+                [*(meshed for meshed in faces if triangle_count(meshed)), face], float(chord_of[number]), bend, False
+            )
     return chord * coarsened
 
 
@@ -224,8 +226,8 @@ def triangles_of(face: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     from OCP.TopAbs import TopAbs_REVERSED
     from OCP.TopLoc import TopLoc_Location
 
-    place = TopLoc_Location()
-    mesh = BRep_Tool.Triangulation_s(face, place)
+    location = TopLoc_Location()
+    mesh = BRep_Tool.Triangulation_s(face, location)
     if mesh is None or not mesh.NbTriangles():
         return None
     if BRep_Tool.Surface_s(face) is None:
@@ -236,7 +238,7 @@ def triangles_of(face: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     points = np.array([(p.X(), p.Y(), p.Z()) for p in map(mesh.Node, nodes)])
     normals = np.array([(n.X(), n.Y(), n.Z()) for n in map(mesh.Normal, nodes)])
     corners = np.array([mesh.Triangle(i).Get() for i in range(1, mesh.NbTriangles() + 1)]).reshape(-1, 3) - 1
-    motion = place.Transformation()
+    motion = location.Transformation()
     matrix = np.array([[motion.Value(r, c) for c in range(1, 5)] for r in range(1, 4)])
     points, normals = points @ matrix[:, :3].T + matrix[:, 3], normals @ matrix[:, :3].T
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)

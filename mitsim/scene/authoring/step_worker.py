@@ -48,31 +48,31 @@ def bodies(document: Any) -> list[tuple[str, Any, tuple[float, float, float] | N
     from OCP.XCAFDoc import XCAFDoc_DocumentTool, XCAFDoc_ShapeTool
 
     tool = XCAFDoc_DocumentTool.ShapeTool_s(document.Main())
-    found: list[tuple[str, Any, tuple[float, float, float] | None]] = []
+    shapes: list[tuple[str, Any, tuple[float, float, float] | None]] = []
 
-    def walk(label: Any, name: str, place: Any, colour: tuple[float, float, float] | None) -> None:
+    def walk(label: Any, name: str, location: Any, colour: tuple[float, float, float] | None) -> None:
         colour = label_colour(label) or colour
         if XCAFDoc_ShapeTool.IsReference_s(label):
-            place = place.Multiplied(XCAFDoc_ShapeTool.GetLocation_s(label))
+            location = location.Multiplied(XCAFDoc_ShapeTool.GetLocation_s(label))
             referred = TDF_Label()
             XCAFDoc_ShapeTool.GetReferredShape_s(label, referred)
-            walk(referred, label_name(referred) or name, place, colour)
+            walk(referred, label_name(referred) or name, location, colour)
             return
         if XCAFDoc_ShapeTool.IsAssembly_s(label):
             parts = TDF_LabelSequence()
             XCAFDoc_ShapeTool.GetComponents_s(label, parts, False)
             for number in range(1, parts.Length() + 1):
                 part = parts.Value(number)
-                walk(part, label_name(part) or name, place, colour)
+                walk(part, label_name(part) or name, location, colour)
             return
         shape = XCAFDoc_ShapeTool.GetShape_s(label)
-        found.append((name or label_name(label), shape.Moved(place), colour))
+        shapes.append((name or label_name(label), shape.Moved(location), colour))
 
     free = TDF_LabelSequence()
     tool.GetFreeShapes(free)
     for number in range(1, free.Length() + 1):
         walk(free.Value(number), label_name(free.Value(number)), TopLoc_Location(), None)
-    return found
+    return shapes
 
 
 def label_name(label: Any) -> str:
@@ -137,26 +137,30 @@ def surface_of(face: Any, tolerance: float) -> dict[str, Any]:
         return simple("sphere", adaptor.Sphere())
     if kind == Kinds.GeomAbs_Torus:
         return simple("torus", adaptor.Torus())
-    known = ShapeAnalysis_CanonicalRecognition(face)
-    for name, one, asked in (
-        ("plane", gp_Pln(), known.IsPlane),
-        ("cylinder", gp_Cylinder(), known.IsCylinder),
-        ("cone", gp_Cone(), known.IsCone),
-        ("sphere", gp_Sphere(), known.IsSphere),
+    recognition = ShapeAnalysis_CanonicalRecognition(face)
+    for name, surface, asked in (
+        ("plane", gp_Pln(), recognition.IsPlane),
+        ("cylinder", gp_Cylinder(), recognition.IsCylinder),
+        ("cone", gp_Cone(), recognition.IsCone),
+        ("sphere", gp_Sphere(), recognition.IsSphere),
     ):
         try:
-            found = asked(tolerance, one)
+            matches = asked(tolerance, surface)
         except Exception:  # OpenCASCADE fails for some splines
             continue
-        if found:
-            return simple(name, one)
+        if matches:
+            return simple(name, surface)
     return {"kind": "freeform"}
 
 
 def in_mm(surface: dict[str, Any], unit_mm: float) -> dict[str, Any]:
     """Return the numbers of a surface in mm."""
     lengths = {key: surface[key] * unit_mm for key in ("radius", "tube") if key in surface}
-    return surface | lengths | ({"point": [unit_mm * one for one in surface["point"]]} if "point" in surface else {})
+    return (
+        surface
+        | lengths
+        | ({"point": [unit_mm * coordinate for coordinate in surface["point"]]} if "point" in surface else {})
+    )
 
 
 def simple(kind: str, surface: Any) -> dict[str, Any]:
@@ -200,15 +204,15 @@ class FaceSurfaces:
 
         self.faces = [face for shape in shapes for face in subshapes(shape, TopAbs_FACE)]
         self._numbers = TopTools_IndexedMapOfShape()
-        self._found: list[dict[str, Any]] = []
+        self._surfaces: list[dict[str, Any]] = []
         for face in self.faces:
-            if self._numbers.Add(face) > len(self._found):
-                self._found.append(surface_of(face, tolerance))
+            if self._numbers.Add(face) > len(self._surfaces):
+                self._surfaces.append(surface_of(face, tolerance))
 
     def of(self, face: Any) -> dict[str, Any]:
         """Return the surface of one of the faces."""
-        found: dict[str, Any] = self._found[self._numbers.FindIndex(face) - 1]
-        return found
+        surface: dict[str, Any] = self._surfaces[self._numbers.FindIndex(face) - 1]
+        return surface
 
 
 def convert(  # noqa: PLR0913 - the arguments of the command
@@ -256,20 +260,20 @@ def convert(  # noqa: PLR0913 - the arguments of the command
     colours = XCAFDoc_DocumentTool.ColorTool_s(document.Main())
 
     def entity(face: Any) -> int:
-        found = transfer.EntityFromShapeResult(face.Located(TopLoc_Location()), -1)
-        name = "" if found is None or not hasattr(found, "Name") else found.Name().ToCString()
+        record = transfer.EntityFromShapeResult(face.Located(TopLoc_Location()), -1)
+        name = "" if record is None or not hasattr(record, "Name") else record.Name().ToCString()
         return int(name[1:]) if name[1:].isdigit() else 0
 
     faces: list[dict[str, Any]] = []
     arrays: dict[str, list[np.ndarray]] = {"vertices": [], "normals": [], "triangles": []}
     lost = body = 0
     there = bodies(document)
-    others = chord_mm if others_mm is None else others_mm
+    other_chord = chord_mm if others_mm is None else others_mm
     shapes = [shape for _, shape, _ in there]
     surfaces = FaceSurfaces(shapes, SAME_MM / unit_mm)
     kinds = [surfaces.of(face)["kind"] for face in surfaces.faces]
     fitted = fitted_mm2 / unit_mm**2
-    largest = mesh(shapes, surfaces.faces, kinds, chord_mm / unit_mm, bend, others / unit_mm, int(most), fitted)
+    largest = mesh(shapes, surfaces.faces, kinds, chord_mm / unit_mm, bend, other_chord / unit_mm, int(most), fitted)
     for name, shape, part_colour in there:
         edges = TopTools_IndexedMapOfShape()
         TopExp.MapShapes_s(shape, TopAbs_EDGE, edges)
@@ -285,7 +289,7 @@ def convert(  # noqa: PLR0913 - the arguments of the command
                 if made is None:
                     lost += 1
                     continue
-                bare = [one.Located(TopLoc_Location()) for one in (face, solid)]
+                bare = [part.Located(TopLoc_Location()) for part in (face, solid)]
                 colour = shape_colour(colours, bare[0]) or shape_colour(colours, bare[1]) or part_colour
                 faces.append(
                     {

@@ -18,12 +18,12 @@ from mitsim.scene.authoring.face import Face
 #: kinds of face that a task supports
 MEASURED = (Plane, Cylinder, Sphere, Cone)
 
-#: number of directions whose farthest places give the outline of a face
+#: number of directions whose farthest points give the outline of a face
 _DIRECTIONS = 8
 
 
 def outline(face: Face) -> Floats:
-    """Return places (k, 3) [mm] on a surface that span a face: corners of a plane, the two ends of an axis."""
+    """Return points (k, 3) [mm] on a surface that span a face: corners of a plane, the two ends of an axis."""
     surface = face.surface
     if isinstance(surface, Plane):
         basis = tangents(surface.normal)
@@ -57,7 +57,7 @@ def feature_keys(face: Face) -> dict[str, Any]:
         keys["half_angle_deg"] = number(float(np.rad2deg(surface.half_angle)), 5)
     spread = outline(face)
     if len(spread) >= (3 if isinstance(surface, Plane) else 2):
-        keys["outline_mm"] = [numbers(place) for place in spread]
+        keys["outline_mm"] = [numbers(point) for point in spread]
     return keys
 
 
@@ -74,10 +74,10 @@ def task_toml(faces: Sequence[Face], name: str, drawing: DrawnTask | None = None
     measured = drawing.measurements if drawing else {}
     if not measured:
         lines += _example(faces)
-    known = [face for face in faces if isinstance(face.surface, MEASURED)]
-    if not known:
+    fitted_faces = [face for face in faces if isinstance(face.surface, MEASURED)]
+    if not fitted_faces:
         lines += ["# No plane, cylinder, cone or sphere was recognised.", "[features]", ""]
-    for face in known:
+    for face in fitted_faces:
         datum = drawing.datum_of(face.name) if drawing else ""
         lines += [
             f"[features.{_key(face.name)}]{f'  # datum {datum}' if datum else ''}",
@@ -112,7 +112,7 @@ def _toml(value: Any) -> str:
     if isinstance(value, str):
         return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
     if isinstance(value, list | tuple):
-        return f"[{', '.join(_toml(one) for one in value)}]"
+        return f"[{', '.join(_toml(item) for item in value)}]"
     return str(value)
 
 
@@ -130,11 +130,11 @@ def _example(faces: Sequence[Face]) -> list[str]:
     ]
 
 
-def numbers(values: NDArray[np.floating], places: int = 4) -> list[float]:
+def numbers(values: NDArray[np.floating], decimals: int = 4) -> list[float]:
     """Round lengths to 0.1 um."""
-    return [number(float(value), places) for value in values]
+    return [number(float(value), decimals) for value in values]
 
 
-def number(value: float, places: int = 4) -> float:
+def number(value: float, decimals: int = 4) -> float:
     """Round a length to 0.1 um, the precision of a mesh file in single precision."""
-    return round(float(value), places) + 0.0
+    return round(float(value), decimals) + 0.0

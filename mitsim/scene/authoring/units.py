@@ -61,8 +61,8 @@ def commented_unit(suffix: str, data: bytes) -> float | None:
         lines = [b"solid " + b" ".join(head[:80].split())]
     for line in lines:
         if re.match(mark, line.strip()):
-            for found in _STATEMENT.finditer(line.decode("ascii", "replace").lower()):
-                size = UNITS_MM.get(found.group(1) or found.group(2))
+            for statement in _STATEMENT.finditer(line.decode("ascii", "replace").lower()):
+                size = UNITS_MM.get(statement.group(1) or statement.group(2))
                 if size is not None:
                     return size
     return None
@@ -73,9 +73,9 @@ def step_units(text: StepText) -> list[float]:
     sizes: dict[float, None] = {}
     for context in text.all("GLOBAL_UNIT_ASSIGNED_CONTEXT"):
         for values in context.of("GLOBAL_UNIT_ASSIGNED_CONTEXT") or ():
-            for one in values if isinstance(values, tuple) else ():
-                unit = text.follow(one)
-                size = unit_size(text, one) if unit is not None and _is_length(unit) else None
+            for reference in values if isinstance(values, tuple) else ():
+                unit = text.follow(reference)
+                size = unit_size(text, reference) if unit is not None and _is_length(unit) else None
                 if size is not None:
                     sizes[round(size, 9)] = None
     return list(sizes)
@@ -83,7 +83,7 @@ def step_units(text: StepText) -> list[float]:
 
 def _is_length(unit: Entity) -> bool:
     si = unit.of("SI_UNIT")
-    metre = si is not None and any(isinstance(one, Enumeration) and one.name == "METRE" for one in si)
+    metre = si is not None and any(isinstance(value, Enumeration) and value.name == "METRE" for value in si)
     return unit.has("LENGTH_UNIT") or metre
 
 
@@ -105,6 +105,6 @@ def unit_size(text: StepText, reference: Any, depth: int = 0) -> float | None:
     si = entity.of("SI_UNIT")
     if si is None:
         return None
-    prefix, name = ([one.name if isinstance(one, Enumeration) else "" for one in si[-2:]] + ["", ""])[:2]
+    prefix, name = ([value.name if isinstance(value, Enumeration) else "" for value in si[-2:]] + ["", ""])[:2]
     base_unit = {"METRE": 1e3, "RADIAN": math.degrees(1.0)}.get(name)
     return None if base_unit is None else base_unit * _PREFIX.get(prefix, 1.0)

@@ -74,10 +74,10 @@ class CandidatePaths:
     def joined(cls, parts: Sequence[CandidatePaths], surfaces: int) -> CandidatePaths:
         """Return the paths of several parts, as if all had the largest number of surfaces."""
 
-        def wide(one: NDArray[Any], fill: int) -> NDArray[Any]:
-            pad = [(0, 0)] * one.ndim
-            pad[1] = (0, surfaces - one.shape[1])
-            return np.pad(one, pad, constant_values=fill)
+        def wide(values: NDArray[Any], fill: int) -> NDArray[Any]:
+            pad = [(0, 0)] * values.ndim
+            pad[1] = (0, surfaces - values.shape[1])
+            return np.pad(values, pad, constant_values=fill)
 
         if not parts:
             nothing = np.empty((0, surfaces, 6), np.float32)
@@ -100,10 +100,10 @@ class Vertices:
         flat = material.ravel()
         order = np.argsort(flat, kind="stable")
         order = order[np.searchsorted(flat[order], 0) :]
-        place = np.zeros(len(flat), np.uint32)
-        place[order] = np.arange(1, len(order) + 1, dtype=np.uint32)
-        #: place of the factor of each surface of a path, (m, n)
-        self.places = place.reshape(material.shape).T
+        index = np.zeros(len(flat), np.uint32)
+        index[order] = np.arange(1, len(order) + 1, dtype=np.uint32)
+        #: index of the factor of each surface of a path, (m, n)
+        self.indices = index.reshape(material.shape).T
         directions = toward.reshape(-1, 6)
         self._parts: list[tuple[int, Any, Any]] = []
         for number in np.unique(flat[order]).tolist():
@@ -142,12 +142,12 @@ class KeptPaths:
         self._first, self._counts = mi.UInt32(first.astype(np.uint32)), mi.UInt32(counts.astype(np.uint32))
         self._weight = to_device(paths.weight)
         self._uv, self._length = mi.Point2f(*[to_device(paths.code[:, k]) for k in (0, 1)]), to_device(paths.code[:, 2])
-        self._places = [mi.UInt32(np.ascontiguousarray(one)) for one in self._vertices.places]
+        self._indices = [mi.UInt32(np.ascontiguousarray(indices)) for indices in self._vertices.indices]
 
     @property
     def bytes(self) -> int:
         """Memory that the paths need on the device."""
-        return 24 * len(self._vertices) + self.count * (16 + 4 * len(self._places))
+        return 24 * len(self._vertices) + self.count * (16 + 4 * len(self._indices))
 
     def codes(self, bsdfs: Sequence[Any], light: ProjectedLight) -> Floats:
         """Return the light (codes, height, width) of each code of a region, for the BSDFs of the drawn finishes.
@@ -159,8 +159,8 @@ class KeptPaths:
             return out.reshape(light.codes, self.roi.height, self.roi.width)
         factors = self._vertices.factors(bsdfs)
         radiance = self._weight
-        for places in self._places:
-            radiance = radiance * dr.gather(mi.Float, factors, places)
+        for indices in self._indices:
+            radiance = radiance * dr.gather(mi.Float, factors, indices)
         dr.eval(radiance)
         last = self._first + self._counts
 
@@ -186,7 +186,7 @@ def light_of(paths: CandidatePaths, finishes: Sequence[Sequence[Any]]) -> Iterat
     vertices = Vertices(paths.material, paths.toward)
     for bsdfs in finishes:
         factors = np.asarray(vertices.factors(bsdfs), np.float64)
-        yield np.asarray(paths.weight * factors[vertices.places].prod(axis=0))
+        yield np.asarray(paths.weight * factors[vertices.indices].prod(axis=0))
 
 
 def mattering(
@@ -219,15 +219,15 @@ def mattering(
     kept = np.flatnonzero(np.floor(reached) > np.floor(np.concatenate([[0.0], reached[:-1]])))
     index, probability = order[kept], probability[kept]
     del size, pixel, order, reached
-    places, chosen, first = list[NDArray[np.integer]](), list[CandidatePaths](), 0
+    rows, chosen, first = list[NDArray[np.integer]](), list[CandidatePaths](), 0
     for part in parts:  # never all candidates together, which are many times as large as what is kept
         of_part = np.flatnonzero((index >= first) & (index < first + len(part)))
-        places.append(of_part)
+        rows.append(of_part)
         chosen.append(part.chosen(index[of_part] - first))
         first += len(part)
     paths = CandidatePaths.joined(chosen, surfaces)
     del chosen
-    sequence = np.argsort(np.concatenate(places))
+    sequence = np.argsort(np.concatenate(rows))
     return paths.chosen(sequence, (paths.weight[sequence] / probability).astype(np.float32))
 
 
@@ -235,9 +235,9 @@ def _sizes(paths: CandidatePaths, finishes: Sequence[Sequence[Any]]) -> NDArray[
     """Return the root mean square light (n,) of paths over some finishes."""
     size = np.zeros(len(paths))
     for first in range(0, len(paths), _AT_ONCE):
-        some = slice(first, first + _AT_ONCE)
-        for light in light_of(paths.chosen(some), finishes):
-            size[some] += light**2
+        block = slice(first, first + _AT_ONCE)
+        for light in light_of(paths.chosen(block), finishes):
+            size[block] += light**2
     return np.sqrt(size / max(len(finishes), 1))
 
 
@@ -246,11 +246,11 @@ def _threshold(size: NDArray[np.float64], count: int) -> float:
     positive = np.sort(size[size > 0])[::-1]
     if len(positive) <= count:
         return float(positive[-1]) if len(positive) else 1.0
-    rest = np.cumsum(positive[::-1])[::-1]  # of this and all smaller ones
+    tail_sums = np.cumsum(positive[::-1])[::-1]  # of this and all smaller ones
     kept_whole = np.arange(len(positive))  # number of larger ones, kept with certainty
     free = count - kept_whole
     possible = free > 0
-    candidates = rest[possible] / free[possible]
+    candidates = tail_sums[possible] / free[possible]
     # the first at which this one would be kept with a probability of 1 or less
     return float(candidates[np.argmax(candidates >= positive[possible])])
 

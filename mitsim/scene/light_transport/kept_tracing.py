@@ -71,12 +71,12 @@ def camera_paths(
     --------
     photon_paths : the other paths of the same light
     """
-    one = Tracer(scene, rays, projector, pose, roi, tracing)
+    tracer = Tracer(scene, rays, projector, pose, roi, tracing)
     index = mi.UInt32(np.asarray(pixels, np.uint32))
     at_once = max(1, _AT_ONCE // max(1, len(pixels)))
     for first in range(0, tracing.samples, at_once):
         count = min(at_once, tracing.samples - first)
-        yield from _records(one, _camera_start(one, index, first, count), _camera_step)
+        yield from _records(tracer, _camera_start(tracer, index, first, count), _camera_step)
 
 
 def _records(
@@ -204,9 +204,9 @@ def photon_paths(
     --------
     camera_paths : the other paths of the same light
     """
-    one = Tracer(scene, rays, projector, pose, roi, tracing)
+    tracer = Tracer(scene, rays, projector, pose, roi, tracing)
     for first in range(0, tracing.photons, _AT_ONCE):
-        yield from _records(one, _photon_start(one, first, min(_AT_ONCE, tracing.photons - first)), _photon_step)
+        yield from _records(tracer, _photon_start(tracer, first, min(_AT_ONCE, tracing.photons - first)), _photon_step)
 
 
 def _photon_start(tracer: Tracer, first: int, count: int) -> Walk:

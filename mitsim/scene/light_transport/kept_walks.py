@@ -60,19 +60,19 @@ class Walk:
     def at(self, index: Any) -> Walk:
         """Return the lanes with an index."""
 
-        def some(value: Any) -> Any:
+        def lanes(value: Any) -> Any:
             return dr.gather(type(value), value, index)
 
         return Walk(
-            lane=some(self.lane),
-            pixel=some(self.pixel),
-            origin=some(self.origin),
-            direction=some(self.direction),
-            weight=some(self.weight),
-            ratio=some(self.ratio),
-            length=some(self.length),
-            code=some(self.code),
-            surfaces=[[some(one) for one in surface] for surface in self.surfaces],
+            lane=lanes(self.lane),
+            pixel=lanes(self.pixel),
+            origin=lanes(self.origin),
+            direction=lanes(self.direction),
+            weight=lanes(self.weight),
+            ratio=lanes(self.ratio),
+            length=lanes(self.length),
+            code=lanes(self.code),
+            surfaces=[[lanes(value) for value in surface] for surface in self.surfaces],
         )
 
 
@@ -106,7 +106,7 @@ class Tracer:
 
     def material(self, surface: Any, valid: Any) -> Any:
         """Return the number of the drawn finish of each lane, -1 for none."""
-        return dr.gather(mi.Int32, self.drawn, self.bsdfs.place(surface, valid), valid)
+        return dr.gather(mi.Int32, self.drawn, self.bsdfs.index_of(surface, valid), valid)
 
     def kept(self, surface: Any, material: Any, toward_camera: Any, toward_projector: Any) -> list[Any]:
         """Return material and local directions of a surface as a path keeps them.
@@ -169,21 +169,21 @@ def _arrays(walk: Walk) -> list[Any]:
 def _candidates(walk: Walk, record: Any, index: Any) -> CandidatePaths:
     weight, uv, length, *last = record
 
-    def some(value: Any) -> Any:
+    def lanes(value: Any) -> Any:
         return dr.gather(type(value), value, index)
 
     surfaces = [*walk.surfaces, last]
-    code = np.stack([np.asarray(some(one)) for one in (uv.x, uv.y, length)], axis=-1)
-    material = np.stack([np.asarray(some(surface[0])).astype(np.int8) for surface in surfaces], axis=-1)
+    code = np.stack([np.asarray(lanes(value)) for value in (uv.x, uv.y, length)], axis=-1)
+    material = np.stack([np.asarray(lanes(surface[0])).astype(np.int8) for surface in surfaces], axis=-1)
     toward = np.stack(
         [
-            np.concatenate([vectors_to_host(some(surface[1])), vectors_to_host(some(surface[2]))], axis=1)
+            np.concatenate([vectors_to_host(lanes(surface[1])), vectors_to_host(lanes(surface[2]))], axis=1)
             for surface in surfaces
         ],
         axis=1,
     )
     return CandidatePaths(
-        np.asarray(some(walk.pixel)).astype(np.int32), np.asarray(some(weight), np.float32), code, material, toward
+        np.asarray(lanes(walk.pixel)).astype(np.int32), np.asarray(lanes(weight), np.float32), code, material, toward
     )
 
 

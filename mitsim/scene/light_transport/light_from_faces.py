@@ -90,13 +90,13 @@ def light_from_faces(
     done = 0
     while done < samples:
         now = min(samples - done, max(1, _TOGETHER // pixels))
-        first, second, one, two = _traced(scene, rays, projector, world_from_sensor, now, seed + done, region)
+        first, second, single, double = _traced(scene, rays, projector, world_from_sensor, now, seed + done, region)
         pixel = np.arange(now * pixels) % pixels
-        direct += np.bincount(pixel, one, pixels)
-        for number, values, sums in ((first, np.ones(len(first)), met), (second, two, by_face)):
+        direct += np.bincount(pixel, single, pixels)
+        for number, values, sums in ((first, np.ones(len(first)), met), (second, double, by_face)):
             hit = number >= 0
-            place = number[hit].astype(np.int64) * pixels + pixel[hit]
-            sums += np.bincount(place, values[hit], shapes * pixels).reshape(shapes, pixels)
+            index = number[hit].astype(np.int64) * pixels + pixel[hit]
+            sums += np.bincount(index, values[hit], shapes * pixels).reshape(shapes, pixels)
         done += now
     shape = np.where(met.any(axis=0), met.argmax(axis=0), -1)
     size = (region.height, region.width)
@@ -132,19 +132,19 @@ def _traced(
     ray = mi.Ray3f(eye.position, eye.to_world(dr.normalize(local)))
     surface = scene.mitsuba.ray_intersect(ray)
     hit = surface.is_valid()
-    one = lit(surface, ray.d, hit)
+    single = lit(surface, ray.d, hit)
     sample1, sample2 = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
     sampled, weight = bsdfs.at(surface).sample(mi.BSDFContext(), surface, sample1, sample2, hit)
     next_ray = surface.spawn_ray(surface.to_world(sampled.wo))
     second = scene.mitsuba.ray_intersect(next_ray, hit & (weight[0] > 0))
-    two = dr.select(second.is_valid(), weight[0] * lit(second, next_ray.d, second.is_valid()), 0.0)
-    numbers = [_number(one_) for one_ in (surface, second)]
-    dr.eval(one, two, numbers)
+    double = dr.select(second.is_valid(), weight[0] * lit(second, next_ray.d, second.is_valid()), 0.0)
+    numbers = [_number(interaction) for interaction in (surface, second)]
+    dr.eval(single, double, numbers)
     first_shape, second_shape = (shape_indices(scene.mitsuba, number) for number in numbers)
-    return first_shape, second_shape, np.array(one, float), np.array(two, float)
+    return first_shape, second_shape, np.array(single, float), np.array(double, float)
 
 
 def _number(surface: mi.SurfaceInteraction3f) -> mi.UInt32:
     """Return Mitsuba's number of the shape, or of its instance, that each lane met; 0 for none."""
-    inside, instance = (dr.reinterpret_array(mi.UInt32, one) for one in (surface.shape, surface.instance))
+    inside, instance = (dr.reinterpret_array(mi.UInt32, pointer) for pointer in (surface.shape, surface.instance))
     return dr.select(surface.is_valid(), dr.select(instance != 0, instance, inside), 0)

@@ -144,7 +144,7 @@ def _launch(
     camera = Eye([pose @ rays.camera.sensor_from_camera for pose in poses], lane)
     projector = ProjectorLight(poses, light.projector, scene.bounds, lane)
     has_aperture = rays.aperture_mm > 0
-    aperture, inverse_focus = (opaque(one) for one in (0.5 * rays.aperture_mm, 1.0 / rays.focus_mm))
+    aperture, inverse_focus = (opaque(value) for value in (0.5 * rays.aperture_mm, 1.0 / rays.focus_mm))
     in_row, surfaces = (opaque_index(n) for n in (rays.camera.width, depth))
     # n_C / n_L; 0 if there are only photons
     samples_per_photon = opaque(0.0 if photons.samples is None else photons.samples / photons.count)

@@ -83,7 +83,7 @@ def launch(
     stretch = opaque(1.0 if jitter or side == 1 else float(1.0 / np.sqrt(1.0 - side**-2)))
     cells, per_cell = opaque_index(side), opaque(1.0 / side)
     has_aperture = rays.aperture_mm > 0
-    aperture, inverse_focus = (opaque(one) for one in (0.5 * rays.aperture_mm, 1.0 / rays.focus_mm))
+    aperture, inverse_focus = (opaque(value) for value in (0.5 * rays.aperture_mm, 1.0 / rays.focus_mm))
     pupils = _Pupils(side * side if has_aperture or projector.has_aperture else 0, jitter)
     has_ambient = has_emitters(scene)
     # the ray from the last surface may meet an emitter of the scene

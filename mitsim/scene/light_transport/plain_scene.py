@@ -54,29 +54,29 @@ class SceneBsdfs:
         if self._bsdfs is None:
             return
         numbers = np.array(dr.reinterpret_array(mi.UInt32, scene.mitsuba.shapes_dr()))
-        places = np.zeros(numbers.max() + 1, np.uint32)  # for each of Mitsuba's numbers of shapes
-        places[numbers] = [self._bsdfs.index(shape.bsdf()) for shape in scene.shapes]
-        self._places = mi.UInt32(places)
+        indices = np.zeros(numbers.max() + 1, np.uint32)  # for each of Mitsuba's numbers of shapes
+        indices[numbers] = [self._bsdfs.index(shape.bsdf()) for shape in scene.shapes]
+        self._indices = mi.UInt32(indices)
         self._bsdfs = self._bsdfs if instead is None else list(instead)
 
-    def place(self, surface: Any, valid: Any) -> Any:
-        """Return the place of each valid lane's BSDF in the list of the scene's."""
-        return dr.gather(mi.UInt32, self._places, dr.reinterpret_array(mi.UInt32, surface.shape), valid)
+    def index_of(self, surface: Any, valid: Any) -> Any:
+        """Return the index of each valid lane's BSDF in the list of the scene's."""
+        return dr.gather(mi.UInt32, self._indices, dr.reinterpret_array(mi.UInt32, surface.shape), valid)
 
     def at(self, surface: Any) -> Any:
         """Return the BSDF of each lane's surface, with the methods that light paths need."""
         if self._bsdfs is None:
             return surface.bsdf()
         valid = surface.is_valid()
-        place = self.place(surface, valid)
-        return _BsdfOfLane(self._bsdfs, place, valid)
+        index = self.index_of(surface, valid)
+        return _BsdfOfLane(self._bsdfs, index, valid)
 
 
 class _BsdfOfLane:
-    """A BSDF that calls, for each ``valid`` lane, the one of some BSDFs that is at its ``place`` in the list."""
+    """A BSDF that calls, for each ``valid`` lane, the one of some BSDFs that is at its ``index`` in the list."""
 
-    def __init__(self, bsdfs: list[Any], place: Any, valid: Any) -> None:
-        self._bsdfs, self._place, self._valid = bsdfs, place, valid
+    def __init__(self, bsdfs: list[Any], index: Any, valid: Any) -> None:
+        self._bsdfs, self._index, self._valid = bsdfs, index, valid
 
     def eval(self, context: Any, surface: Any, outgoing: Any, active: Any) -> Any:
         return self._call("eval", context, active, surface, outgoing)
@@ -92,16 +92,16 @@ class _BsdfOfLane:
 
     def _call(self, method: str, context: Any, active: Any, *arguments: Any) -> Any:
         targets = [partial(getattr(bsdf, method), context) for bsdf in self._bsdfs]
-        return dr.switch(self._place, targets, *arguments, self._valid & active)
+        return dr.switch(self._index, targets, *arguments, self._valid & active)
 
 
 def intersect_plane(plane: Any, ray: Any) -> Any:
     """Return what ``mi.Scene.ray_intersect`` returns for a scene that is a :func:`single_plane`."""
-    found = plane.ray_intersect_preliminary(ray)
-    hit = found.is_valid()
-    surface = plane.compute_surface_interaction(ray, found, mi.RayFlags.All, hit)
+    intersection = plane.ray_intersect_preliminary(ray)
+    hit = intersection.is_valid()
+    surface = plane.compute_surface_interaction(ray, intersection, mi.RayFlags.All, hit)
     surface.t = dr.select(hit, surface.t, dr.inf)
-    surface.shape = found.shape
+    surface.shape = intersection.shape
     surface.initialize_sh_frame()
     surface.wi = surface.to_local(-ray.d)
     return surface

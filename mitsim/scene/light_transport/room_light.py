@@ -49,9 +49,9 @@ class SeenSurfaces:
         """
         surfaces = cast(scene, rays, world_from_sensor, np.empty((0, 3)))
         directions = vectors_to_host(rays.directions).reshape(*rays.size, 3)
-        some = slice(None) if roi is None else roi.slices
-        cosine = np.abs((surfaces.normal[some] * directions[some]).sum(axis=-1))
-        return cls(surfaces.shape[some], cosine)
+        region = slice(None) if roi is None else roi.slices
+        cosine = np.abs((surfaces.normal[region] * directions[region]).sum(axis=-1))
+        return cls(surfaces.shape[region], cosine)
 
     def room_radiance(self, albedos: list[NDArray[np.float64]]) -> NDArray[np.float32]:
         """Return the radiance (h, w) [1/sr] per unit of irradiance on a surface with a free view.
@@ -83,12 +83,12 @@ def room_radiance(
 
 def directional_albedos(scene: Scene) -> list[NDArray[np.float64]]:
     """Return the :func:`directional_albedo` of each shape; shapes with one BSDF share it."""
-    known: dict[str, NDArray[np.float64]] = {}
+    albedos: dict[str, NDArray[np.float64]] = {}
     bsdfs = [shape.bsdf() for shape in scene.shapes]
     for bsdf in bsdfs:
-        if bsdf.id() not in known:
-            known[bsdf.id()] = directional_albedo(bsdf)
-    return [known[bsdf.id()] for bsdf in bsdfs]
+        if bsdf.id() not in albedos:
+            albedos[bsdf.id()] = directional_albedo(bsdf)
+    return [albedos[bsdf.id()] for bsdf in bsdfs]
 
 
 def directional_albedo(bsdf: Any) -> NDArray[np.float64]:
@@ -99,7 +99,7 @@ def directional_albedo(bsdf: Any) -> NDArray[np.float64]:
     """
     cosines = _cosines()
     count = len(cosines) * _SAMPLES
-    azimuth, sample1, *sample2 = (to_device(np.tile(one, len(cosines))) for one in _points().T)
+    azimuth, sample1, *sample2 = (to_device(np.tile(column, len(cosines))) for column in _points().T)
     cosine = to_device(np.repeat(cosines, _SAMPLES))
     sine = dr.sqrt(1 - dr.square(cosine))
     surface = dr.zeros(mi.SurfaceInteraction3f, count)

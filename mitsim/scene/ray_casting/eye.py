@@ -43,10 +43,12 @@ class Eye:
 
     def __init__(self, world_from_eye: Transform | Sequence[Transform], lane: Any = None) -> None:
         frames = [world_from_eye] if isinstance(world_from_eye, Transform) else world_from_eye
-        places = np.array([frame.translation for frame in frames])
+        origins = np.array([frame.translation for frame in frames])
         axes = np.array([frame.rotation.T for frame in frames])
-        self.position = mi.Point3f(*[of_lane(one, lane) for one in places.T])
-        self.axes = [mi.Vector3f(*[of_lane(one, lane) for one in axis.T]) for axis in np.moveaxis(axes, 1, 0)]
+        self.position = mi.Point3f(*[of_lane(component, lane) for component in origins.T])
+        self.axes = [
+            mi.Vector3f(*[of_lane(component, lane) for component in axis.T]) for axis in np.moveaxis(axes, 1, 0)
+        ]
 
     def to_world(self, local: Any) -> Any:
         """Rotate a direction from the eye's frame to the world frame."""

@@ -47,13 +47,13 @@ class MapTables:
         width = np.diff(knots) if len(knots) > 1 else np.ones(1)
         low, high = (np.exp(knots[i : i + self.intervals]) for i in (0, min(1, len(knots) - 1)))
         self.knots = mi.Float(np.stack([low, high, 1 / width], axis=-1).astype(np.float32).ravel())
-        every = [one for surface in surfaces for one in (surface, *surface.directions)]
+        every = [entry for surface in surfaces for entry in (surface, *surface.directions)]
         self.numbers = np.cumsum([0] + [1 + len(surface.directions) for surface in surfaces])[:-1].tolist()
         self.directions = max(len(surface.directions) for surface in surfaces)
         directed = next((surface for surface in surfaces if surface.directions), first)
-        self.mirror = [opaque(place) for place in directed.mirror_mm]
-        self.has_lay = mi.Bool([bool(one.directions) for one in every])
-        rows = np.concatenate([_rows(one, self.intervals) for one in every])
+        self.mirror = [opaque(coordinate) for coordinate in directed.mirror_mm]
+        self.has_lay = mi.Bool([bool(entry.directions) for entry in every])
+        rows = np.concatenate([_rows(entry, self.intervals) for entry in every])
         self.table = mi.Float(rows.ravel())
         dr.eval(self.knots, self.table, self.has_lay)
 
@@ -95,9 +95,9 @@ class MapTables:
             probit_weight += dr.select(fraction_known, weight, 0)
             log_sigma += dr.select(sigma_known, weight * s, 0)
             sigma_weight += dr.select(sigma_known, weight, 0)
-        known = within & (probit_weight >= 0.5)
-        fraction = dr.select(known, _from_probit(probit / probit_weight), dr.nan)
-        sigma = dr.select(known & (sigma_weight > 0), dr.exp(log_sigma / sigma_weight), dr.nan)
+        determined = within & (probit_weight >= 0.5)
+        fraction = dr.select(determined, _from_probit(probit / probit_weight), dr.nan)
+        sigma = dr.select(determined & (sigma_weight > 0), dr.exp(log_sigma / sigma_weight), dr.nan)
         return fraction, sigma
 
     def look_up_lay(self, number: Any, distance: Any, normal: Any, along: Any, active: Any) -> tuple[Any, Any]:
@@ -119,10 +119,10 @@ class MapTables:
         mirror = dr.normalize(mi.Vector3f(self.mirror[0] / distance, self.mirror[1] / distance, 1))
         z = mi.Vector3f(0, 0, 1)
         flat = _rotated_with(_rotated_with(along, mirror, z), _rotated_with(normal, mirror, z), z)
-        place = dr.atan2(flat.y, flat.x) * (self.directions / math.pi)
-        place -= self.directions * dr.floor(place / self.directions)
-        before = dr.minimum(mi.UInt32(place), self.directions - 1)
-        t = place - mi.Float(before)
+        position = dr.atan2(flat.y, flat.x) * (self.directions / math.pi)
+        position -= self.directions * dr.floor(position / self.directions)
+        before = dr.minimum(mi.UInt32(position), self.directions - 1)
+        t = position - mi.Float(before)
         after = dr.select(before + 1 == self.directions, 0, before + 1)
         step = math.pi / self.directions
         near = self.look_up(number + 1 + before, distance, _turned(normal, -t * step, mirror), directed)
@@ -130,11 +130,11 @@ class MapTables:
         at_near, at_far = t < AT_KNOT, t > 1 - AT_KNOT
         fraction = (1 - t) * near[0] + t * far[0]
         fraction = dr.select(at_near, near[0], dr.select(at_far, far[0], fraction))
-        one, other = (dr.select(dr.isnan(a), b, a) for a, b in ((near[1], far[1]), (far[1], near[1])))
-        sigma = dr.exp((1 - t) * dr.log(one) + t * dr.log(other))
+        near_sigma, far_sigma = (dr.select(dr.isnan(a), b, a) for a, b in ((near[1], far[1]), (far[1], near[1])))
+        sigma = dr.exp((1 - t) * dr.log(near_sigma) + t * dr.log(far_sigma))
         sigma = dr.select(at_near, near[1], dr.select(at_far, far[1], sigma))
-        known = directed & dr.isfinite(fraction)
-        return dr.select(known, fraction, mean[0]), dr.select(known, sigma, mean[1])
+        determined = directed & dr.isfinite(fraction)
+        return dr.select(determined, fraction, mean[0]), dr.select(determined, sigma, mean[1])
 
     def _distance_interval(self, distance: Any, within: Any) -> tuple[Any, Any]:
         """Return the interval of distances, and the position between its knots, 0 to 1 in ln |V|."""

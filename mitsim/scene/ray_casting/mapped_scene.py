@@ -119,7 +119,7 @@ class ViewRays:
 
     def pixels(self, roi: Roi) -> Any:
         """Return the flat indices of the pixels of a region."""
-        left, top, width = (opaque_index(each) for each in (roi.left, roi.top, roi.width))
+        left, top, width = (opaque_index(number) for number in (roi.left, roi.top, roi.width))
         index = dr.arange(mi.UInt32, roi.width * roi.height)
         return (index // width + top) * opaque_index(self.grid.width) + index % width + left
 
@@ -141,15 +141,15 @@ class MappedScene:
 
     def __init__(self, scene: Scene, surfaces: Sequence[Surface | None]) -> None:
         self.scene = scene
-        known: list[Surface] = []
+        distinct: list[Surface] = []
         numbers = []
         for surface in surfaces:
-            if surface is not None and not any(surface is one for one in known):
-                known.append(surface)
-            numbers.append(-1 if surface is None else next(i for i, one in enumerate(known) if one is surface))
-        self.tables = MapTables(known) if known else None
+            if surface is not None and not any(surface is member for member in distinct):
+                distinct.append(surface)
+            numbers.append(-1 if surface is None else next(i for i, member in enumerate(distinct) if member is surface))
+        self.tables = MapTables(distinct) if distinct else None
         if self.tables is not None:
-            numbers = [-1 if one < 0 else self.tables.numbers[one] for one in numbers]
+            numbers = [-1 if row < 0 else self.tables.numbers[row] for row in numbers]
         self.with_lay = self.tables is not None and self.tables.directions > 0
         # a row for each of Mitsuba's shape numbers: index of the shape, index of its surface, whether its back is seen
         ids = [shape_number(shape) for shape in scene.shapes]
@@ -195,7 +195,7 @@ class MappedScene:
         )
         number = dr.reinterpret_array(mi.UInt32, surface.shape)
         met = surface.is_valid() & (number < self.count)  # shapes inside an instance have larger numbers
-        index, known, two_sided = dr.gather(mi.Array3i, self.shapes, number, met)
+        index, surface_index, two_sided = dr.gather(mi.Array3i, self.shapes, number, met)
         facing = dr.select(dr.dot(surface.n, direction) > 0, -1.0, 1.0)
         hit = met & (index >= 0) & ((facing > 0) | (two_sided > 0))
         normal = surface.n * facing
@@ -204,12 +204,12 @@ class MappedScene:
         in_view = view.in_view_frame(frame.to_local(normal), ray)
         fraction = sigma = dr.full(mi.Float, dr.nan, dr.width(pixel))
         if self.tables is not None:
-            queried = (status == _code(Status.VALID)) & (known >= 0)
+            queried = (status == _code(Status.VALID)) & (surface_index >= 0)
             if self.with_lay:
                 along = view.in_view_frame(frame.to_local(surface.dp_du), ray)
-                fraction, sigma = self.tables.look_up_lay(mi.UInt32(known), surface.t, in_view, along, queried)
+                fraction, sigma = self.tables.look_up_lay(mi.UInt32(surface_index), surface.t, in_view, along, queried)
             else:
-                fraction, sigma = self.tables.look_up(mi.UInt32(known), surface.t, in_view, queried)
+                fraction, sigma = self.tables.look_up(mi.UInt32(surface_index), surface.t, in_view, queried)
         return {
             "status": dr.uint8_array_t(mi.Float)(status),
             "shape": dr.select(hit, index, -1),

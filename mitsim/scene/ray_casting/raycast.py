@@ -63,7 +63,7 @@ class PixelRays:
 
     def within(self, roi: Roi) -> PixelRays:
         """Return the rays of a region."""
-        left, top, width, whole = (opaque_index(each) for each in (roi.left, roi.top, roi.width, self.size[1]))
+        left, top, width, whole = (opaque_index(number) for number in (roi.left, roi.top, roi.width, self.size[1]))
         index = dr.arange(mi.UInt32, roi.width * roi.height)
         pixel = (index // width + top) * whole + index % width + left
         part = copy.copy(self)

@@ -79,7 +79,7 @@ def seen_faces(
     if not len(chosen):
         return out
     rng = np.random.default_rng(0)
-    point, normal, ray = (np.asarray(one, float)[chosen] for one in (points, normals, rays))
+    point, normal, ray = (np.asarray(vectors, float)[chosen] for vectors in (points, normals, rays))
     start = point + _OFFSET * float(np.linalg.norm(np.ptp(scene.bounds, axis=0))) * normal
     ball = rng.standard_normal((2, len(chosen), 3))
     ball /= np.linalg.norm(ball, axis=2, keepdims=True)

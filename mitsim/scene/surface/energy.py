@@ -88,7 +88,7 @@ def facets(
     views = [0.0] if isotropic else np.pi / 2 * (np.arange(several) + 0.5) / several
     lobe = _Lobe(alpha_u, alpha_v, distribution, index)
     seen = [_facets_from(incidence, view, sx, sy, lobe) for view in views]
-    weights, cosines = (np.concatenate([one[k].ravel() for one in seen]) for k in (0, 1))
+    weights, cosines = (np.concatenate([pair[k].ravel() for pair in seen]) for k in (0, 1))
     return weights / weights.size, cosines
 
 

@@ -181,8 +181,8 @@ def machined(
 
 def lay_is_open(face: MachinedFace) -> bool:
     """Return whether the process leaves marks whose direction is not given; ``lay = "none"`` says there are none."""
-    given = face.lay is not None or face.alpha is not None or face.alpha_u is not None
-    return not given and PROCESSES[face.process_or_default].lay_ratio < 1
+    width_stated = face.lay is not None or face.alpha is not None or face.alpha_u is not None
+    return not width_stated and PROCESSES[face.process_or_default].lay_ratio < 1
 
 
 def check(face: MachinedFace, where: str) -> None:
@@ -269,8 +269,8 @@ def _lobe(face: MachinedFace, process: Process, sigma: float, wavelength_nm: flo
     if face.alpha is not None:
         return _LobeWidths(face.alpha, face.alpha, f"alpha {face.alpha:g} as given", FACTORS["alpha"])
     if face.alpha_u is not None and face.alpha_v is not None:
-        given = f"alpha {face.alpha_u:g} and {face.alpha_v:g} along u and v as given"
-        return _LobeWidths(face.alpha_v, face.alpha_u, given, FACTORS["alpha"])
+        provenance = f"alpha {face.alpha_u:g} and {face.alpha_v:g} along u and v as given"
+        return _LobeWidths(face.alpha_v, face.alpha_u, provenance, FACTORS["alpha"])
     if face.height_map is not None:
         areal = face.height_map
         across = _from_heights(areal.across, areal.Sq, wavelength_nm, where, "height_map")

@@ -127,25 +127,25 @@ class Deviation:
         InputError
             For an unknown name (it suggests the nearest), a name given twice, or an invalid or too large number.
         """
-        known, given = [field.name for field in fields(cls)], dict[str, float]()
+        names, values = [field.name for field in fields(cls)], dict[str, float]()
         for word in filter(None, (word.strip() for word in text.split(","))):
             name, mark, value = (part.strip() for part in word.partition("="))
-            if name not in known:
-                raise InputError(where, "", repr(name), ", ".join(known), nearest(name, known))
-            if name in given:
+            if name not in names:
+                raise InputError(where, "", repr(name), ", ".join(names), nearest(name, names))
+            if name in values:
                 raise InputError(where, name, "two values", "one")
             low, high, unit = -LARGEST_DEVIATION, LARGEST_DEVIATION, "standard deviations"
             if name == "lay_deg":
                 low, high, unit = 0.0, 180.0, "degrees"
             allowed = f"a number of {unit} from {low:g} to {high:g}"
             try:
-                given[name] = float(value)
+                values[name] = float(value)
             except ValueError:
                 found = repr(value) if mark else "nothing"
                 raise InputError(where, name, found, allowed, f"write {name}=1") from None
-            if not low <= given[name] <= high:
+            if not low <= values[name] <= high:
                 raise InputError(where, name, value, allowed)
-        return cls(**given)
+        return cls(**values)
 
     def width(self, alpha: float, factor: float) -> float:
         """Return a lobe's alpha [1] after the deviation; ``factor`` is its one-sigma factor."""
@@ -161,16 +161,16 @@ class Deviation:
         if not self.wide_angle or ends[0] == ends[1] or not 0 < share < LARGEST_WIDE_ANGLE:
             return share
 
-        def odds(one: float) -> float:
-            return one / (LARGEST_WIDE_ANGLE - one)
+        def odds(wide_share: float) -> float:
+            return wide_share / (LARGEST_WIDE_ANGLE - wide_share)
 
         ratio = odds(ends[1]) / odds(share) if self.wide_angle > 0 else odds(share) / odds(ends[0])
         return moved_odds(share, ratio**self.wide_angle)
 
     def beckmann(self, share: float, ends: tuple[float, float]) -> float:
         """Return the Beckmann share of a lobe [1] after the deviation; ``ends`` are its one-sigma range."""
-        places = (-LARGEST_DEVIATION, -1.0, 0.0, 1.0, LARGEST_DEVIATION)
-        return float(np.interp(self.tail, places, (0.0, ends[0], share, ends[1], 1.0)))
+        deviations = (-LARGEST_DEVIATION, -1.0, 0.0, 1.0, LARGEST_DEVIATION)
+        return float(np.interp(self.tail, deviations, (0.0, ends[0], share, ends[1], 1.0)))
 
     def along(self, along: float, across: float, factor: float = LAY_FACTOR) -> float:
         """Return alpha along the marks [1] after the deviation; it is ``across`` at most."""
