@@ -69,9 +69,9 @@ class CalibratedEye:
     matrix_map: str
     values: dict[str, Composed] = field(repr=False)
 
-    def sources(self, what: str) -> tuple[str, ...]:
+    def sources(self, quantity: str) -> tuple[str, ...]:
         """Return the dotted names of the sources of a value; none without it."""
-        return self.values[what].sources if what in self.values else ()
+        return self.values[quantity].sources if quantity in self.values else ()
 
     @property
     def is_projector(self) -> bool:
@@ -93,19 +93,19 @@ def eyes_of(tree: dict[str, Any]) -> list[CalibratedEye]:
 
     A matrix under a usual name in no map is none of them, since such names need no search.
     """
-    found = []
+    matrix_paths = []
     for path in islice(_maps([("", _without_dots(tree))]), _MOST):
         matrix = _matrix(*path[-1])
         if matrix is not None and not any("radialdistortion" in map(str.lower, table) for _, table in path):
-            found.append((path, matrix))  # MATLAB's, whose pixels count from 1, has other readers
+            matrix_paths.append((path, matrix))  # MATLAB's, whose pixels count from 1, has other readers
     alone = not any(vector(value, 9) is not None for value in tree.values())
     out: list[CalibratedEye] = []
-    for path, matrix in found:
+    for path, matrix in matrix_paths:
         depth = next(
             at + 1
             for at in range(len(path))
             if at + 1 == len(path)
-            or (sum(other[at][1] is path[at][1] for other, _ in found if len(other) > at) == 1 and (at or alone))
+            or (sum(other[at][1] is path[at][1] for other, _ in matrix_paths if len(other) > at) == 1 and (at or alone))
         )
         out.append(_eye(path, depth, matrix))
     return out
@@ -114,8 +114,8 @@ def eyes_of(tree: dict[str, Any]) -> list[CalibratedEye]:
 def cameras_of(eyes: Sequence[CalibratedEye]) -> tuple[list[CalibratedEye], bool]:
     """Return the eyes that are no projectors, and whether their order is known: from their names, or from a pose."""
     cameras = [eye for eye in eyes if not eye.is_projector]
-    places = [eye.place for eye in cameras]
-    if None not in places and len(set(places)) == len(places):
+    positions = [eye.place for eye in cameras]
+    if None not in positions and len(set(positions)) == len(positions):
         return sorted(cameras, key=lambda eye: eye.place or 0), True
     posed = ["rotation" in eye.values for eye in cameras]
     return sorted(cameras, key=lambda eye: "rotation" in eye.values), posed.count(False) <= 1
@@ -129,7 +129,7 @@ def usual_values(eyes: Sequence[CalibratedEye]) -> dict[str, Composed]:
     out: dict[str, Composed] = {}
     for eye in eyes:
         for name in {eye.name, eye.matrix_map}:
-            out |= {f"+{what} of {name}": value for what, value in eye.values.items() if name}
+            out |= {f"+{quantity} of {name}": value for quantity, value in eye.values.items() if name}
     cameras, ordered = cameras_of(eyes)
     if len(cameras) == 1:
         out |= _under(cameras[0], {"matrix": "+K", "distortion": "+D1", "size": "+size"})
@@ -144,7 +144,7 @@ def usual_values(eyes: Sequence[CalibratedEye]) -> dict[str, Composed]:
 
 
 def _under(eye: CalibratedEye, names: dict[str, str]) -> dict[str, Composed]:
-    return {name: eye.values[what] for what, name in names.items() if what in eye.values}
+    return {name: eye.values[quantity] for quantity, name in names.items() if quantity in eye.values}
 
 
 def _without_dots(tree: dict[str, Any]) -> dict[str, Any]:
@@ -171,35 +171,39 @@ def _maps(path: list[_Named]) -> Iterator[list[_Named]]:
         for number, inner in enumerate(many):
             if isinstance(inner, dict):
                 stated = inner.get("name")
-                own = key if many is not value else f"{key}.{stated if isinstance(stated, str) and stated else number}"
-                yield from _maps([*path, (dotted(name, own), inner)])
+                inner_name = (
+                    key if many is not value else f"{key}.{stated if isinstance(stated, str) and stated else number}"
+                )
+                yield from _maps([*path, (dotted(name, inner_name), inner)])
 
 
 def _eye(path: list[_Named], depth: int, matrix: Composed) -> CalibratedEye:
     """Return the eye of the last map of a path; the maps around it from ``depth`` on have no other eye."""
-    own: list[_Named] = []
+    maps: list[_Named] = []
     for name, table in reversed(path[depth - 1 :]):
-        own += [(name, table)]
-        own += [(dotted(name, key), value) for key, value in table.items() if _is_beside(value)]
-    around = [*own, *reversed(path[: depth - 1])]
+        maps += [(name, table)]
+        maps += [(dotted(name, key), value) for key, value in table.items() if _is_beside(value)]
+    around = [*maps, *reversed(path[: depth - 1])]
     qualifying: dict[str, Any] = {}
     for _, table in reversed(around):
         qualifying |= {key: value for key, value in table.items() if not isinstance(value, dict) or key == "roi"}
     values = {
         "matrix": Composed(matrix.value, matrix.sources, qualifying),
-        "distortion": _lens(own, is_fisheye(qualifying)),
+        "distortion": _lens(maps, is_fisheye(qualifying)),
         "size": _size(around),
-        **pose_in(own),
+        **pose_in(maps),
     }
     name = path[depth - 1][0] or (path[1][0] if len(path) > 1 else "")
-    return CalibratedEye(name, path[-1][0], {what: value for what, value in values.items() if value is not None})
+    return CalibratedEye(
+        name, path[-1][0], {quantity: value for quantity, value in values.items() if value is not None}
+    )
 
 
 def _is_beside(value: Any) -> bool:
     """Return whether a value is a map that may belong to an eye beside it: none with a camera matrix of its own."""
     if not isinstance(value, dict):
         return False
-    matrices = [numbers for each in value.values() if (numbers := vector(each, 9)) is not None]
+    matrices = [numbers for item in value.values() if (numbers := vector(item, 9)) is not None]
     return not any(numbers[0] > 1 and (numbers[6:] == (0, 0, 1)).all() for numbers in matrices)
 
 
@@ -211,7 +215,7 @@ def _matrix(name: str, table: dict[str, Any]) -> Composed | None:
         if numbers is not None:
             return Composed(numbers.reshape(3, 3), (dotted(name, low[usual]),), table)
     four = vector(table.get(low.get("intrinsics", "")))
-    keys = [next((low[each] for each in names if each in low), "") for names in (*_SINGLE, *_DOUBLE)]
+    keys = [next((low[spelling] for spelling in names if spelling in low), "") for names in (*_SINGLE, *_DOUBLE)]
     if all(keys[:4]):
         fx, fy, cx, cy = (_number(table[key]) for key in keys[:4])
         sources = keys[:4]
@@ -223,7 +227,9 @@ def _matrix(name: str, table: dict[str, Any]) -> Composed | None:
         sources = [low["intrinsics"]]
     else:
         return None
-    return Composed(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), tuple(dotted(name, each) for each in sources), {})
+    return Composed(
+        np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), tuple(dotted(name, source) for source in sources), {}
+    )
 
 
 def is_fisheye(table: dict[str, Any]) -> bool:
@@ -236,18 +242,22 @@ def _lens(maps: list[_Named], fisheye: bool) -> Composed | None:
     """Return the distortion in the first of several maps that states one, as a list or as single numbers."""
     for name, table in maps:
         low = {key.lower(): key for key in table}
-        for each in sorted(_LENSES & set(low)):
-            bent = vector(table[low[each]])
+        for spelling in sorted(_LENSES & set(low)):
+            bent = vector(table[low[spelling]])
             if bent is not None:
-                return Composed(bent, (dotted(name, low[each]),), table)
+                return Composed(bent, (dotted(name, low[spelling]),), table)
         names = [
-            each for each in (_FISHEYE if fisheye else _BENT) if vector(table.get(low.get(each, "")), 1) is not None
+            coefficient
+            for coefficient in (_FISHEYE if fisheye else _BENT)
+            if vector(table.get(low.get(coefficient, "")), 1) is not None
         ]
         if names:
             order = _FISHEYE if fisheye else _BENT
-            count = next(each for each in (4, 5, 8, 12, 14) if each > order.index(names[-1]))
-            numbers = [_number(table[low[each]]) if each in names else 0.0 for each in order[:count]]
-            return Composed(np.array(numbers), tuple(dotted(name, low[each]) for each in names), table)
+            count = next(length for length in (4, 5, 8, 12, 14) if length > order.index(names[-1]))
+            numbers = [
+                _number(table[low[coefficient]]) if coefficient in names else 0.0 for coefficient in order[:count]
+            ]
+            return Composed(np.array(numbers), tuple(dotted(name, low[coefficient]) for coefficient in names), table)
     return None
 
 
@@ -255,13 +265,13 @@ def _size(maps: list[_Named]) -> Composed | None:
     """Return width and height in the first of several maps that has them."""
     for name, table in maps:
         low = {key.lower(): key for key in table}
-        found = size_of(table)
-        if found is not None:
-            return Composed(found, (), table)
-        for each in sorted(_SIZES & set(low)):
-            found = size_of(table[low[each]])
-            if found is not None:
-                return Composed(found, (dotted(name, low[each]),), table)
+        size = size_of(table)
+        if size is not None:
+            return Composed(size, (), table)
+        for spelling in sorted(_SIZES & set(low)):
+            size = size_of(table[low[spelling]])
+            if size is not None:
+                return Composed(size, (dotted(name, low[spelling]),), table)
     return None
 
 
@@ -271,13 +281,13 @@ def size_of(value: Any) -> NDArray[np.float64] | None:
         return vector(value, 2)
     low = {str(key).lower(): key for key in value}
     for sides in _SIDES:
-        found = vector([value.get(low.get(side, "")) for side in sides], 2)
-        if found is not None:
-            return found
+        numbers = vector([value.get(low.get(side, "")) for side in sides], 2)
+        if numbers is not None:
+            return numbers
     return None
 
 
 def _number(value: Any) -> float:
     """Return a number; NaN of what is none, which the check of the matrix refuses."""
-    found = vector(value, 1)
-    return float("nan") if found is None else float(found[0])
+    numbers = vector(value, 1)
+    return float("nan") if numbers is None else float(numbers[0])

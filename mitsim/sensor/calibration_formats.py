@@ -121,11 +121,11 @@ def _with_matrices(value: Any, depth: int) -> Any:
     if depth > _DEEPEST:
         return None
     if isinstance(value, list):
-        nested = any(isinstance(each, (dict, list)) for each in value)
-        return [_with_matrices(each, depth + 1) for each in value] if nested else value
+        nested = any(isinstance(item, (dict, list)) for item in value)
+        return [_with_matrices(item, depth + 1) for item in value] if nested else value
     if not isinstance(value, dict):
         return value
-    out = {name: _with_matrices(each, depth + 1) for name, each in value.items()}
+    out = {name: _with_matrices(item, depth + 1) for name, item in value.items()}
     return matrix_of(out) if {"rows", "cols", "data"} <= set(out) else out
 
 

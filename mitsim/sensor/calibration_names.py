@@ -65,6 +65,6 @@ _WRITTEN: dict[str, tuple[str, str, str]] = {
 }
 
 USUAL_NAMES: dict[str, tuple[Names, Names, Names]] = {
-    what: (tuple(first.split()), tuple(second.split()), tuple(projector.split()))
-    for what, (first, second, projector) in _WRITTEN.items()
+    quantity: (tuple(first.split()), tuple(second.split()), tuple(projector.split()))
+    for quantity, (first, second, projector) in _WRITTEN.items()
 }

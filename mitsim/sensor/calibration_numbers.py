@@ -65,13 +65,13 @@ def numbers_of(value: Any, file: Path, key: str, shapes: tuple[tuple[int, ...], 
     except (ValueError, TypeError, OverflowError):
         values = np.array(math.nan)
     vector = len(shapes[0]) == 1
-    found = values.reshape(-1) if vector and values.ndim and values.size == max(values.shape) else values
-    if found.shape not in shapes or not np.isfinite(found).all():
+    numbers = values.reshape(-1) if vector and values.ndim and values.size == max(values.shape) else values
+    if numbers.shape not in shapes or not np.isfinite(numbers).all():
         if vector and values.ndim and values.size == 0 and (0,) in shapes:
             return np.empty(0)
         allowed = " or ".join(" x ".join(map(str, shape)) for shape in shapes) + " finite numbers"
         raise InputError(file, key, _shown(value, values), allowed)
-    return found
+    return numbers
 
 
 def _shown(value: Any, values: NDArray[np.float64]) -> str:

@@ -53,9 +53,9 @@ def pose_in(maps: Sequence[tuple[str, dict[str, Any]]]) -> dict[str, Composed]:
                 posed = Composed(motion, (dotted(name, key),), {"unit": unit} if unit else table)
                 return {"rotation": posed, "translation": posed}
         for turns, shifts in (_TO_CAMERA, _OF_CAMERA) if name else ():
-            ordered = [each for each in table if each.lower().endswith(("xyzw", "wxyz"))]
-            turn = next((each for each in (*turns, *ordered) if each in table), "")
-            shift = next((each for each in shifts if each in table), "")
+            ordered = [spelling for spelling in table if spelling.lower().endswith(("xyzw", "wxyz"))]
+            turn = next((spelling for spelling in (*turns, *ordered) if spelling in table), "")
+            shift = next((spelling for spelling in shifts if spelling in table), "")
             R, T = vector(table.get(turn)), vector(table.get(shift), 3)
             if T is None or R is None or len(R) not in (3, 4, 9):
                 continue

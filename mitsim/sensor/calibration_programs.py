@@ -51,8 +51,8 @@ def with_usual_names(tree: dict[str, Any]) -> dict[str, Any]:
     for name, holder in [("", tree), *((name, value) for name, value in tree.items() if isinstance(value, dict))]:
         if isinstance(holder.get("CameraParameters1"), dict):
             out |= _toolbox_pair(holder, name)
-        elif found := _toolbox_camera(holder, name, "1", {}):
-            out |= found
+        elif camera_values := _toolbox_camera(holder, name, "1", {}):
+            out |= camera_values
             if not name:  # its pixels count from 1, so it is no K of OpenCV
                 out.pop("K", None)
     return out
@@ -126,7 +126,7 @@ def _toolbox_pair(pair: dict[str, Any], name: str) -> dict[str, Any]:
     """Return the values of a stereo structure of the Computer Vision Toolbox."""
     out: dict[str, Any] = {}
     cameras = [pair.get(f"CameraParameters{number}") for number in "12"]
-    stated = [each.get("WorldUnits") for each in (*cameras, pair) if isinstance(each, dict)]
+    stated = [part.get("WorldUnits") for part in (*cameras, pair) if isinstance(part, dict)]
     units = next(({"unit": unit} for unit in stated if isinstance(unit, str) and unit), {})
     for number, camera in zip("12", cameras, strict=True):
         if isinstance(camera, dict):

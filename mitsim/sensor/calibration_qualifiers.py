@@ -115,15 +115,15 @@ def check_intrinsics(focal: tuple[float, float], principal: tuple[float, float],
     images = f"for images of {width} x {height} px"
     if not all(low <= focal_px <= high for focal_px in focal):
         raise ValueError(f"focal_px from {low:g} to {high:g} {images}{_cause(focal, principal)}")
-    if not all(abs(place) <= _CENTRE_SHARE * side for place in principal):
+    if not all(abs(coordinate) <= _CENTRE_SHARE * side for coordinate in principal):
         raise ValueError(f"principal_px within {_CENTRE_SHARE * side:g} px of the image's corner {images}")
 
 
 def _cause(focal: tuple[float, float], principal: tuple[float, float]) -> str:
     """Return the likely cause of a focal length that no image has, as the end of a sentence."""
-    if not all(math.isfinite(each) and each > 0 for each in focal):
+    if not all(math.isfinite(length) and length > 0 for length in focal):
         return ""
-    if max(focal) < 15 and all(-1 <= place <= 2 for place in principal):
+    if max(focal) < 15 and all(-1 <= coordinate <= 2 for coordinate in principal):
         return (
             "; these are normalised values, shares of the image's sides: multiply fx and cx by the width in px, fy and "
             "cy by the height"
@@ -243,7 +243,7 @@ def of_images(
 
 
 def lens_model(
-    table: dict[str, Any], where: str | Path, given: str | None = None, straight: bool = False
+    table: dict[str, Any], where: str | Path, model: str | None = None, straight: bool = False
 ) -> str | None:
     """Return ``perspective`` or ``fisheye`` if a table states the lens model; None if it does not.
 
@@ -253,7 +253,7 @@ def lens_model(
         Table of the calibration file.
     where
         File that messages name.
-    given
+    model
         Model that the sensor file gives.
     straight
         Whether all coefficients are zero, so that the distortion model does not matter.
@@ -263,7 +263,7 @@ def lens_model(
     InputError
         If the model is none of OpenCV's, or contradicts the given one.
     """
-    found: str | None = None
+    stated_model: str | None = None
     for name in LENS_MODELS:
         text = table.get(name)
         if name == "distortion_type" and isinstance(text, int | float):
@@ -271,17 +271,19 @@ def lens_model(
         if not isinstance(text, str) or not text:
             continue
         word = text.lower().removeprefix("distortion.")  # as librealsense's wrappers write it
-        known = _MODELS.get(word)
+        opencv_model = _MODELS.get(word)
         other = word in _OTHER_MODELS or (word in _OF_ZEROS and not straight)
         if name in ("distortion_model", "distortion_type"):
-            other = known is None and not straight
-        if other and given is None:
+            other = opencv_model is None and not straight
+        if other and model is None:
             hint = 'if the coefficients are OpenCV\'s, say so in a sensor file: model = "perspective" or "fisheye"'
             raise InputError(where, name, repr(text), f"OpenCV's models: {', '.join(_MODELS)}", hint)
-        found = known or found
-    if given is not None and found is not None and found != given:
-        raise InputError(where, "model", repr(given), f"{found}, which the calibration states", "leave out model")
-    return found
+        stated_model = opencv_model or stated_model
+    if model is not None and stated_model is not None and stated_model != model:
+        raise InputError(
+            where, "model", repr(model), f"{stated_model}, which the calibration states", "leave out model"
+        )
+    return stated_model
 
 
 def unit_mm(table: dict[str, Any], where: str | Path) -> float | None:

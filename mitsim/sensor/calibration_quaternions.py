@@ -39,15 +39,15 @@ def with_rotations(table: dict[str, Any]) -> dict[str, Any]:
 
 
 def _plain(name: str, value: Any) -> Any:
-    if isinstance(value, list) and any(isinstance(each, dict) for each in value):
-        return [_plain("", each) for each in value]
+    if isinstance(value, list) and any(isinstance(item, dict) for item in value):
+        return [_plain("", item) for item in value]
     if not isinstance(value, dict):
         order = name.lower()[-4:]
         numbers = vector(value, 4) if order in ("xyzw", "wxyz") else None
         return value if numbers is None else _matrix(numbers[[1, 2, 3, 0]] if order == "wxyz" else numbers)
     for names in ("xyz", "xyzw"):
         for before in ("", "q"):
-            keys = [before + each for each in names]
+            keys = [before + letter for letter in names]
             numbers = vector([value[key] for key in keys]) if set(keys) == set(value) else None
             if numbers is not None:
                 return _matrix(numbers) if len(numbers) == 4 else numbers

@@ -65,7 +65,7 @@ class CalibrationTree:
             If several files, or several documents of a file, give different values.
         """
         file, mark, name = key.rpartition(":")
-        found: list[Found] = []
+        matches: list[Found] = []
         for i, path in enumerate(self.files):
             if mark and path.parts[-len(Path(file).parts) :] != Path(file).parts:
                 continue
@@ -75,18 +75,18 @@ class CalibrationTree:
             self.seen.add((i, written))
             if isinstance(value, Composed):
                 self.seen.update((i, source) for source in value.sources)
-                found.append(Found(path, value.value, value.table, ", ".join(value.sources)))
+                matches.append(Found(path, value.value, value.table, ", ".join(value.sources)))
             else:
-                found.append(Found(path, value, table, written))
-        for other in found[1:]:
-            first = found[0]
+                matches.append(Found(path, value, table, written))
+        for other in matches[1:]:
+            first = matches[0]
             if not _same(first.value, other.value):
                 if other.file == first.file:
                     raise InputError(first.file, name, "other values in a later document of the file", "one document")
                 both = f"other values in {first.file.name} than in {other.file.name}"
                 hint = f'name the file to use: file = "{first.file.name}" in [calibration.keys.NAME]'
                 raise InputError(other.file, name, both, "a value of one file, or the same in all", hint)
-        return found[0] if found else None
+        return matches[0] if matches else None
 
     def eyes(self) -> list[CalibratedEye]:
         """Return the cameras and projectors that stand in maps."""
@@ -181,11 +181,11 @@ def _spelt(name: str, table: dict[str, Any]) -> str:
     """Return the name that a map has in other capitals (``Camera_Matrix``); a short one stays as it is: r is not R."""
     if len(name) < _SHORTEST:
         return name
-    return next((each for each in table if each.lower() == name.lower()), name)
+    return next((key for key in table if key.lower() == name.lower()), name)
 
 
-def _same(one: Any, other: Any) -> bool:
+def _same(value: Any, other: Any) -> bool:
     try:
-        return bool(np.array_equal(np.asarray(one, float), np.asarray(other, float)))
+        return bool(np.array_equal(np.asarray(value, float), np.asarray(other, float)))
     except (ValueError, TypeError, OverflowError):
-        return bool(one == other)
+        return bool(value == other)

@@ -64,9 +64,9 @@ class Camera:
             raise ValueError(f"camera model {self.model!r}: allowed are perspective, fisheye")
 
     def _values(self) -> tuple[object, ...]:
-        place = self.sensor_from_camera
-        arrays = (self.matrix, self.distortion, place.rotation, place.translation)
-        return (self.model, self.width, self.height, *(np.asarray(each, float).tobytes() for each in arrays))
+        pose = self.sensor_from_camera
+        arrays = (self.matrix, self.distortion, pose.rotation, pose.translation)
+        return (self.model, self.width, self.height, *(np.asarray(array, float).tobytes() for array in arrays))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Camera) and self._values() == other._values()
@@ -312,10 +312,10 @@ class Rig:
     @property
     def baseline_direction(self) -> NDArray[np.float64]:
         """Return the unit vector in the sensor frame from the reference camera to the second camera or projector."""
-        others = [*list(self.cameras.values())[1:], *([self.projector] if self.projector else [])]
-        if not others:
+        eyes = [*list(self.cameras.values())[1:], *([self.projector] if self.projector else [])]
+        if not eyes:
             return np.array([1.0, 0.0, 0.0])
-        direction = others[0].centre - self.reference.centre
+        direction = eyes[0].centre - self.reference.centre
         length = np.linalg.norm(direction)
         return direction / length if length > 0 else np.array([1.0, 0.0, 0.0])
 

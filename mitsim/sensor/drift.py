@@ -101,14 +101,14 @@ def drift_modes(rig: Rig, names: tuple[str, ...], drift: Drift) -> list[DriftMod
         if f"{name}.rotation_x_rad" not in names:
             continue
         baseline = eye.centre - reference.centre
-        for what, milliradian, axis in zip(
+        for kind, milliradian, axis in zip(
             ("vergence", "row error", "roll"),
             (drift.vergence_mrad, drift.row_mrad, drift.roll_mrad),
             _axes(eye, baseline),
             strict=True,
         ):
             step = {f"{name}.rotation_{letter}_rad": float(part) for letter, part in zip("xyz", axis, strict=True)}
-            out.append(DriftMode(f"{what} of {name}", milliradian * 1e-3, step))
+            out.append(DriftMode(f"{kind} of {name}", milliradian * 1e-3, step))
         longer = {f"{name}.position_{letter}_mm": float(part) for letter, part in zip("xyz", baseline, strict=True)}
         out.append(DriftMode(f"baseline to {name}", drift.baseline_per_kelvin * drift.temperature_k, longer))
     return out

@@ -145,15 +145,15 @@ def expose(
     levels: NDArray[np.uint8] | NDArray[np.uint16]
     levels = np.empty(stack.shape, np.uint8) if chip.bits <= 8 else np.empty(stack.shape, np.uint16)
     dark = imager.dark_current * exposure_s if noise.dark else 0.0
-    places = list(np.ndindex(stack.shape[:-2]))
-    streams = rng.spawn(len(places)) if rng is not None and len(places) > 1 else [rng] * len(places)
+    indices = list(np.ndindex(stack.shape[:-2]))
+    streams = rng.spawn(len(indices)) if rng is not None and len(indices) > 1 else [rng] * len(indices)
     # a few rows at a time fit the processor's cache, and avoid a second copy of the stack in floating point
     rows = max(1, _PIXELS_AT_ONCE // max(1, stack.shape[-1]))
     smoothed = np.empty(stack.shape[-2:], np.float32) if imager.smoothing_px > 0 else None
-    for place, stream in zip(places, streams, strict=True):
+    for index, stream in zip(indices, streams, strict=True):
         for first in range(0, stack.shape[-2], rows):
             part = slice(first, first + rows)
-            charge = np.array(stack[place][part], np.float32)
+            charge = np.array(stack[index][part], np.float32)
             if not np.isfinite(charge).all():
                 raise ValueError("mean electrons must be finite")
             if fixed_pattern is not None and noise.prnu:
@@ -165,13 +165,13 @@ def expose(
             if fixed_pattern is not None and noise.column:
                 charge += fixed_pattern.column
             if smoothed is None:
-                levels[place][part] = _convert(charge, chip)
+                levels[index][part] = _convert(charge, chip)
             else:
                 smoothed[part] = np.minimum(charge, np.float32(imager.full_well))
         if smoothed is not None:
             for axis in (0, 1):
                 smoothed[:] = correlate1d(smoothed, point_spread(imager.smoothing_px), axis, mode="reflect")
-            levels[place] = _convert(smoothed, chip)
+            levels[index] = _convert(smoothed, chip)
     return levels
 
 
@@ -208,8 +208,8 @@ def _add_shot_noise(means: NDArray[np.float32], read: float, rng: np.random.Gene
     exact = counted_below(read)
     # nothing is counted where there is no light, such as beside a part
     faint = (means < np.float32(exact)) & (means > 0) if exact > 0 else None
-    some = faint is not None and bool(faint.any())
-    if some:
+    any_faint = faint is not None and bool(faint.any())
+    if any_faint:
         counts = rng.poisson(means[faint]) + np.float32(read) * z[faint]
     variance = np.maximum(means, np.float32(1e-3)) if read == 0 else means + np.float32(read**2)
     skewed = np.divide(means, variance)
@@ -223,7 +223,7 @@ def _add_shot_noise(means: NDArray[np.float32], read: float, rng: np.random.Gene
     means += skewed
     if read == 0:
         np.rint(means, out=means)
-    if some:
+    if any_faint:
         means[faint] = counts
 
 

@@ -196,8 +196,8 @@ class ImageSequence(Document):
 
     def fringes(self, axis: Axis) -> list[FringeImages]:
         """Return the groups of fringes along an axis, from the longest period to the shortest."""
-        found = [group for group in self.images if isinstance(group, FringeImages) and group.axis == axis]
-        return sorted(found, key=lambda group: -group.period_px)
+        groups = [group for group in self.images if isinstance(group, FringeImages) and group.axis == axis]
+        return sorted(groups, key=lambda group: -group.period_px)
 
     def roles(self, width: int, height: int) -> list[Role]:
         """Return one role for each image, in display order; ``width`` and ``height`` are the projector's [px].

@@ -50,22 +50,22 @@ def with_lenses(path: Path, table: dict[str, Any]) -> dict[str, Any]:
     return out
 
 
-def _lens(path: Path, place: str, eye: Any, shared: Any) -> Any:
+def _lens(path: Path, field: str, eye: Any, shared: Any) -> Any:
     if not isinstance(eye, dict):
         return eye
     for key, meant in _MEANT.items():
         if key in eye:
             allowed = "the keys in docs/reference/formats"
-            raise InputError(path, f"{place}.{key}", "an unknown key", allowed, f"write {meant}")
+            raise InputError(path, f"{field}.{key}", "an unknown key", allowed, f"write {meant}")
     if "focal_mm" not in eye:
         return eye
     if "focal_px" in eye:
-        raise InputError(path, f"{place}.focal_mm", "focal_mm beside focal_px", "one of the two")
+        raise InputError(path, f"{field}.focal_mm", "focal_mm beside focal_px", "one of the two")
     pixel = eye.get("pixel_um", shared)
     if pixel is None:
         hint = "or focal_px in place of focal_mm"
-        raise InputError(path, f"{place}.pixel_um", "nothing", "the pixel pitch that belongs to focal_mm, in um", hint)
-    focal, pitch = _pair(path, f"{place}.focal_mm", eye["focal_mm"]), _pair(path, f"{place}.pixel_um", pixel)
+        raise InputError(path, f"{field}.pixel_um", "nothing", "the pixel pitch that belongs to focal_mm, in um", hint)
+    focal, pitch = _pair(path, f"{field}.focal_mm", eye["focal_mm"]), _pair(path, f"{field}.pixel_um", pixel)
     made = {key: value for key, value in eye.items() if key not in ("focal_mm", "pixel_um")}
     made["focal_px"] = [1000.0 * f / p for f, p in zip(focal, pitch, strict=True)]
     sizes = [made.get(key) for key in ("width", "height")]
@@ -77,7 +77,9 @@ def _lens(path: Path, place: str, eye: Any, shared: Any) -> Any:
 def _pair(path: Path, field: str, value: Any) -> tuple[float, float]:
     """Return one length as a pair, or the pair along x and y."""
     values = value if isinstance(value, list) else [value, value]
-    numbers = [one for one in values if isinstance(one, int | float) and not isinstance(one, bool) and one > 0]
+    numbers = [
+        number for number in values if isinstance(number, int | float) and not isinstance(number, bool) and number > 0
+    ]
     if len(values) != 2 or len(numbers) != 2:
         raise InputError(path, field, repr(value), "a number over 0, or two of them along x and y")
     return float(numbers[0]), float(numbers[1])

@@ -200,18 +200,18 @@ def value(code: LightCode, role: Role, coordinate: NDArray[np.floating]) -> NDAr
 
     The coordinate may lie between pixel centres. For white and black only its shape matters.
     """
-    place = np.asarray(coordinate, np.float64) + 0.5
+    position = np.asarray(coordinate, np.float64) + 0.5
     match role.kind:
         case "white":
-            return np.ones_like(place)
+            return np.ones_like(position)
         case "black" | "unused":
-            return np.zeros_like(place)
+            return np.zeros_like(position)
         case "phase":
             assert not isinstance(code, GrayCode)
-            return np.asarray(code.mean + code.contrast * np.cos(2 * np.pi * place / role.period - role.shift))
+            return np.asarray(code.mean + code.contrast * np.cos(2 * np.pi * position / role.period - role.shift))
         case _:
             # bit i of s ^ (s >> 1): of every four stripes of bit i, each role.period wide, the middle two are lit
-            quarters = (np.floor((place + role.offset) / role.period) + 1) / 4
+            quarters = (np.floor((position + role.offset) / role.period) + 1) / 4
             lit = quarters - np.floor(quarters) >= 0.5
             return np.asarray(lit if role.kind == "gray" else ~lit, np.float64)
 

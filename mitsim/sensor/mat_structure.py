@@ -153,8 +153,8 @@ class _Bytes:
     order: str
     most: int
 
-    def fault(self, found: str) -> InputError:
-        return InputError(self.file, "", f"a damaged file: {found}", _KIND, "save it again, with the option -v7")
+    def fault(self, damage: str) -> InputError:
+        return InputError(self.file, "", f"a damaged file: {damage}", _KIND, "save it again, with the option -v7")
 
     def element(self, data: memoryview) -> tuple[int, memoryview, memoryview]:
         """Return type and content of the first element, and the bytes after it."""
@@ -174,9 +174,9 @@ class _Bytes:
 
 
 def _check_variables(read: _Bytes, data: bytes) -> None:
-    rest, total = memoryview(data)[128:], 0
-    while len(rest):
-        kind, content, rest = read.element(rest)
+    remainder, total = memoryview(data)[128:], 0
+    while len(remainder):
+        kind, content, remainder = read.element(remainder)
         if kind == _Type.COMPRESSED:
             try:
                 unpacked = inflated(content, 8 * read.most, ZLIB)
@@ -198,7 +198,7 @@ def _check_matrix(read: _Bytes, data: memoryview, depth: int) -> int:
         raise read.fault(f"values nested over {_DEEPEST} deep")
     if not len(data):  # an empty cell
         return 0
-    kind, flags, rest = read.element(data)
+    kind, flags, remainder = read.element(data)
     if kind != _Type.UINT32 or len(flags) != 8:
         raise read.fault("a variable without its class")
     word = struct.unpack_from(f"{read.order}I", flags)[0]
@@ -206,36 +206,36 @@ def _check_matrix(read: _Bytes, data: memoryview, depth: int) -> int:
     array = word & 0xFF
     if array == _Class.OPAQUE:  # an object: three names, and the bytes that only MATLAB can read
         inside = 0
-        while len(rest):
-            kind, content, rest = read.element(rest)
+        while len(remainder):
+            kind, content, remainder = read.element(remainder)
             if kind == _Type.MATRIX:
                 inside += _check_matrix(read, content, depth + 1)
             elif kind not in _NAMES:
                 raise read.fault("an object without a class")
         return inside
-    kind, sides, rest = read.element(rest)
+    kind, sides, remainder = read.element(remainder)
     if kind not in _WHOLE or len(sides) % 4 or not 8 <= len(sides) <= 128:
         raise read.fault("a variable without its size")
     shape = struct.unpack(f"{read.order}{len(sides) // 4}i", sides)
     if min(shape) < 0 or math.prod(shape) > read.most:
         raise read.fault(f"a variable of {' x '.join(map(str, shape))}")
-    kind, _, rest = read.element(rest)
+    kind, _, remainder = read.element(remainder)
     if kind not in _NAMES:
         raise read.fault("a variable without a name")
     count = int(math.prod(shape))
     if array in _NUMERIC:
         for _ in range(parts):
-            rest = _check_numbers(read, rest, count)
+            remainder = _check_numbers(read, remainder, count)
     elif array == _Class.CHAR:
-        kind, text, rest = read.element(rest)
+        kind, text, remainder = read.element(remainder)
         if kind not in _TEXT_BYTES or len(text) % _TEXT_BYTES[kind] or len(text) // _TEXT_BYTES[kind] > 4 * count:
             raise read.fault("text of the wrong type or length")
     elif array == _Class.SPARSE:
-        _check_sparse(read, rest, shape, parts)
+        _check_sparse(read, remainder, shape, parts)
     elif array in (_Class.CELL, _Class.STRUCT, _Class.OBJECT, _Class.FUNCTION):
-        rest = _check_fields(read, rest, array)
-        while len(rest):
-            kind, content, rest = read.element(rest)
+        remainder = _check_fields(read, remainder, array)
+        while len(remainder):
+            kind, content, remainder = read.element(remainder)
             if kind != _Type.MATRIX:
                 raise read.fault(f"an element of type {kind} in place of a value")
             count += _check_matrix(read, content, depth + 1)
@@ -245,12 +245,12 @@ def _check_matrix(read: _Bytes, data: memoryview, depth: int) -> int:
 
 
 def _check_numbers(read: _Bytes, data: memoryview, count: int) -> memoryview:
-    kind, numbers, rest = read.element(data)
+    kind, numbers, remainder = read.element(data)
     if kind not in _BYTES:
         raise read.fault(f"numbers of type {kind}")
     if len(numbers) != count * _BYTES[kind]:
         raise read.fault(f"{len(numbers) / _BYTES[kind]:g} numbers in place of {count}")
-    return rest
+    return remainder
 
 
 def _check_fields(read: _Bytes, data: memoryview, array: int) -> memoryview:
@@ -272,13 +272,13 @@ def _check_sparse(read: _Bytes, data: memoryview, shape: tuple[int, ...], parts:
     """Check the row indices and the column starts of a sparse matrix: they are addresses in its arrays."""
     if len(shape) != 2:
         raise read.fault("a sparse matrix of more than two dimensions")
-    found = []
+    index_arrays = []
     for _ in range(2):
         kind, content, data = read.element(data)
         if kind not in _WHOLE or len(content) % 4:
             raise read.fault("a sparse matrix without its indices")
-        found.append(struct.unpack(f"{read.order}{len(content) // 4}i", content))
-    rows, starts = found
+        index_arrays.append(struct.unpack(f"{read.order}{len(content) // 4}i", content))
+    rows, starts = index_arrays
     rising = all(a <= b for a, b in pairwise(starts))
     if len(starts) != shape[1] + 1 or starts[0] != 0 or not rising or starts[-1] > len(rows):
         raise read.fault("a sparse matrix whose columns do not follow one another")

@@ -120,9 +120,9 @@ def delayed(
     The images of a frequency are w + c cos(delta) + d sin(delta) for any mix of light paths. A delay rotates (c, d).
     """
     out = np.empty_like(light)
-    each = light.reshape(-1, code.steps, *light.shape[1:])
-    turned = out.reshape(each.shape)
-    for images, result, frequency in zip(each, turned, code.frequencies_hz, strict=True):
+    by_frequency = light.reshape(-1, code.steps, *light.shape[1:])
+    turned = out.reshape(by_frequency.shape)
+    for images, result, frequency in zip(by_frequency, turned, code.frequencies_hz, strict=True):
         mean = images.mean(axis=0)
         across = np.tensordot(2 / code.steps * np.sin(code.delays), images, axes=1)
         along = np.tensordot(2 / code.steps * np.cos(code.delays), images, axes=1)

@@ -36,8 +36,8 @@ class Noise:
     @classmethod
     def only(cls, *names: str) -> Noise:
         """Return noise with these sources only."""
-        known = _sources(names, "noise")
-        return cls(**{field.name: field.name in known for field in fields(cls)})
+        sources = _sources(names, "noise")
+        return cls(**{field.name: field.name in sources for field in fields(cls)})
 
     @classmethod
     def without(cls, *names: str) -> Noise:
@@ -72,8 +72,8 @@ class Noise:
 
 
 def _sources(names: list[str] | tuple[str, ...], where: str) -> list[str]:
-    known = [field.name for field in fields(Noise)]
+    sources = [field.name for field in fields(Noise)]
     for name in names:
-        if name not in known:
-            raise InputError(where, "", repr(name), ", ".join(known), nearest(name, known))
+        if name not in sources:
+            raise InputError(where, "", repr(name), ", ".join(sources), nearest(name, sources))
     return list(names)

@@ -113,11 +113,11 @@ def with_calibration(
     out = dict(table)
     out["cameras"] = {}
     for index, name in enumerate(calibration_table.cameras):
-        own = _own(table, "cameras", name)
-        out["cameras"][name] = _eye(values, name, min(index, 1), own) | own
+        sensor_keys = _own(table, "cameras", name)
+        out["cameras"][name] = _eye(values, name, min(index, 1), sensor_keys) | sensor_keys
     if calibration_table.projector:
-        own = _own(table, "projector")
-        out["projector"] = _eye(values, "projector", 2, own) | own
+        sensor_keys = _own(table, "projector")
+        out["projector"] = _eye(values, "projector", 2, sensor_keys) | sensor_keys
     if values.missing:
         raise values.all_missing()
     straight = [
@@ -134,7 +134,7 @@ def _sized(table: dict[str, Any], size: tuple[int, int] | None) -> dict[str, Any
     if size is None or not isinstance(cameras, dict):
         return table
     width_height = {"width": size[0], "height": size[1]}
-    sized = {name: width_height | each if isinstance(each, dict) else each for name, each in cameras.items()}
+    sized = {name: width_height | camera if isinstance(camera, dict) else camera for name, camera in cameras.items()}
     return table | {"cameras": sized}
 
 
@@ -146,7 +146,9 @@ def has_pair(tree: CalibrationTree) -> bool:
     InputError
         If the files contradict one another.
     """
-    return all(any(tree.find(key) for key in USUAL_NAMES[what][1]) for what in ("matrix", "rotation", "translation"))
+    return all(
+        any(tree.find(key) for key in USUAL_NAMES[quantity][1]) for quantity in ("matrix", "rotation", "translation")
+    )
 
 
 def _with_files_of_ros(
@@ -203,37 +205,42 @@ class _Values:
         self.by_columns = False
 
     def find(
-        self, name: str, place: int, what: str, shapes: tuple[tuple[int, ...], ...], needed: bool = True
+        self, name: str, index: int, quantity: str, shapes: tuple[tuple[int, ...], ...], needed: bool = True
     ) -> Found | None:
         """Return one value of an eye as an array of one of the shapes; None if it is missing."""
         keys = self.calibration_table.keys.get(name, EyeKeys())
-        given = getattr(keys, what)
-        names = (given,) if given else USUAL_NAMES[what][place]
-        if keys.matrix and (what == "matrix" or not given):
-            names = (*(f"+{what} of {each}" for each in (keys.matrix, keys.matrix.rpartition(".")[0])), *names)
-        if keys.file and what in ("matrix", "distortion", "size"):
+        stated_name = getattr(keys, quantity)
+        names = (stated_name,) if stated_name else USUAL_NAMES[quantity][index]
+        if keys.matrix and (quantity == "matrix" or not stated_name):
+            names = (
+                *(f"+{quantity} of {map_name}" for map_name in (keys.matrix, keys.matrix.rpartition(".")[0])),
+                *names,
+            )
+        if keys.file and quantity in ("matrix", "distortion", "size"):
             # a file of one eye uses the names of a single camera
-            names = tuple(f"{keys.file}:{key}" for key in ((given,) if given else names + USUAL_NAMES[what][0]))
-        elif place == 2 and len(self.calibration_table.cameras) == 2 and not given:
+            names = tuple(
+                f"{keys.file}:{key}" for key in ((stated_name,) if stated_name else names + USUAL_NAMES[quantity][0])
+            )
+        elif index == 2 and len(self.calibration_table.cameras) == 2 and not stated_name:
             # R and T are those of the second camera
-            names = tuple(key for key in names if key not in USUAL_NAMES[what][1])
+            names = tuple(key for key in names if key not in USUAL_NAMES[quantity][1])
         for key in names:
-            found = self.tree.find(key)
-            if found is not None and (key == given or what == "size" or not isinstance(found.value, dict)):
-                value = size_of(found.value) if what == "size" and isinstance(found.value, dict) else found.value
-                return replace(found, value=numbers_of(value, found.file, found.name, shapes))
-        if needed or given:
-            self.missing.append((name, what, names))
+            match = self.tree.find(key)
+            if match is not None and (key == stated_name or quantity == "size" or not isinstance(match.value, dict)):
+                value = size_of(match.value) if quantity == "size" and isinstance(match.value, dict) else match.value
+                return replace(match, value=numbers_of(value, match.file, match.name, shapes))
+        if needed or stated_name:
+            self.missing.append((name, quantity, names))
         return None
 
     def all_missing(self) -> InputError:
         """Return one error that names all missing values."""
         files = ", ".join(dict.fromkeys(str(file) for file in self.tree.files))
-        found = "; ".join(_some([key for key in names if "+" not in key]) for _, _, names in self.missing)
-        allowed = ", ".join(f"the {what} of {name}" for name, what, _ in self.missing)
-        keys = "; ".join(f"in [calibration.keys.{name}], as {what}" for name, what, _ in self.missing)
-        known = ", ".join(self.tree.names()[:20])
-        return InputError(files, found, "nothing", allowed, f"the file has {known}: give the name to use {keys}")
+        missing = "; ".join(_some([key for key in names if "+" not in key]) for _, _, names in self.missing)
+        allowed = ", ".join(f"the {quantity} of {name}" for name, quantity, _ in self.missing)
+        keys = "; ".join(f"in [calibration.keys.{name}], as {quantity}" for name, quantity, _ in self.missing)
+        candidates = ", ".join(self.tree.names()[:20])
+        return InputError(files, missing, "nothing", allowed, f"the file has {candidates}: give the name to use {keys}")
 
 
 def _some(names: list[str]) -> str:
@@ -241,27 +248,27 @@ def _some(names: list[str]) -> str:
     return " or ".join([*names[:4], *(["another usual name"] if len(names) > 4 else [])])
 
 
-def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[str, Any]:
-    """Return the keys of an ``OpticsTable``; ``place`` 0 is the first camera, 1 the second, 2 the projector.
+def _eye(values: _Values, name: str, index: int, sensor_keys: dict[str, Any]) -> dict[str, Any]:
+    """Return the keys of an ``OpticsTable``; ``index`` 0 is the first camera, 1 the second, 2 the projector.
 
-    The sensor file's ``own`` keys may be missing in the calibration.
+    Keys in ``sensor_keys``, of the sensor file, may be missing in the calibration.
     """
     calibration_table, file = values.calibration_table, ", ".join(dict.fromkeys(map(str, values.tree.files)))
-    matrix = values.find(name, place, "matrix", ((3, 3), (9,)), needed="focal_px" not in own)
+    matrix = values.find(name, index, "matrix", ((3, 3), (9,)), needed="focal_px" not in sensor_keys)
     table = {} if matrix is None else matrix.table
     values.tables.append(table)
-    found = values.find(name, place, "distortion", ((0,), (4,), (5,), (8,), (12,), (14,)), needed=False)
-    distortion = np.empty(0) if found is None else found.value
+    match = values.find(name, index, "distortion", ((0,), (4,), (5,), (8,), (12,), (14,)), needed=False)
+    distortion = np.empty(0) if match is None else match.value
     model = None
-    if place < 2:
+    if index < 2:
         stating = file if matrix is None else matrix.file
         model = lens_model(table, stating, calibration_table.model, not distortion.any()) or calibration_table.model
-    if place < 2 and model is None and (note := lens_note(name, distortion)):
+    if index < 2 and model is None and (note := lens_note(name, distortion)):
         values.notes.append(f"calibration {file}: {note}")
     model = model or "perspective"
     if model == "fisheye" and len(distortion) not in (0, 4):
         raise InputError(file, f"distortion of {name}", f"{len(distortion)} numbers", "4, as of a fisheye lens")
-    size = _size(values, name, place, table)
+    size = _size(values, name, index, table)
     out: dict[str, Any] = {"model": model, "distortion": distortion.tolist()}
     if matrix is not None:
         K, by_columns = by_rows(matrix.value)
@@ -270,57 +277,59 @@ def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[st
         if by_columns:
             values.notes.append(f"calibration {matrix.file.name}: {name}: its matrix is written by columns")
         read_out = read_out_of(table, matrix.file)
-        width, height = own.get("width"), own.get("height")
+        width, height = sensor_keys.get("width"), sensor_keys.get("height")
         stated = (width, height) if isinstance(width, int) and isinstance(height, int) else None
         if read_out is not None:
             K, size, note = of_images(K, size, read_out, stated or values.size)
             if note:
                 values.notes.append(f"calibration {matrix.file.name}: {name}: {note}")
         seen = stated or size or values.size
-        if place < 2 and read_out is None and seen and (note := principal_note(name, K, seen)):
+        if index < 2 and read_out is None and seen and (note := principal_note(name, K, seen)):
             values.notes.append(f"calibration {matrix.file.name}: {note}")
         out |= {"focal_px": [float(K[0, 0]), float(K[1, 1])], "principal_px": [float(K[0, 2]), float(K[1, 2])]}
     if size is not None:
         out |= {"width": size[0], "height": size[1]}
-    return out | (_pose(values, name, place, own) if place > 0 else {})
+    return out | (_pose(values, name, index, sensor_keys) if index > 0 else {})
 
 
-def _size(values: _Values, name: str, place: int, table: dict[str, Any]) -> tuple[int, int] | None:
+def _size(values: _Values, name: str, index: int, table: dict[str, Any]) -> tuple[int, int] | None:
     """Return the image size (width, height) [px] of an eye that the files state; None without one.
 
     ``table`` has the matrix of the eye; a width and height beside the matrix come first.
     """
-    size = values.find(name, place, "size", ((2,),), needed=False)
+    size = values.find(name, index, "size", ((2,),), needed=False)
     if size is not None:
         return int(size.value[0]), int(size.value[1])
     beside = size_of(table)
     own_file = values.calibration_table.keys.get(name, EyeKeys()).file
-    if beside is not None and (place < 2 or own_file or table is not values.tables[0]):
+    if beside is not None and (index < 2 or own_file or table is not values.tables[0]):
         return int(beside[0]), int(beside[1])
-    if place == 2 and not own_file:
+    if index == 2 and not own_file:
         return None
     sides = [values.tree.find(f"{own_file}:{key}" if own_file else key) for key in ("image_width", "image_height")]
     if sides[0] is None or sides[1] is None:
         return None
-    width, height = (numbers_of([each.value], each.file, "image_width", ((1,),)) for each in sides if each)
+    width, height = (numbers_of([side.value], side.file, "image_width", ((1,),)) for side in sides if side)
     return int(width[0]), int(height[0])
 
 
-def _pose(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[str, Any]:
+def _pose(values: _Values, name: str, index: int, sensor_keys: dict[str, Any]) -> dict[str, Any]:
     """Return the keys of the pose of a second eye: of R and T, or of the rectifications of a pair of ROS."""
     file = ", ".join(dict.fromkeys(map(str, values.tree.files)))
     pair = rectified_pair(values.tables[0], values.tables[-1])
     needed = pair is None
     motions = ((4, 4), (3, 4))
     shapes = ((3, 3), (9,), (3,), (3, 1), (1, 3), (4,), (4, 1), (1, 4), *motions)
-    rotation = values.find(name, place, "rotation", shapes, needed and "rotation_deg" not in own)
-    translation = values.find(name, place, "translation", ((3,), *motions), needed and "position_mm" not in own)
+    rotation = values.find(name, index, "rotation", shapes, needed and "rotation_deg" not in sensor_keys)
+    translation = values.find(name, index, "translation", ((3,), *motions), needed and "position_mm" not in sensor_keys)
     if rotation is not None and translation is not None:
         R, T = rotation.value, translation.value
-        for found in (rotation, translation):
-            if not is_motion(found.value):
+        for motion in (rotation, translation):
+            if not is_motion(motion.value):
                 hint = "write it by rows, the translation in the last column"
-                raise InputError(found.file, found.name, found.value.tolist(), "4 x 4 with the last row 0 0 0 1", hint)
+                raise InputError(
+                    motion.file, motion.name, motion.value.tolist(), "4 x 4 with the last row 0 0 0 1", hint
+                )
         if R.size == 4:
             allowed = f"a rotation matrix or vector, or {ORDERED}"
             raise InputError(rotation.file, rotation.name, f"four numbers, {R.ravel().tolist()}", allowed)
@@ -331,12 +340,12 @@ def _pose(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[s
     else:
         return {}
     R = rotation_matrix(R, name, file, values.by_columns and rotation is not None)
-    given = values.calibration_table.to_mm
-    T = T * (given or stated or 1.0)
-    if given is not None and stated is not None and given != stated:
-        values.notes.append(f"calibration: to_mm = {given:g} is used, though the file states {stated:g} mm")
+    to_mm = values.calibration_table.to_mm
+    T = T * (to_mm or stated or 1.0)
+    if to_mm is not None and stated is not None and to_mm != stated:
+        values.notes.append(f"calibration: to_mm = {to_mm:g} is used, though the file states {stated:g} mm")
     baseline = float(np.linalg.norm(T))
-    of_mc_calib = translation is not None and given is stated is None and "camera_pose_matrix" in translation.name
+    of_mc_calib = translation is not None and to_mm is stated is None and "camera_pose_matrix" in translation.name
     doubt = board_unit_note if of_mc_calib else baseline_note
     for note in (doubt(name, baseline), facing_note(name, R)):
         if note:

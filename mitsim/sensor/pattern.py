@@ -94,12 +94,12 @@ def dot_frames(pattern: DotPattern, width: int, height: int) -> NDArray[np.float
             width, height, pattern.cell_px, pattern.places, pattern.spot_px, pattern.tiles, pattern.seed
         )
         return spots[None]
-    given = (pattern.run_length_px, pattern.bright_share, pattern.blur_px, pattern.seed)
+    arguments = (pattern.run_length_px, pattern.bright_share, pattern.blur_px, pattern.seed)
     if not pattern.shifts_px:
-        return random_blobs(width, height, *given)[None]
+        return random_blobs(width, height, *arguments)[None]
     # the mask exceeds the field, so that a shift does not wrap around
     margin = int(np.ceil(np.abs(pattern.shifts_px).max())) + 1
-    mask = random_blobs(width + 2 * margin, height + 2 * margin, *given)
+    mask = random_blobs(width + 2 * margin, height + 2 * margin, *arguments)
     return np.stack([_cut(mask, margin - right, margin - down, width, height) for right, down in pattern.shifts_px])
 
 
@@ -177,7 +177,7 @@ def _spots(
     near_row, near_column = np.rint(rows).astype(int), np.rint(columns).astype(int)
     steps = np.arange(-reach, reach + 1)
     inside = (near_row <= height) & (near_column <= width)
-    near_row, near_column, rows, columns = (each[inside] for each in (near_row, near_column, rows, columns))
+    near_row, near_column, rows, columns = (array[inside] for array in (near_row, near_column, rows, columns))
     places_taken = near_row * field.shape[1] + near_column
     apart = len(np.unique(places_taken)) == len(places_taken)  # then indices do not repeat, which is faster
     falls = [np.exp(-0.5 * ((near_column + j - columns) / spot_px) ** 2) for j in steps]

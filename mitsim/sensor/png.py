@@ -106,5 +106,5 @@ def is_grey_png(data: bytes) -> bool:
     return data[25] == 0
 
 
-def _damaged(where: str | Path, how: str) -> InputError:
-    return InputError(where, "", f"a damaged PNG ({how})", "a complete PNG: copy the file again")
+def _damaged(where: str | Path, damage: str) -> InputError:
+    return InputError(where, "", f"a damaged PNG ({damage})", "a complete PNG: copy the file again")

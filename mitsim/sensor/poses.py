@@ -54,8 +54,8 @@ def look_at(
     >>> print(pose.points([[0.0, 0.0, 500.0]]).round(6) + 0.0)
     [[0. 0. 0.]]
     """
-    for name, given in (("position", position), ("target", target), ("up", up)):
-        array = np.asarray(given, float)
+    for name, coordinates in (("position", position), ("target", target), ("up", up)):
+        array = np.asarray(coordinates, float)
         if array.shape != (3,) or not np.isfinite(array).all():
             raise InputError("look_at", name, array.tolist(), "three numbers [mm]")
     if not np.linalg.norm(np.subtract(position, target)) > 0 or not np.linalg.norm(up) > 0:

@@ -136,7 +136,7 @@ def _assemble(path: Path, table: SensorFile, missing: frozenset[str], notes: tup
         corner_illumination=keys.corner_illumination,
         pixel_gap=keys.pixel_gap,
     )
-    imager = Imager(**{each.name: getattr(written, each.name) for each in fields(Imager)})
+    imager = Imager(**{field.name: getattr(written, field.name) for field in fields(Imager)})
     calibrated = not missing & {"projector.focal_px", "projector.principal_px"}
     return Sensor(
         name=table.name,

@@ -23,10 +23,10 @@ def preset_covariance(sensor: Sensor, drift: Drift | None = None) -> RigCovarian
     """
     path = Path(str(files("mitsim.sensor") / "presets" / "calibrations" / f"{sensor.name}.toml"))
     if not path.is_file():
-        known = sorted(each.stem for each in path.parent.glob("*.toml"))
+        names = sorted(file.stem for file in path.parent.glob("*.toml"))
         hint = f"make one: mitsim calibrate {sensor.name}.toml -o {sensor.name}-calibration.toml"
         raise InputError(
-            "sensor", "name", repr(sensor.name), f"a sensor that comes calibrated: {', '.join(known)}", hint
+            "sensor", "name", repr(sensor.name), f"a sensor that comes calibrated: {', '.join(names)}", hint
         )
     covariance = read_rig_covariance(path, sensor.rig)
     return with_drift(covariance, sensor.rig, Drift() if drift is None else drift)

@@ -188,7 +188,7 @@ def read_images(folder: Path, width: int, height: int) -> ProjectorImages:
             found = f"{image.shape[1]} x {image.shape[0]} px"
             raise InputError(path, "size", found, f"{width} x {height} px, as [projector] of the sensor file has")
         if image.dtype != images[0].dtype:
-            found, allowed = (f"{8 * one.itemsize} bits" for one in (image, images[0]))
+            found, allowed = (f"{8 * array.itemsize} bits" for array in (image, images[0]))
             raise InputError(path, "depth", found, f"{allowed}, as {paths[0].name}")
     return checked_images(np.stack(images), width, height, str(folder))
 

@@ -35,6 +35,6 @@ class PublishedNoise(Document):
     def at(self, distance_mm: ArrayLike) -> NDArray[np.float64]:
         """Interpolate sigma [mm] at distances [mm], linearly in the logarithms; NaN outside the given ones."""
         with np.errstate(divide="ignore"):
-            x, known = np.log(np.asarray(distance_mm, float)), np.log(self.distance_mm)
-        inside = (x >= known[0] - 1e-9) & (x <= known[-1] + 1e-9)
-        return np.asarray(np.where(inside, np.exp(np.interp(x, known, np.log(self.sigma_mm))), np.nan))
+            x, knots = np.log(np.asarray(distance_mm, float)), np.log(self.distance_mm)
+        inside = (x >= knots[0] - 1e-9) & (x <= knots[-1] + 1e-9)
+        return np.asarray(np.where(inside, np.exp(np.interp(x, knots, np.log(self.sigma_mm))), np.nan))

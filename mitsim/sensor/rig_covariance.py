@@ -133,12 +133,12 @@ def _check_nominal(path: str | Path, rig: Rig, names: tuple[str, ...], nominal: 
     if without or beyond:
         field = ", ".join((without + beyond)[:6])
         raise InputError(path, f"nominal: {field}", "other parameters", "the parameters of [one_sigma], each once")
-    own = parameter_values(rig, names)
-    given = np.array([nominal[name] for name in names])
-    other = np.flatnonzero(~np.isclose(given, own, rtol=1e-6, atol=1e-9))
+    rig_values = parameter_values(rig, names)
+    nominal_values = np.array([nominal[name] for name in names])
+    other = np.flatnonzero(~np.isclose(nominal_values, rig_values, rtol=1e-6, atol=1e-9))
     if len(other):
-        found = ", ".join(f"{names[i]} {given[i]:.8g}" for i in other[:4])
-        allowed = ", ".join(f"{own[i]:.8g}" for i in other[:4]) + ", the nominal values of this rig"
+        found = ", ".join(f"{names[i]} {nominal_values[i]:.8g}" for i in other[:4])
+        allowed = ", ".join(f"{rig_values[i]:.8g}" for i in other[:4]) + ", the nominal values of this rig"
         hint = f"{len(other)} of {len(names)} values differ: the covariance belongs to another rig; calibrate this one"
         raise InputError(path, "nominal", found, allowed, hint)
 

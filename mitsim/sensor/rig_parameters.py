@@ -57,8 +57,8 @@ def parameter_names(rig: Rig, projector: bool = True) -> tuple[str, ...]:
     reference = next(iter(rig.cameras))
     names = []
     for eye, camera in eyes(rig, projector).items():
-        own = (*MATRIX_NAMES, *distortion_names(camera), *(() if eye == reference else POSE_NAMES))
-        names += [f"{eye}.{name}" for name in own]
+        eye_names = (*MATRIX_NAMES, *distortion_names(camera), *(() if eye == reference else POSE_NAMES))
+        names += [f"{eye}.{name}" for name in eye_names]
     return tuple(names)
 
 
@@ -71,10 +71,10 @@ def distortion_names(camera: Camera) -> tuple[str, ...]:
     """Return the names of the distortion coefficients that a camera's model estimates."""
     if camera.model == "fisheye":
         return FISHEYE_NAMES
-    given = PERSPECTIVE_NAMES[: len(camera.distortion)]
-    values = dict(zip(given, camera.distortion, strict=True))
+    names = PERSPECTIVE_NAMES[: len(camera.distortion)]
+    values = dict(zip(names, camera.distortion, strict=True))
     used = [group for group in _GROUPS if any(values.get(name, 0.0) != 0 for name in group)]
-    return (*given[:5], *(name for group in used for name in group))
+    return (*names[:5], *(name for group in used for name in group))
 
 
 def parameter_values(rig: Rig, names: Sequence[str]) -> NDArray[np.float64]:
@@ -135,17 +135,19 @@ def path_error(names: Sequence[str], values: ArrayLike) -> tuple[float, float]:
 
     The sensor reports the distance along the ray ``offset + (1 + scale) * distance``.
     """
-    found = dict(zip(names, np.asarray(values, float).reshape(-1), strict=True))
-    return float(found.get("path.offset_mm", 0.0)), float(found.get("path.scale", 0.0))
+    by_name = dict(zip(names, np.asarray(values, float).reshape(-1), strict=True))
+    return float(by_name.get("path.offset_mm", 0.0)), float(by_name.get("path.scale", 0.0))
 
 
 def check_names(rig: Rig, names: Sequence[str], where: str = "parameters") -> None:
     """Raise an :class:`InputError` listing all names that are no parameter of the rig, or that occur twice."""
-    known = [*parameter_names(rig), *PATH_NAMES]
-    unknown = [name for name in names if name not in known]
+    rig_names = [*parameter_names(rig), *PATH_NAMES]
+    unknown = [name for name in names if name not in rig_names]
     if unknown:
-        allowed = f"{', '.join(known[:4])}, ... ({len(known)} of them: {', '.join(eyes(rig))})"
-        raise InputError(where, ", ".join(unknown[:8]), "no parameter of this rig", allowed, nearest(unknown[0], known))
+        allowed = f"{', '.join(rig_names[:4])}, ... ({len(rig_names)} of them: {', '.join(eyes(rig))})"
+        raise InputError(
+            where, ", ".join(unknown[:8]), "no parameter of this rig", allowed, nearest(unknown[0], rig_names)
+        )
     twice = sorted({name for name in names if list(names).count(name) > 1})
     if twice:
         raise InputError(where, ", ".join(twice[:8]), "a parameter named twice", "each parameter once")
@@ -177,11 +179,11 @@ def _moved_camera(camera: Camera, steps: dict[str, float]) -> Camera:
         elif parameter not in POSE_NAMES:
             distortion[_distortion_order(camera).index(parameter)] += step
     pose = np.array([steps.get(name, 0.0) for name in POSE_NAMES])
-    place = camera.sensor_from_camera
+    frame = camera.sensor_from_camera
     if pose.any():
-        turned = place.rotation @ Rotation.from_rotvec(pose[:3]).as_matrix()
-        place = Transform(turned, place.translation + pose[3:])
-    return replace(camera, matrix=matrix, distortion=distortion, sensor_from_camera=place)
+        turned = frame.rotation @ Rotation.from_rotvec(pose[:3]).as_matrix()
+        frame = Transform(turned, frame.translation + pose[3:])
+    return replace(camera, matrix=matrix, distortion=distortion, sensor_from_camera=frame)
 
 
 def _distortion_order(camera: Camera) -> tuple[str, ...]:

@@ -75,7 +75,7 @@ class OpticsTable(Document):
             raise ValueError(f"at most {MOST_PIXELS:,} pixels, not {self.width} x {self.height}")
         if not np.isnan([*self.focal_px, *self.principal_px]).any() and self.width and self.height:
             check_intrinsics(self.focal_px, self.principal_px, self.width, self.height)
-        if not all(abs(place) <= 1e5 for place in self.position_mm):
+        if not all(abs(coordinate) <= 1e5 for coordinate in self.position_mm):
             raise ValueError("position_mm within 100 m of the sensor's frame")
         return self
 
@@ -87,8 +87,8 @@ class OpticsTable(Document):
         distortion = np.array([*self.distortion, *[0.0] * max(0, least - len(self.distortion))])
         if len(distortion) > 5:  # OpenCV takes 4, 5, 8, 12 or 14 coefficients
             distortion = np.concatenate([distortion, np.zeros(14 - len(distortion))])
-        place = Transform.from_degrees(self.rotation_deg, self.position_mm)
-        return Camera(matrix, distortion, self.width, self.height, place, self.model)
+        pose = Transform.from_degrees(self.rotation_deg, self.position_mm)
+        return Camera(matrix, distortion, self.width, self.height, pose, self.model)
 
 
 class ProjectorTable(OpticsTable):
@@ -327,10 +327,10 @@ def absent_keys(table: dict[str, Any], keys: Iterable[str]) -> tuple[str, ...]:
 
 
 def _has(table: Any, key: str) -> bool:
-    first, _, rest = key.partition(".")
+    first, _, remainder = key.partition(".")
     if not isinstance(table, dict):
         return True  # a wrong type, which the model reports
-    return first in table and (not rest or _has(table[first], rest))
+    return first in table and (not remainder or _has(table[first], remainder))
 
 
 def with_depths(table: dict[str, Any]) -> dict[str, Any]:

@@ -98,9 +98,9 @@ def _speckles_in_square(width: float) -> float:
     if width > _WIDEST:
         return _speckles_in_square(_WIDEST) * (width / _WIDEST) ** 2
     nodes, weights = np.polynomial.legendre.leggauss(_NODES + 4 * int(width))
-    places = (nodes + 1) / 2
-    shares = weights / 2 * (1 - places)  # of pairs of points of the pixel, by their distance along an axis
-    argument = np.maximum(np.pi * width * np.hypot(places, places[:, None]), 1e-9)
+    distances = (nodes + 1) / 2
+    shares = weights / 2 * (1 - distances)  # of pairs of points of the pixel, by their distance along an axis
+    argument = np.maximum(np.pi * width * np.hypot(distances, distances[:, None]), 1e-9)
     return float(1 / (4 * shares @ (2 * j1(argument) / argument) ** 2 @ shares))
 
 
@@ -236,23 +236,23 @@ def _kernel(size_px: float) -> NDArray[np.float32]:
 
 def _gamma_of_normal(normal: NDArray[np.float32], contrast: NDArray[np.float32]) -> NDArray[np.float32]:
     """Map normal variables to gamma variables of mean 1 and standard deviation ``contrast`` at equal quantiles."""
-    place = np.clip(normal, -_REACH, _REACH)
-    place += np.float32(_REACH)
-    place *= np.float32(_STEPS / (2 * _REACH))
-    step = np.minimum(place.astype(np.int32), _STEPS - 1)
-    place -= step
+    position = np.clip(normal, -_REACH, _REACH)
+    position += np.float32(_REACH)
+    position *= np.float32(_STEPS / (2 * _REACH))
+    step = np.minimum(position.astype(np.int32), _STEPS - 1)
+    position -= step
     if contrast.ndim == 0:
         table = _quantiles(float(contrast))
-        return np.asarray(table[step] * (1 - place) + table[step + 1] * place)
+        return np.asarray(table[step] * (1 - position) + table[step + 1] * position)
     tables = _all_quantiles()
-    row_place = contrast * np.float32(_CONTRASTS - 1)
-    row = np.minimum(row_place.astype(np.int32), _CONTRASTS - 2)
-    row_place -= row
+    row_position = contrast * np.float32(_CONTRASTS - 1)
+    row = np.minimum(row_position.astype(np.int32), _CONTRASTS - 2)
+    row_position -= row
     step += row * (_STEPS + 1)
-    low = tables[step] * (1 - place) + tables[step + 1] * place
+    low = tables[step] * (1 - position) + tables[step + 1] * position
     step += _STEPS + 1
-    high = tables[step] * (1 - place) + tables[step + 1] * place
-    return np.asarray(low + row_place * (high - low))
+    high = tables[step] * (1 - position) + tables[step + 1] * position
+    return np.asarray(low + row_position * (high - low))
 
 
 @lru_cache(maxsize=64)

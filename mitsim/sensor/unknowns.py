@@ -106,9 +106,9 @@ class FinishUnknowns(Document):
 
     def centres_and_sizes(self, finish: str) -> dict[str, tuple[float, float]]:
         """Return centre and standard deviation of each property of a finish, in one-sigma ranges of its prior."""
-        given = self.measured.get(finish, MeasuredFinish())
+        measured = self.measured.get(finish, MeasuredFinish())
         names = MeasuredFinish.model_fields
-        return {name: getattr(given, name) or (0.0, float(getattr(self, name))) for name in names}
+        return {name: getattr(measured, name) or (0.0, float(getattr(self, name))) for name in names}
 
     @property
     def varies(self) -> bool:
@@ -263,6 +263,6 @@ def unknowns_of(*tables: UnknownsTable) -> UnknownsTable:
     merged: dict[str, dict[str, Any]] = {}
     for table in tables:
         for group in table.model_fields_set:
-            given = getattr(table, group)
-            merged.setdefault(group, {}).update({key: getattr(given, key) for key in given.model_fields_set})
+            section = getattr(table, group)
+            merged.setdefault(group, {}).update({key: getattr(section, key) for key in section.model_fields_set})
     return UnknownsTable.model_validate(merged)
