@@ -57,8 +57,8 @@ def board_frame(
     FitError
         If the image does not show the board, or the cloud has too few points on it.
     """
-    found, corners = cv2.findChessboardCornersSB(image, (board.columns, board.rows), flags=cv2.CALIB_CB_ACCURACY)
-    if not found:
+    detected, corners = cv2.findChessboardCornersSB(image, (board.columns, board.rows), flags=cv2.CALIB_CB_ACCURACY)
+    if not detected:
         raise FitError(f"no chequerboard of {board.columns} x {board.rows} inner corners in the image")
     pixels = np.asarray(corners, np.float64).reshape(-1, 2)
     hull = cv2.convexHull(pixels.astype(np.float32))

@@ -111,8 +111,8 @@ def load_scene(
     >>> print(scene.finishes[0])
     aluminium/ground Ra 0.2 um
     """
-    given = {name: str(value) for name, value in (definitions or {}).items()}
-    return load.load_scene(path, sensor.wavelength_nm, given, deviation)
+    parameters = {name: str(value) for name, value in (definitions or {}).items()}
+    return load.load_scene(path, sensor.wavelength_nm, parameters, deviation)
 
 
 def prepared_sensor(sensor: Sensor) -> SimulatedSensor:

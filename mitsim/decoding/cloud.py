@@ -157,8 +157,8 @@ def settings_in_words(
     decoder_settings : the settings
     """
     stored, preset = capture.decoding, capture.sensor in presets()
-    known = preset or any((sensor, range_mm, stored.near_mm, stored.range_mm, stored.decoder))
-    assumed = "" if known or not isinstance(settings, MatcherSettings) else ASSUMED_RANGE
+    stated = preset or any((sensor, range_mm, stored.near_mm, stored.range_mm, stored.decoder))
+    assumed = "" if stated or not isinstance(settings, MatcherSettings) else ASSUMED_RANGE
     by = f"settings of {sensor or capture.sensor}"
     if capture.source == "simulated" and not (sensor or stored.decoder or preset):
         by = "default settings, since settings.json has none (add --sensor FILE for those of its sensor)"
@@ -214,8 +214,8 @@ def stored_geometry(capture: Capture, settings: Settings, sensor: Sensor | str |
         return None
     loaded = load_sensor(sensor, "decoding") if isinstance(sensor, str | Path) else sensor
     pattern = None if loaded is None else loaded.pattern
-    known = isinstance(pattern, ProjectorImages) and pattern.description == capture.decoding.pattern
-    return technology_of(capture.technology).geometry(capture.rig, settings, pattern) if known else None
+    same_pattern = isinstance(pattern, ProjectorImages) and pattern.description == capture.decoding.pattern
+    return technology_of(capture.technology).geometry(capture.rig, settings, pattern) if same_pattern else None
 
 
 def unknown_code(where: str, count: int) -> InputError:

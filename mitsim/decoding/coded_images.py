@@ -93,7 +93,7 @@ class CodedImages:
         out: dict[str, dict[Axis, ProjectorCoordinate]] = {}
         for name, stack in self.stacks.items():
             region = self.read_out.get(name)
-            found = decode_coordinates(
+            coordinates = decode_coordinates(
                 stack if region is None else np.ascontiguousarray(stack[:, *region.slices]),
                 self.code,
                 self.size,
@@ -104,8 +104,10 @@ class CodedImages:
             )
             if region is not None:
                 shape = (stack.shape[1], stack.shape[2])
-                found = {axis: each.placed(shape, region.slices) for axis, each in found.items()}
-            out[name] = found
+                coordinates = {
+                    axis: coordinate.placed(shape, region.slices) for axis, coordinate in coordinates.items()
+                }
+            out[name] = coordinates
         return out
 
 

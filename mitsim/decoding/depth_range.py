@@ -119,12 +119,12 @@ def range_warning(
     """
     near, far = (f"{depth:.0f}" for depth in depths)
     extent = f"{near} mm" if near == far else f"{near} to {far} mm"
-    place = f"[{_TABLES.get(type(settings), 'decoder')}] of the sensor file of {sensor}"
+    location = f"[{_TABLES.get(type(settings), 'decoder')}] of the sensor file of {sensor}"
     if sensor is None:
-        place = "settings.json of the capture (mitsim import --range), or decode with --sensor"
+        location = "settings.json of the capture (mitsim import --range), or decode with --sensor"
     return (
         f"{surface} is at a depth of {extent} ({reason}), but the decoder searches {settings.near_mm:g} to "
-        f"{settings.far_mm:g} mm: change near_mm and far_mm in {place}"
+        f"{settings.far_mm:g} mm: change near_mm and far_mm in {location}"
     )
 
 
@@ -148,10 +148,10 @@ def surface_beyond(capture: Capture, cloud: PointCloud, settings: Settings) -> S
     if isinstance(wide, MatcherSettings):
         step = max(2, step)
     try:
-        found = capture_cloud(_coarse_capture(capture, step, binned=isinstance(wide, MatcherSettings)), wide)
+        wide_cloud = capture_cloud(_coarse_capture(capture, step, binned=isinstance(wide, MatcherSettings)), wide)
     except InputError:
         return None
-    depth = _depth(found)
+    depth = _depth(wide_cloud)
     smooth = (depth > 0) & (
         np.abs(depth - median_filter(depth, _NEIGHBOURHOOD_PX, mode="nearest")) < _DEPTH_TOLERANCE * depth
     )

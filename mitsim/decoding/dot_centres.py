@@ -77,9 +77,9 @@ def dot_centres(image: NDArray[np.uint8], dark: bool = True) -> NDArray[np.float
     for diameter in _DIAMETERS:
         if 2 * diameter > min(image.shape):
             break
-        found = _dots_of_diameter(fine, diameter, scale)
-        if len(found) > len(best):
-            best = found
+        centres = _dots_of_diameter(fine, diameter, scale)
+        if len(centres) > len(best):
+            best = centres
     return best
 
 

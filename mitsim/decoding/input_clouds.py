@@ -63,9 +63,9 @@ def cloud_paths(paths: Iterable[Path]) -> list[Path]:
             out.append(path)
             continue
         contained = [
-            one
-            for one in sorted(path.iterdir())
-            if (one / "capture.json").exists() or (one.is_file() and one.suffix.lower() in _SUFFIXES)
+            entry
+            for entry in sorted(path.iterdir())
+            if (entry / "capture.json").exists() or (entry.is_file() and entry.suffix.lower() in _SUFFIXES)
         ]
         # a folder without them may be a recording as its device saved it
         out += contained or [path]

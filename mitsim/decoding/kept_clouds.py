@@ -64,9 +64,9 @@ def kept_cloud(path: Path, settings: Iterable[object], decode: Callable[[], Poin
 
 
 def _folder() -> Path | None:
-    given = os.environ.get("MITSIM_CACHE")
-    if given is not None:
-        return Path(given) / "clouds" if given else None
+    folder = os.environ.get("MITSIM_CACHE")
+    if folder is not None:
+        return Path(folder) / "clouds" if folder else None
     with suppress(RuntimeError):  # no home
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mitsim" / "clouds"
     return None
@@ -77,7 +77,7 @@ def _digest(path: Path, settings: Iterable[object]) -> str | None:
     sha = hashlib.sha256(repr(own_build()).encode())
     for setting in settings:
         sha.update(repr(setting).encode())
-    files = [path] if path.is_file() else sorted(one for one in path.rglob("*") if one.is_file())
+    files = [path] if path.is_file() else sorted(entry for entry in path.rglob("*") if entry.is_file())
     try:
         if len(files) > MOST_FILES or sum(file.stat().st_size for file in files) > _LARGEST:
             return None

@@ -37,13 +37,13 @@ def result_table(results: Sequence[Result]) -> str:
     return "\n".join(aligned(rows))
 
 
-def repeatability_table(found: Sequence[Repeatability]) -> str:
+def repeatability_table(repeatabilities: Sequence[Repeatability]) -> str:
     """Return the table of the repeatability over several clouds, one line for each measurement."""
-    nominal = any(math.isfinite(repeatability.nominal) for repeatability in found)
+    nominal = any(math.isfinite(repeatability.nominal) for repeatability in repeatabilities)
     rows = [
         ["measurement", "n", "mean", "standard deviation", "unit", "u (rms of fits)", *(["error"] if nominal else [])]
     ]
-    for repeatability in found:
+    for repeatability in repeatabilities:
         rows.append(
             [
                 repeatability.name,
@@ -69,7 +69,9 @@ def result_tables(
     if len(paths) == 1:
         tables = [result_table(results[0])]
     else:
-        tables = [f"{path}\n{result_table(found)}\n" for path, found in zip(paths, results, strict=True)]
+        tables = [
+            f"{path}\n{result_table(cloud_results)}\n" for path, cloud_results in zip(paths, results, strict=True)
+        ]
     return "\n".join([*tables, *([repeatability_table(repeatability)] if repeatability else [])])
 
 
@@ -104,15 +106,15 @@ def measured_document(
         ],
         "repeatability": [
             {
-                "name": one.name,
-                "unit": one.unit,
-                "count": one.count,
-                "asked": one.cloud_count,
-                "mean": or_none(one.mean),
-                "standard_deviation": or_none(one.deviation),
-                "fit_uncertainty": or_none(one.uncertainty),
+                "name": quantity.name,
+                "unit": quantity.unit,
+                "count": quantity.count,
+                "asked": quantity.cloud_count,
+                "mean": or_none(quantity.mean),
+                "standard_deviation": or_none(quantity.deviation),
+                "fit_uncertainty": or_none(quantity.uncertainty),
             }
-            for one in repeatability
+            for quantity in repeatability
         ],
     }
 

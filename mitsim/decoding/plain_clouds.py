@@ -92,7 +92,7 @@ def plain_cloud(
     why = why or f"which their median distance of {distance:.4g} suggests; if not, --unit"
     step = float(np.spacing(np.float32(np.nanmax(np.abs(grid)))))
     coarse = f"coordinates kept to {step:.2g} mm: subtract their offset" if step > _COARSE_MM else ""
-    return cloud, "; ".join(each for each in (f"{path.name}: {shape}, in {name}, {why}", note, coarse) if each)
+    return cloud, "; ".join(remark for remark in (f"{path.name}: {shape}, in {name}, {why}", note, coarse) if remark)
 
 
 def _through(points: NDArray[np.float64]) -> ViewGrid:
@@ -126,12 +126,12 @@ def _of_arrays(path: Path, data: bytes, suffix: str) -> NDArray[np.floating]:
         arrays = arrays_of_npz(data, path)
     else:
         arrays = dict(_arrays_in(read_mat(path, data, _MOST_NUMBERS, simplify_cells=True)))
-    found = points_among(arrays)
-    if found is None:
+    points = points_among(arrays)
+    if points is None:
         shapes = ", ".join(f"{name} {' x '.join(map(str, array.shape))}" for name, array in arrays.items())[:200]
         allowed = "an array of n x 3, 3 x n or rows x columns x 3, or x, y and z alike"
         raise InputError(path, "", shapes or "no array", allowed)
-    return found
+    return points
 
 
 def _arrays_in(values: dict[str, Any]) -> Iterator[tuple[str, NDArray[Any]]]:

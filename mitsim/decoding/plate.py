@@ -78,13 +78,13 @@ class PlateDots:
     - ``centres`` (n, 3) [mm], in the sensor frame.
     - ``indices`` (n, 2): row and column of each dot in the plate.
     - ``distances`` (m,) [mm] of all neighbours along rows and columns.
-    - ``found``: number of dots in the window, on the plate or not.
+    - ``dot_count``: number of dots in the window, on the plate or not.
     """
 
     centres: Array
     indices: NDArray[np.int64]
     distances: Array
-    found: int
+    dot_count: int
 
 
 def image_on_grid(capture: Capture, grid: ViewGrid) -> NDArray[np.uint8]:
@@ -138,12 +138,12 @@ def measure_plate(name: str, plate: Plate, cloud: PointCloud, image: NDArray[np.
     try:
         dots = plate_dots(name, plate, cloud, image)
     except FitError as error:
-        return [failed(one, "mm", str(error)) for one in names]
+        return [failed(quantity, "mm", str(error)) for quantity in names]
     scale, uncertainty, residual = plate_scale(dots, plate.pitch)
     count, freedom = len(dots.centres), 2 * len(dots.centres) - 4
     within = math.sqrt(float((residual[:, :2] ** 2).sum()) / freedom)
     mean, spread = float(dots.distances.mean()), float(dots.distances.std(ddof=1))
-    result = partial(Result, unit="mm", points=count, points_given=dots.found)
+    result = partial(Result, unit="mm", points=count, points_given=dots.dot_count)
     fitted = partial(result, origin="fit")
     return [
         fitted(names[0], value=scale * plate.pitch, uncertainty=uncertainty * plate.pitch, nominal=plate.pitch),
@@ -182,14 +182,14 @@ def plate_dots(name: str, plate: Plate, cloud: PointCloud, image: NDArray[np.uin
     measure_plate : the results from the dots
     """
     rows, columns = window_slices(plate.window, cloud, name)
-    found = dot_centres(np.ascontiguousarray(image[rows, columns]), plate.dark)
-    if len(found) < LEAST_DOTS:
-        raise FitError(f"{len(found)} round dots in the image, at least {LEAST_DOTS} are needed")
-    spacing = cKDTree(found).query(found, 2)[0][:, 1]
-    adjacent = cKDTree(found).query_pairs(_ADJACENT * float(np.median(spacing)), output_type="ndarray")
-    pixels = found[_largest_group(adjacent, len(found))] + np.array([columns.start, rows.start])
+    dots = dot_centres(np.ascontiguousarray(image[rows, columns]), plate.dark)
+    if len(dots) < LEAST_DOTS:
+        raise FitError(f"{len(dots)} round dots in the image, at least {LEAST_DOTS} are needed")
+    spacing = cKDTree(dots).query(dots, 2)[0][:, 1]
+    adjacent = cKDTree(dots).query_pairs(_ADJACENT * float(np.median(spacing)), output_type="ndarray")
+    pixels = dots[_largest_group(adjacent, len(dots))] + np.array([columns.start, rows.start])
     if len(pixels) < LEAST_DOTS:
-        raise FitError(f"{len(found)} round dots in the image, but fewer than {LEAST_DOTS} side by side")
+        raise FitError(f"{len(dots)} round dots in the image, but fewer than {LEAST_DOTS} side by side")
     points = _dot_positions(cloud, pixels, float(np.median(spacing)) / 2)
     if len(points) < LEAST_DOTS:
         raise FitError(f"the cloud has points on {len(points)} of {len(pixels)} dots, at least {LEAST_DOTS} are needed")
@@ -209,7 +209,7 @@ def plate_dots(name: str, plate: Plate, cloud: PointCloud, image: NDArray[np.uin
     indices, is_step = _grid_indices(centres, kept, plate.pitch)
     neighbours = kept[is_step]
     distances = np.linalg.norm(centres[neighbours[:, 0]] - centres[neighbours[:, 1]], axis=1)
-    return PlateDots(centres, indices, distances, len(found))
+    return PlateDots(centres, indices, distances, len(dots))
 
 
 def plate_scale(dots: PlateDots, pitch: float) -> tuple[float, float, Array]:
@@ -220,19 +220,19 @@ def plate_scale(dots: PlateDots, pitch: float) -> tuple[float, float, Array]:
     """
     plate = np.column_stack([dots.indices * pitch, np.zeros(len(dots.indices))]).astype(float)
     plate -= plate.mean(axis=0)
-    found = dots.centres - dots.centres.mean(axis=0)
-    rotation, scale = turn_and_scale(found, plate)
-    residual = found @ rotation - scale * plate
+    centred = dots.centres - dots.centres.mean(axis=0)
+    rotation, scale = turn_and_scale(centred, plate)
+    residual = centred @ rotation - scale * plate
     sigma = math.sqrt(float((residual[:, :2] ** 2).sum()) / (2 * len(plate) - 4))
     return scale, sigma / math.sqrt(float((plate**2).sum())), residual
 
 
-def turn_and_scale(found: Array, printed: Array) -> tuple[Array, float]:
-    """Return the rotation (3, 3) from print to sensor, and the scale, that take printed points to found ones.
+def turn_and_scale(points: Array, printed: Array) -> tuple[Array, float]:
+    """Return the rotation (3, 3) from print to sensor, and the scale, that take printed points to measured ones.
 
     Both (n, 3) [mm] have their mean at 0. Least squares: Umeyama, IEEE PAMI 13(4), 1991.
     """
-    u, singular, vt = np.linalg.svd(found.T @ printed)
+    u, singular, vt = np.linalg.svd(points.T @ printed)
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     return u @ np.diag(sign) @ vt, float((singular * sign).sum()) / float((printed**2).sum())
 

@@ -75,21 +75,21 @@ def checked_cloud(
     pair = _pair_geometry(capture, settings)
     geometry = pair or stored_geometry(capture, settings, sensor)
     cloud, images, noise = decoded_once(capture, settings, imager, geometry)
-    found = Findings() if images is None else code_findings(images, capture.rig, capture.source == "device", pair)
+    findings = Findings() if images is None else code_findings(images, capture.rig, capture.source == "device", pair)
     matched = pair_row_error(capture, cloud, pair)
-    warnings = [*capture.settings.get("warnings", []), *found.warnings, *row_error_warnings(matched)]
+    warnings = [*capture.settings.get("warnings", []), *findings.warnings, *row_error_warnings(matched)]
     if not np.isfinite(matched) and (contradiction := pair_contradiction(capture, pair)):
         warnings.append(contradiction)
     if lost := uncalibrated_in_words(cloud):
         warnings.append(lost)
     beyond = surface_beyond(capture, cloud, settings)
     if beyond is not None:
-        known = f"a coarse search over a wider range finds it in {100 * beyond.share:.0f} % of the pixels"
+        reason = f"a coarse search over a wider range finds it in {100 * beyond.share:.0f} % of the pixels"
         whose = capture.sensor if capture.sensor in presets() else None
         if sensor is not None:
             whose = sensor.name if isinstance(sensor, Sensor) else str(sensor)
-        warnings.append(range_warning(f"{where}: a surface", beyond.depths, settings, whose, known))
-    notes = row_error_in_words(capture, settings, found, matched), sigma_source(capture, cloud, noise)
+        warnings.append(range_warning(f"{where}: a surface", beyond.depths, settings, whose, reason))
+    notes = row_error_in_words(capture, settings, findings, matched), sigma_source(capture, cloud, noise)
     return CheckedCloud(cloud, tuple(dict.fromkeys(warnings)), tuple(note for note in notes if note))
 
 

@@ -96,12 +96,12 @@ def stripe_edges(images: CodeLines, axis: Axis) -> StripeEdges | None:
     finest = max(gray, key=lambda role: role.index)
     periods = sorted({image_roles[i].index for i in phases})
     numbers = [[i for i in phases if image_roles[i].index == index] for index in periods]
-    shifts = [np.array([image_roles[i].shift for i in each]) for each in numbers]
+    shifts = [np.array([image_roles[i].shift for i in group]) for group in numbers]
     threshold = images.settings.minimum_modulation_dn * full_scale / 255
-    found: list[tuple[Floats, Floats, Floats, Floats]] = []
+    edges: list[tuple[Floats, Floats, Floats, Floats]] = []
     between: list[Floats] = []
     for way, part in enumerate(images.lines):
-        fitted = fit_phases(np.concatenate([part[each] for each in numbers]), shifts)
+        fitted = fit_phases(np.concatenate([part[group] for group in numbers]), shifts)
         white_minus_black = fitted.modulation[-1] / np.float32(code.contrast)
         middle = fitted.offset + np.float32(0.5 - code.mean) * white_minus_black
         decoded = decode_stripes(part, image_roles, axis, images.settings.bit_share, (middle, white_minus_black))
@@ -117,9 +117,9 @@ def stripe_edges(images: CodeLines, axis: Axis) -> StripeEdges | None:
         position = np.maximum(number[:, 1:], number[:, :-1]) * finest.period - finest.offset
         # the edge lies anywhere between the two pixels, in the middle on average
         middle_cycles = turns[:, :, :-1] + step / 2
-        found.append((change[change != 0], position[at_edge], middle_cycles[:, at_edge], (step * change)[:, at_edge]))
+        edges.append((change[change != 0], position[at_edge], middle_cycles[:, at_edge], (step * change)[:, at_edge]))
         between.append(_moves(step, clear[:, 1:] & clear[:, :-1] & (np.abs(change) <= 1), at_edge, position))
-    changes, positions, cycles, rises = (np.concatenate(each, axis=-1) for each in zip(*found, strict=True))
+    changes, positions, cycles, rises = (np.concatenate(arrays, axis=-1) for arrays in zip(*edges, strict=True))
     enough = len(changes) >= _ENOUGH
     return StripeEdges(
         float(np.mean(np.abs(changes) == 1)) if enough else float("nan"),
@@ -240,17 +240,17 @@ def origin_in_words(edges: StripeEdges, images: CodeLines, axis: Axis) -> str:
         PhaseDeviation.of(edges.position, fringes.period, cycles if forward else -cycles)
         for fringes, cycles in zip(every, edges.cycles, strict=True)
     ]
-    if min(each.length for each in measured) < _CONCENTRATED:
+    if min(deviation.length for deviation in measured) < _CONCENTRATED:
         return ""
     needed = [
-        (fringes.shifts if forward else -fringes.shifts) - 2 * np.pi * each.cycles
-        for fringes, each in zip(every, measured, strict=True)
+        (fringes.shifts if forward else -fringes.shifts) - 2 * np.pi * deviation.cycles
+        for fringes, deviation in zip(every, measured, strict=True)
     ]
     change = next(
         (
-            each
-            for each in CHANGES
-            if all(_off(each.shifts(f), n) < _EIGHTH for f, n in zip(every, needed, strict=True))
+            candidate
+            for candidate in CHANGES
+            if all(_off(candidate.shifts(f), n) < _EIGHTH for f, n in zip(every, needed, strict=True))
         ),
         None,
     )
@@ -259,7 +259,9 @@ def origin_in_words(edges: StripeEdges, images: CodeLines, axis: Axis) -> str:
         offset = _fitting_offset(edges, every, image_roles, axis, images.extent(axis))
         if offset is not None:
             return f"{start}: they fit if the Gray code has offset_px = {offset} in [pattern]"
-    if change is None or any(each.unusual(edges, f, n) for each, f, n in zip(measured, every, needed, strict=True)):
+    if change is None or any(
+        deviation.unusual(edges, f, n) for deviation, f, n in zip(measured, every, needed, strict=True)
+    ):
         fitting = " and ".join(
             f"shifts_deg = {_degrees(shifts - origin_shift(fringes.wave, fringes.at, fringes.period))} at "
             f"{fringes.period:g} px"
@@ -284,14 +286,14 @@ def described(code: LightCode, image_roles: list[Role], axis: Axis) -> list[Desc
     groups = code.fringes(axis) if isinstance(code, ImageSequence) else []
     out: list[DescribedFringes] = []
     for index in sorted({role.index for role in image_roles if role.kind == "phase" and role.axis == axis}):
-        own = [role for role in image_roles if (role.kind, role.axis, role.index) == ("phase", axis, index)]
+        phase_roles = [role for role in image_roles if (role.kind, role.axis, role.index) == ("phase", axis, index)]
         wave: Wave = "cosine"
         at: Origin = "edge"
         if groups:
             wave, at = groups[index].wave, groups[index].at
         elif not isinstance(code, ImageSequence | GrayCode):
             wave, at = code.wave, code.at
-        out.append(DescribedFringes(own[0].period, np.array([role.shift for role in own]), wave, at))
+        out.append(DescribedFringes(phase_roles[0].period, np.array([role.shift for role in phase_roles]), wave, at))
     return out
 
 
@@ -334,7 +336,7 @@ def _off(shifts: Floats, needed: Floats) -> float:
 
 def _degrees(shifts: Floats) -> list[int]:
     """Return shifts (N,) [rad] as whole degrees from 0 to 359."""
-    return [int(each) % 360 for each in np.rint(np.degrees(shifts))]
+    return [int(angle) % 360 for angle in np.rint(np.degrees(shifts))]
 
 
 def _fitting_offset(

@@ -40,7 +40,7 @@ def copies_in_words(lines: CodeLines, axis: Axis) -> str:
     for numbers, _, width, stack in _periods(lines, axis):
         copies = [(i, j) for j in range(len(stack)) for i in range(j) if np.array_equal(stack[i], stack[j])]
         if copies and stack.min() != stack.max():
-            first, second = (numbers[each] + 1 for each in copies[0])
+            first, second = (numbers[index] + 1 for index in copies[0])
             return (
                 f"images {first} and {second} of the sequence, fringes of the {axis} at {width:g} px, are the same: "
                 "one is a copy"
@@ -53,11 +53,11 @@ def steps_in_words(lines: CodeLines, axis: Axis) -> str:
     threshold = 4 * lines.settings.minimum_modulation_dn * lines.full_scale / 255
     for _, shifts, width, stack in _periods(lines, axis):
         lit = (stack.max(axis=0) < lines.full_scale) & (np.ptp(stack.astype(float), axis=0) > threshold)
-        found = contradiction(stack[:, lit].astype(float), shifts)
-        if found > _CONTRADICTION:
+        share = contradiction(stack[:, lit].astype(float), shifts)
+        if share > _CONTRADICTION:
             return (
                 f"the {len(shifts)} fringe images of the {axis} at {width:g} px contradict one another by "
-                f"{100 * found:.0f} % of their contrast: check that none is missing or repeated, that the shifts are "
+                f"{100 * share:.0f} % of their contrast: check that none is missing or repeated, that the shifts are "
                 "those of [pattern], and whether the exposure was automatic"
             )
     return ""

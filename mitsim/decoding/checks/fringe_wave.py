@@ -72,7 +72,9 @@ def wave_in_words(lines: CodeLines, axis: Axis) -> str:
         return ""
     strict = lines.settings.model_copy(update={"consistency_sigma": lines.settings.consistency_sigma / _STRICTER})
     stricter = {change: tried(replace(variants[change], settings=strict)).faults for change in fitting}
-    change = min(fitting, key=lambda each: (not trials[each].rises, round(stricter[each], 1), each.mistakes))
+    change = min(
+        fitting, key=lambda candidate: (not trials[candidate].rises, round(stricter[candidate], 1), candidate.mistakes)
+    )
     words = f"the fringes of the {axis} fit if they have {change.in_words(described(code, lines.image_roles, axis)[0])}"
     kind = (
         ""
@@ -94,11 +96,13 @@ class _Trial:
         """Judge values [px] and statuses (n, W) along rows, and along columns; the code runs along ``along``."""
         lit = [np.isin(status, [Status.VALID, Status.PHASE_INCONSISTENT]) for _, status in parts]
         rejected = sum(
-            int((each & (status != Status.VALID)).sum()) for each, (_, status) in zip(lit, parts, strict=True)
+            int((lit_lines & (status != Status.VALID)).sum()) for lit_lines, (_, status) in zip(lit, parts, strict=True)
         )
-        jumped = max(float(np.mean(has_jump(value, each, extent))) for each, (value, _) in zip(lit, parts, strict=True))
+        jumped = max(
+            float(np.mean(has_jump(value, lit_lines, extent))) for lit_lines, (value, _) in zip(lit, parts, strict=True)
+        )
         change = np.diff(parts[along][0], axis=1)
-        share = rejected / max(sum(int(each.sum()) for each in lit), 1)
+        share = rejected / max(sum(int(lit_lines.sum()) for lit_lines in lit), 1)
         return cls(
             share + (jumped if jumped > _MANY else 0.0),
             float(np.nanmedian(change)) > 0 if np.isfinite(change).any() else False,
@@ -145,7 +149,7 @@ def with_change(code: LightCode, size: tuple[int, int], axis: Axis, change: Frin
         for fringes in every
     ]
     if isinstance(code, ImageSequence):
-        own = dict(zip(map(id, code.fringes(axis)), changed, strict=True))
-        return code.model_copy(update={"images": [own.get(id(group), group) for group in code.images]})
+        changed_groups = dict(zip(map(id, code.fringes(axis)), changed, strict=True))
+        return code.model_copy(update={"images": [changed_groups.get(id(group), group) for group in code.images]})
     assert not isinstance(code, GrayCode)
     return ImageSequence(kind="image_sequence", images=list(changed), mean=code.mean, contrast=code.contrast)

@@ -66,18 +66,18 @@ _EXPLAINED = 0.3
 def beyond_in_words(lines: CodeLines, axis: Axis) -> str:
     """Return a warning if another origin of a Gray code leaves far fewer pixels beyond the projector, or ""."""
     try:
-        others = {
+        shares = {
             words: _share_rejected(replace(lines, code=with_origins(lines.code, origins)), axis)
             for words, origins in other_origins(lines.code, lines.size).items()
             if axis in origins
         }
-        stated = _share_rejected(lines, axis) if others else 0.0
+        stated = _share_rejected(lines, axis) if shares else 0.0
     except InputError:
         return ""
-    words = min(others, key=lambda each: others[each], default="")
-    if not words or stated - others[words] < _LEAST or others[words] > _FRACTION * stated:
+    words = min(shares, key=lambda description: shares[description], default="")
+    if not words or stated - shares[words] < _LEAST or shares[words] > _FRACTION * stated:
         return ""
-    share = 100 * (stated - others[words])
+    share = 100 * (stated - shares[words])
     return f"{share:.0f} % of the lit pixels decode to {axis} beyond the projector: they fit if {words}"
 
 
@@ -92,9 +92,9 @@ def gray_origin_warning(images: CodedImages, rig: Rig, others_may_be_meant: bool
         return ""
     stack = next(iter(images.stacks.values()))
     step = max(1, min(stack.shape[1:]) // _COARSE)
-    places = np.s_[step // 2 :: step, step // 2 :: step]
-    coarse = np.ascontiguousarray(stack[:, *places])
-    rays = eye.rays(eye.pixel_grid()[places])
+    sample = np.s_[step // 2 :: step, step // 2 :: step]
+    coarse = np.ascontiguousarray(stack[:, *sample])
+    rays = eye.rays(eye.pixel_grid()[sample])
 
     def decoded(tried: LightCode) -> dict[Axis, ProjectorCoordinate]:
         return decode_coordinates(coarse, tried, size, images.settings, full_scale=images.full_scale)
@@ -103,9 +103,9 @@ def gray_origin_warning(images: CodedImages, rig: Rig, others_may_be_meant: bool
         return _Explained.of(eye, projector, rays, decoded(tried), images.settings)
 
     try:
-        others = {words: seen_with(with_origins(code, o)) for words, o in other_origins(code, size).items()}
-        stated = seen_with(code) if others else None
-        words = "" if stated is None else _of_usual_origins(stated, others, others_may_be_meant, code)
+        alternatives = {words: seen_with(with_origins(code, o)) for words, o in other_origins(code, size).items()}
+        stated = seen_with(code) if alternatives else None
+        words = "" if stated is None else _of_usual_origins(stated, alternatives, others_may_be_meant, code)
         if words or not others_may_be_meant or _states_origins(code):
             return words
         return _of_measured_origin(eye, projector, rays, decoded(code), code)
@@ -114,10 +114,10 @@ def gray_origin_warning(images: CodedImages, rig: Rig, others_may_be_meant: bool
 
 
 def _of_usual_origins(
-    stated: _Explained, others: dict[str, _Explained], others_may_be_meant: bool, code: LightCode
+    stated: _Explained, alternatives: dict[str, _Explained], others_may_be_meant: bool, code: LightCode
 ) -> str:
     """Return a warning if one of the usual origins explains more of the pixels, or as many, or ""."""
-    words, best = max(others.items(), key=lambda each: each[1].share)
+    words, best = max(alternatives.items(), key=lambda item: item[1].share)
     if best.share < _EXPLAINED:
         return ""
     gain = best.share - stated.share
@@ -136,35 +136,37 @@ def _of_usual_origins(
 
 
 def _of_measured_origin(
-    eye: Camera, projector: Camera, rays: Floats, found: dict[Axis, ProjectorCoordinate], code: LightCode
+    eye: Camera, projector: Camera, rays: Floats, coordinates: dict[Axis, ProjectorCoordinate], code: LightCode
 ) -> str:
     """Return a warning if one offset of columns and rows brings the light onto the view rays, or ""."""
-    if len(found) < 2 or any(role.kind == "phase" for role in roles(code, projector.width, projector.height)):
+    if len(coordinates) < 2 or any(role.kind == "phase" for role in roles(code, projector.width, projector.height)):
         return ""
-    known = np.all([each.status == Status.VALID for each in found.values()], axis=0) & np.isfinite(rays).all(axis=-1)
-    if known.mean() < _LEAST:
+    valid = np.all([coordinate.status == Status.VALID for coordinate in coordinates.values()], axis=0) & np.isfinite(
+        rays
+    ).all(axis=-1)
+    if valid.mean() < _LEAST:
         return ""
-    directions = eye.sensor_from_camera.directions(rays[known])
+    directions = eye.sensor_from_camera.directions(rays[valid])
 
     def miss(offset: float) -> Floats:
-        values = {axis: each.value[known] - offset for axis, each in found.items()}
-        found_miss = meeting(eye, projector, directions, values)[1]
-        return found_miss[np.isfinite(found_miss)]
+        values = {axis: coordinate.value[valid] - offset for axis, coordinate in coordinates.items()}
+        misses = meeting(eye, projector, directions, values)[1]
+        return misses[np.isfinite(misses)]
 
     at = [miss(offset) for offset in (0.0, 1.0)]
-    if not all(each.size for each in at):
+    if not all(misses.size for misses in at):
         return ""
-    at_0, at_1 = (float(np.median(each)) for each in at)
+    at_0, at_1 = (float(np.median(misses)) for misses in at)
     if abs(at_0) < _LEAST_MISS_PX or abs(at_1 - at_0) < _EXPLAINED:
         return ""
     exact = at_0 / (at_0 - at_1)
     offset = round(exact)
     if offset < 1 or abs(exact - offset) > _WHOLE_PX:
         return ""
-    left, uniform = miss(float(offset)), max(half_stripe(each) for each in found.values()) / 2
+    left, uniform = miss(float(offset)), max(half_stripe(coordinate) for coordinate in coordinates.values()) / 2
     if not left.size or float(np.median(np.abs(left))) > uniform + _WHOLE_PX:
         return ""
-    fits = _in_words(dict.fromkeys(found, float(offset)))
+    fits = _in_words(dict.fromkeys(coordinates, float(offset)))
     return (
         f"view rays miss the light that they decode by {abs(at_0):.1f} projector px in the median, all to one side: "
         f"they fit if {fits}, as in a program that counts from another number; or the calibration is off by as much. "
@@ -196,12 +198,12 @@ def other_origins(code: LightCode, size: tuple[int, int]) -> dict[str, Origins]:
     image_roles = roles(code, *size)
     fringes = {role.axis for role in image_roles if role.kind == "phase"}
     stated = {role.axis: role.offset for role in image_roles if role.kind == "gray"}
-    own: list[Axis] = [axis for axis in axes(code) if axis in stated and axis not in fringes]
+    gray_axes: list[Axis] = [axis for axis in axes(code) if axis in stated and axis not in fringes]
     out: dict[str, Origins] = {}
     for offset in ("centred", 0.0):
-        origins: Origins = dict.fromkeys(own, offset)  # type: ignore[arg-type]
+        origins: Origins = dict.fromkeys(gray_axes, offset)  # type: ignore[arg-type]
         tried = {role.axis: role.offset for role in roles(with_origins(code, origins), *size) if role.kind == "gray"}
-        origins = {axis: each for axis, each in origins.items() if tried[axis] != stated[axis]}
+        origins = {axis: origin for axis, origin in origins.items() if tried[axis] != stated[axis]}
         if origins:
             out[_in_words(origins)] = origins
     return out
@@ -211,7 +213,7 @@ def _states_origins(code: LightCode) -> bool:
     """Return whether the sensor file states ``offset_px`` of every Gray code without fringes."""
     if isinstance(code, ImageSequence):
         groups = [code.gray(axis) for axis in code.axes if not code.fringes(axis)]
-        return all(group.offset_px is not None for each in groups for group in each)
+        return all(group.offset_px is not None for axis_groups in groups for group in axis_groups)
     return not isinstance(code, GrayCode) or code.offset_px is not None
 
 
@@ -226,8 +228,8 @@ def _share_rejected(lines: CodeLines, axis: Axis) -> float:
     """Return the share of the lit pixels that have no coordinate along an axis [1]."""
     parts = lines.decoded(axis)
     status, lit = (
-        np.concatenate([each.ravel() for each in all_parts])
-        for all_parts in ([each.status for each in parts], [each.lit for each in parts])
+        np.concatenate([array.ravel() for array in all_parts])
+        for all_parts in ([part.status for part in parts], [part.lit for part in parts])
     )
     return float(np.mean(status[lit] != Status.VALID)) if lit.mean() > 0.02 else 0.0
 
@@ -245,28 +247,28 @@ class _Explained:
         eye: Camera,
         projector: Camera,
         rays: Floats,
-        found: dict[Axis, ProjectorCoordinate],
+        coordinates: dict[Axis, ProjectorCoordinate],
         settings: DecoderSettings,
     ) -> _Explained:
         """Intersect unit ``rays`` (h, w, 3) of the camera with columns or rows, those across the baseline if coded."""
-        lit = np.all([each.lit for each in found.values()], axis=0)
-        known = np.all([each.status == Status.VALID for each in found.values()], axis=0)
-        if lit.mean() < _LEAST or not known.any():
+        lit = np.all([coordinate.lit for coordinate in coordinates.values()], axis=0)
+        valid = np.all([coordinate.status == Status.VALID for coordinate in coordinates.values()], axis=0)
+        if lit.mean() < _LEAST or not valid.any():
             return cls(0.0, float("nan"))
-        axis = axis_across(eye, projector, tuple(found))
-        directions = eye.sensor_from_camera.directions(rays[known])
-        distance = meet_light_planes(eye, projector, directions, found[axis].value[known], axis)
+        axis = axis_across(eye, projector, tuple(coordinates))
+        directions = eye.sensor_from_camera.directions(rays[valid])
+        distance = meet_light_planes(eye, projector, directions, coordinates[axis].value[valid], axis)
         with np.errstate(invalid="ignore"):
-            depth = distance * rays[known][:, 2]
+            depth = distance * rays[valid][:, 2]
             explained = (depth >= settings.near_mm) & (depth <= settings.far_mm)
         points = eye.centre + directions[explained] * distance[explained][:, None]
-        place = projector.project(points)
-        missed = np.zeros(len(place), bool)
-        for other, second in found.items():
+        projected = projector.project(points)
+        missed = np.zeros(len(projected), bool)
+        for other, second in coordinates.items():
             if other != axis:
                 allowed = LARGEST_MISS_PX + half_stripe(second)
-                seen = second.value[known][explained]
-                missed |= ~(np.abs(place[:, 0 if other == "columns" else 1] - seen) <= allowed)
+                seen = second.value[valid][explained]
+                missed |= ~(np.abs(projected[:, 0 if other == "columns" else 1] - seen) <= allowed)
         explained[explained] = ~missed
         share = float(explained.sum() / lit.sum())
         return cls(share, float(np.median(depth[explained])) if explained.any() else float("nan"))

@@ -91,8 +91,10 @@ def image_warnings(images: CodedImages, camera: str, decoded: Mapping[Axis, Proj
     if out:
         return out
     shape = stack.shape[1:]
-    found = _smoothness([{axis: each.part(way) for axis, each in decoded.items()} for way in line_slices(shape)])
-    for axis, own in found.items():
+    by_axis = _smoothness(
+        [{axis: coordinate.part(way) for axis, coordinate in decoded.items()} for way in line_slices(shape)]
+    )
+    for axis, smoothness in by_axis.items():
         warning = copies_in_words(lines, axis) or _unresolved(rows, image_roles, axis, settings, camera)
         order = ""
         edges = None if warning else stripe_edges(lines, axis)
@@ -103,33 +105,33 @@ def image_warnings(images: CodedImages, camera: str, decoded: Mapping[Axis, Proj
         warning = warning or steps_in_words(lines, axis)
         if warning and camera not in warning:
             warning = f"{camera}: {warning}"
-        if not warning and (own.doubtful or own.evenness < _ASKED):
-            least = SMOOTH if own.doubtful else own.evenness - own.contradicted + _BETTER
+        if not warning and (smoothness.doubtful or smoothness.evenness < _ASKED):
+            least = SMOOTH if smoothness.doubtful else smoothness.evenness - smoothness.contradicted + _BETTER
             orders: Iterable[tuple[str, list[int]]] = _other_orders(image_roles, axis)
             if edges is not None and edges.bits_fit:
                 orders = _with_bits_in_place(orders, image_roles, axis)
             order = _fitting_order(lines, axis, orders, least)
         if order:
-            warning = f"{_doubt(own, axis, camera)}: they fit if {order}"
+            warning = f"{_doubt(smoothness, axis, camera)}: they fit if {order}"
         warning = warning or _changed_exposure(rows, image_roles, axis, camera)
-        if not warning and own.doubtful:
-            warning = f"{_doubt(own, axis, camera)}: check that the images are in the order of [pattern]"
+        if not warning and smoothness.doubtful:
+            warning = f"{_doubt(smoothness, axis, camera)}: check that the images are in the order of [pattern]"
         out += [warning] if warning else []
     return out
 
 
-def _doubt(found: Smoothness, axis: Axis, camera: str) -> str:
+def _doubt(smoothness: Smoothness, axis: Axis, camera: str) -> str:
     """Describe the doubt about a coordinate."""
-    if found.evenness < SMOOTH or found.contradicted <= CONTRADICTED:
+    if smoothness.evenness < SMOOTH or smoothness.contradicted <= CONTRADICTED:
         return f"the {axis} that {camera} decodes do not vary smoothly"
-    return f"bits or phases of the {axis} contradict one another on {100 * found.contradicted:.0f} % of {camera}"
+    return f"bits or phases of the {axis} contradict one another on {100 * smoothness.contradicted:.0f} % of {camera}"
 
 
 def _fitting_order(lines: CodeLines, axis: Axis, orders: Iterable[tuple[str, list[int]]], least: float) -> str:
     """Return the description of an order of the images with more smoothness than ``least``; "" if none."""
     best, description = least, ""
     for name, order in orders:
-        rows, columns = (each[order] for each in lines.lines)
+        rows, columns = (array[order] for array in lines.lines)
         try:
             decoded = replace(lines, lines=(rows, columns)).decoded(axis)
         except InputError:
@@ -137,9 +139,9 @@ def _fitting_order(lines: CodeLines, axis: Axis, orders: Iterable[tuple[str, lis
         # an order may be smooth although most pixels are contradictory, or its pairs are not complements
         if _changed_exposure(rows, lines.image_roles, axis, ""):
             continue
-        found = _smoothness([{axis: each} for each in decoded])[axis]
-        if not found.doubtful and found.evenness - found.contradicted > best:
-            best, description = found.evenness - found.contradicted, name
+        smoothness = _smoothness([{axis: coordinate} for coordinate in decoded])[axis]
+        if not smoothness.doubtful and smoothness.evenness - smoothness.contradicted > best:
+            best, description = smoothness.evenness - smoothness.contradicted, name
     return description
 
 
@@ -148,18 +150,18 @@ def _smoothness(lines: Sequence[Mapping[Axis, ProjectorCoordinate]]) -> dict[Axi
     evenness: dict[Axis, list[float]] = {}
     statuses: dict[Axis, list[NDArray[np.uint8]]] = {}
     lit_pixels: dict[Axis, list[NDArray[np.bool_]]] = {}
-    for way, found in enumerate(lines):
-        for axis, coordinate in found.items():
+    for way, coordinates in enumerate(lines):
+        for axis, coordinate in coordinates.items():
             values = coordinate.value if way == 0 else coordinate.value.T
             evenness.setdefault(axis, []).append(_evenness(values))
             statuses.setdefault(axis, []).append(coordinate.status.ravel())
             lit_pixels.setdefault(axis, []).append(coordinate.lit.ravel())
     out: dict[Axis, Smoothness] = {}
-    for axis, each in evenness.items():
+    for axis, measured in evenness.items():
         status, lit = np.concatenate(statuses[axis]), np.concatenate(lit_pixels[axis])
         share = float(np.mean(status[lit] == Status.PHASE_INCONSISTENT)) if lit.mean() > 0.02 else 0.0
-        known = [value for value in each if np.isfinite(value)]
-        out[axis] = Smoothness(max(known, default=float("nan")), share)
+        finite = [value for value in measured if np.isfinite(value)]
+        out[axis] = Smoothness(max(finite, default=float("nan")), share)
     return out
 
 
@@ -168,8 +170,8 @@ def _evenness(values: NDArray[np.float64]) -> float:
     shares = []
     for row in values:
         change = np.diff(row[np.isfinite(row)])  # gaps are skipped: a surface continues behind them
-        own = change[np.abs(change) > _STILL]
-        groups = own[: len(own) // _CHANGES * _CHANGES].reshape(-1, _CHANGES)
+        changes = change[np.abs(change) > _STILL]
+        groups = changes[: len(changes) // _CHANGES * _CHANGES].reshape(-1, _CHANGES)
         shares.append(np.abs(groups.sum(axis=1)) / np.abs(groups).sum(axis=1))
     all_shares = np.concatenate(shares) if shares else np.empty(0)
     return float(np.median(all_shares)) if len(all_shares) >= 10 else float("nan")
@@ -266,17 +268,17 @@ def _with_bits_in_place(
 def _other_orders(image_roles: list[Role], axis: Axis) -> Iterator[tuple[str, list[int]]]:
     """Yield common alternative orders of the images with their descriptions; an order lists the image at each place."""
     plain = list(range(len(image_roles)))
-    place = {(role.kind, role.index): index for index, role in enumerate(image_roles) if role.axis == axis}
-    bits = [index for kind, index in place if kind == "gray"]
-    inverse = ("gray_inverse", 0) in place
+    indices = {(role.kind, role.index): index for index, role in enumerate(image_roles) if role.axis == axis}
+    bits = [index for kind, index in indices if kind == "gray"]
+    inverse = ("gray_inverse", 0) in indices
 
     def exchanged(reverse: bool, complement: bool) -> list[int]:
         order = list(plain)
-        for (kind, index), at in place.items():
+        for (kind, index), at in indices.items():
             if kind == "phase":
                 continue
             other: Kind = ("gray_inverse" if kind == "gray" else "gray") if complement else kind
-            order[at] = place[other, len(bits) - 1 - index if reverse else index]
+            order[at] = indices[other, len(bits) - 1 - index if reverse else index]
         return order
 
     if bits:
@@ -290,11 +292,11 @@ def _other_orders(image_roles: list[Role], axis: Axis) -> Iterator[tuple[str, li
             f"the bits are in the reverse order, and every bit is exchanged with its complement: {_BEFORE}",
             exchanged(True, True),
         )
-        grays = sorted(at for (kind, _), at in place.items() if kind != "phase")
+        grays = sorted(at for (kind, _), at in indices.items() if kind != "phase")
         half = len(grays) // 2
-        each = [at for pair in zip(grays[:half], grays[half:], strict=True) for at in pair]
+        interleaved = [at for pair in zip(grays[:half], grays[half:], strict=True) for at in pair]
         apart = list(plain)
-        for at, source in zip(grays, each, strict=True):
+        for at, source in zip(grays, interleaved, strict=True):
             apart[at] = source
         yield 'the complements are in another order: change inverse between "each" and "all"', apart
         back = list(plain)
@@ -310,8 +312,8 @@ def _other_orders(image_roles: list[Role], axis: Axis) -> Iterator[tuple[str, li
     if phases:
         turned = list(plain)
         for index in {index for index, _ in phases}:
-            own = [at for number, at in phases if number == index]
-            for at, source in zip(own, own[::-1], strict=True):
+            positions = [at for number, at in phases if number == index]
+            for at, source in zip(positions, positions[::-1], strict=True):
                 turned[at] = source
         yield "the fringes move in the other direction: reverse the shifts", turned
     yield "the first image is not listed in [pattern]", [*plain[1:], plain[0]]

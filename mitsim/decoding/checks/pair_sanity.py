@@ -69,21 +69,21 @@ def pair_findings(images: CodedImages, rig: Rig, geometry: StereoGeometry) -> Fi
     exchanged = (
         f"the images of {names} fit the calibration if they are exchanged: check whether left and right are exchanged"
     )
-    found = list(images.coordinates.values())
-    matches = _Matches.of(found, geometry)
+    coordinates = list(images.coordinates.values())
+    matches = _Matches.of(coordinates, geometry)
     if matches.decoded < 0.005:
         return Findings()
     textures, doubt = None, "check that the calibration belongs to these images"
     if not np.isfinite(matches.row_error):
         image_roles = roles(images.code, *images.size)
         textures = [uniform_light_mean(stack, image_roles, images.full_scale) for stack in images.stacks.values()]
-        columns = found[0]["columns"].value, found[1]["columns"].value
+        columns = coordinates[0]["columns"].value, coordinates[1]["columns"].value
         contradiction, other_order = _texture_contradiction((textures[0], textures[1]), columns, rig, geometry)
         if contradiction:
             fits = exchangeable and other_order
             return Findings([exchanged if fits else f"{contradiction}: {doubt}"])
     if matches.doubtful:
-        if exchangeable and not _Matches.of(found[::-1], geometry).doubtful:
+        if exchangeable and not _Matches.of(coordinates[::-1], geometry).doubtful:
             return Findings([exchanged])
         return Findings([f"{matches}: {doubt}"])
     offset, source = matches.row_error, "by the code of the rows"
@@ -130,10 +130,10 @@ def _texture_contradiction(
     pixels = texture_matches(textures, columns)
     if len(pixels[0]) < LEAST_PAIRS:
         return "", False
-    found, other = (_row_errors(*order, rig, geometry) for order in (pixels, pixels[::-1]))
-    if found.fits:
+    errors, other = (_row_errors(*order, rig, geometry) for order in (pixels, pixels[::-1]))
+    if errors.fits:
         return "", False
-    return f"{found}, by the texture of the surface", other.fits
+    return f"{errors}, by the texture of the surface", other.fits
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ class _RowErrors:
 
 def _row_errors(left: Floats, right: Floats, rig: Rig, geometry: StereoGeometry) -> _RowErrors:
     """Return the row error of raw pixels (n, 2) of the first and second camera that show the same point."""
-    pair, places = geometry.rectification, []
+    pair, points = geometry.rectification, []
     for eye, pixels, turn, matrix in zip(
         rig.cameras.values(),
         (left, right),
@@ -168,15 +168,15 @@ def _row_errors(left: Floats, right: Floats, rig: Rig, geometry: StereoGeometry)
     ):
         rays = eye.rays(pixels) @ turn.T
         with np.errstate(invalid="ignore", divide="ignore"):
-            places.append((rays / rays[:, 2:]) @ matrix.T)
-    error = places[1][:, 1] - places[0][:, 1]
-    disparity = places[0][:, 0] - places[1][:, 0] + pair.matrix_right[0, 2] - pair.matrix_left[0, 2]
-    known = np.isfinite(error)
-    if known.mean() < 0.5:
+            points.append((rays / rays[:, 2:]) @ matrix.T)
+    error = points[1][:, 1] - points[0][:, 1]
+    disparity = points[0][:, 0] - points[1][:, 0] + pair.matrix_right[0, 2] - pair.matrix_left[0, 2]
+    finite = np.isfinite(error)
+    if finite.mean() < 0.5:
         return _RowErrors(np.inf, np.inf, 1.0)
     core = _core(error, 1.0)
     return _RowErrors(
-        float(np.median(error[known])), float(np.sqrt(np.mean(core**2))), float(np.mean(disparity[known] <= 0))
+        float(np.median(error[finite])), float(np.sqrt(np.mean(core**2))), float(np.mean(disparity[finite] <= 0))
     )
 
 
@@ -196,32 +196,34 @@ class _Matches:
     spread: float
 
     @classmethod
-    def of(cls, found: Sequence[Mapping[Axis, ProjectorCoordinate]], geometry: StereoGeometry) -> _Matches:
+    def of(cls, coordinates: Sequence[Mapping[Axis, ProjectorCoordinate]], geometry: StereoGeometry) -> _Matches:
         maps, seen = (geometry.map_left, geometry.map_right), (geometry.seen_left, geometry.seen_right)
         height = geometry.map_left.shape[1]
         lines = np.arange(2, height - 2, max(1, height // COARSE))
         u_left, u_right = (
-            rectified(each["columns"].value, positions[:, lines], there[lines])
-            for each, positions, there in zip(found, maps, seen, strict=True)
+            rectified(coordinate["columns"].value, positions[:, lines], there[lines])
+            for coordinate, positions, there in zip(coordinates, maps, seen, strict=True)
         )
-        place = np.stack([find_coordinates(one, other)[0] for one, other in zip(u_left, u_right, strict=True)])
-        matched, decoded = np.isfinite(place), np.isfinite(u_left)
+        right_columns = np.stack(
+            [find_coordinates(left_row, right_row)[0] for left_row, right_row in zip(u_left, u_right, strict=True)]
+        )
+        matched, decoded = np.isfinite(right_columns), np.isfinite(u_left)
         shift = geometry.rectification.matrix_right[0, 2] - geometry.rectification.matrix_left[0, 2]
-        disparity = (np.arange(place.shape[1]) - place)[matched] + shift
+        disparity = (np.arange(right_columns.shape[1]) - right_columns)[matched] + shift
         share = float(matched.sum() / max(decoded.sum(), 1))
         behind = float(np.mean(disparity <= 0)) if matched.any() else 0.0
-        if "rows" not in found[0] or not matched.any():
+        if "rows" not in coordinates[0] or not matched.any():
             return cls(float(decoded.mean()), share, behind, np.nan, np.nan)
-        offset, slope = _row_by_code(found, geometry, lines, place)
+        offset, slope = _row_by_code(coordinates, geometry, lines, right_columns)
         # the effect of a stripe, less than a step in depth
         if not np.isfinite(offset).any():
             return cls(float(decoded.mean()), share, behind, np.nan, np.nan)
-        edge = 1.5 * (2 * half_stripe(found[0]["rows"]) / abs(slope) + 1)
+        edge = 1.5 * (2 * half_stripe(coordinates[0]["rows"]) / abs(slope) + 1)
         # stripe quantisation averages out over a part of the image
         row, column = np.nonzero(matched)
-        part = row * _PARTS // len(lines) * _PARTS + column * _PARTS // place.shape[1]
+        part = row * _PARTS // len(lines) * _PARTS + column * _PARTS // right_columns.shape[1]
         means = [
-            float(np.mean(own)) for n in np.unique(part) if (own := _core(offset[part == n], edge)).size >= _ENOUGH
+            float(np.mean(core)) for n in np.unique(part) if (core := _core(offset[part == n], edge)).size >= _ENOUGH
         ]
         if len(means) < 4:
             return cls(float(decoded.mean()), share, behind, np.nan, np.nan)
@@ -244,37 +246,39 @@ class _Matches:
 
 def _core(values: Floats, least: float) -> Floats:
     """Return values (n,) without those far from their median, as at edges; ``least`` distance that counts as far."""
-    known = values[np.isfinite(values)]
-    if not known.size:
-        return known
-    deviation = np.abs(known - np.median(known))
-    return np.asarray(known[deviation <= max(4 * float(np.median(deviation)), least)])
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return finite
+    deviation = np.abs(finite - np.median(finite))
+    return np.asarray(finite[deviation <= max(4 * float(np.median(deviation)), least)])
 
 
 def _row_by_code(
-    found: Sequence[Mapping[Axis, ProjectorCoordinate]],
+    coordinates: Sequence[Mapping[Axis, ProjectorCoordinate]],
     geometry: StereoGeometry,
     lines: NDArray[np.intp],
-    place: Floats,
+    right_columns: Floats,
 ) -> tuple[Floats, float]:
     """Return the row error [px] of the right image at each match, and projector rows per pixel.
 
     The error is the projector row of the left image less that of the right, over their slope.
     """
-    row, column = np.nonzero(np.isfinite(place))
-    at = place[row, column]
+    row, column = np.nonzero(np.isfinite(right_columns))
+    at = right_columns[row, column]
     mine = geometry.map_left[:, lines[row], column]
 
     def at_right(step: float) -> Floats:
-        raw = np.stack([map_coordinates(each, [lines[row] + step, at], order=1) for each in geometry.map_right])
-        return np.asarray(map_coordinates(found[1]["rows"].value, raw[::-1], order=1, cval=np.nan))
+        raw = np.stack(
+            [map_coordinates(component, [lines[row] + step, at], order=1) for component in geometry.map_right]
+        )
+        return np.asarray(map_coordinates(coordinates[1]["rows"].value, raw[::-1], order=1, cval=np.nan))
 
-    v = np.asarray(map_coordinates(found[0]["rows"].value, mine[::-1], order=1, cval=np.nan))
+    v = np.asarray(map_coordinates(coordinates[0]["rows"].value, mine[::-1], order=1, cval=np.nan))
     # a median over less than a stripe is zero
     for half_distance in _SLOPE_ROWS:
         slope = (at_right(half_distance) - at_right(-half_distance)) / (2 * half_distance)
         usual = float(np.nanmedian(slope)) if np.isfinite(slope).any() else float("nan")
-        if abs(usual) * half_distance >= 2 * half_stripe(found[1]["rows"]):
+        if abs(usual) * half_distance >= 2 * half_stripe(coordinates[1]["rows"]):
             break
     return ((v - at_right(0.0)) / usual if abs(usual) > 1e-3 else np.full(len(v), np.nan)), usual
 

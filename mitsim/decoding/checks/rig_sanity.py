@@ -60,32 +60,36 @@ def camera_warnings(decoded: Mapping[Axis, ProjectorCoordinate], rig: Rig, setti
     if projector is None or not decoded:
         return []
     step = max(1, min(eye.width, eye.height) // COARSE)
-    places = np.s_[step // 2 :: step, step // 2 :: step]
-    found = {axis: each.part(places) for axis, each in decoded.items()}
-    rays = eye.sensor_from_camera.directions(eye.rays(eye.pixel_grid()[places]))
-    known = np.all([each.status == Status.VALID for each in found.values()], axis=0) & np.isfinite(rays).all(axis=-1)
-    if known.mean() < 0.005:
+    sample = np.s_[step // 2 :: step, step // 2 :: step]
+    sampled = {axis: coordinate.part(sample) for axis, coordinate in decoded.items()}
+    rays = eye.sensor_from_camera.directions(eye.rays(eye.pixel_grid()[sample]))
+    valid = np.all([coordinate.status == Status.VALID for coordinate in sampled.values()], axis=0) & np.isfinite(
+        rays
+    ).all(axis=-1)
+    if valid.mean() < 0.005:
         return []
-    coordinates = {axis: each.value[known] for axis, each in found.items()}
-    depth, miss = meeting(eye, projector, rays[known], coordinates)
+    coordinates = {axis: coordinate.value[valid] for axis, coordinate in sampled.items()}
+    depth, miss = meeting(eye, projector, rays[valid], coordinates)
     solved = depth[~np.isnan(depth)]  # without light beyond the fold of the projector's distortion
     behind = float(np.mean(~(solved > 0))) if solved.size else 0.0
     doubt = "check that the calibration belongs to these images, and that R and T are those of cv2.stereoCalibrate"
     out = []
     if behind > _BEHIND:
-        doubt = _other_place(eye, projector, rays[known], coordinates) or doubt
+        doubt = _other_place(eye, projector, rays[valid], coordinates) or doubt
         return [f"{100 * behind:.0f} % of the decoded pixels meet their light behind the camera: {doubt}"]
-    if len(found) == 2:
-        allowed = max(LARGEST_MISS_PX, settings.epipolar_px) + max(half_stripe(each) for each in found.values())
+    if len(sampled) == 2:
+        allowed = max(LARGEST_MISS_PX, settings.epipolar_px) + max(
+            half_stripe(coordinate) for coordinate in sampled.values()
+        )
         error = float(np.nanmedian(np.abs(miss))) if np.isfinite(miss).any() else np.inf
         if error > allowed:
             names: tuple[Axis, Axis] = ("columns", "rows")
-            turned = {one: found[other].value[known] for one, other in (names, names[::-1])}
-            other = float(np.nanmedian(np.abs(meeting(eye, projector, rays[known], turned)[1])))
+            turned = {axis: sampled[other].value[valid] for axis, other in (names, names[::-1])}
+            other = float(np.nanmedian(np.abs(meeting(eye, projector, rays[valid], turned)[1])))
             if other < allowed:
                 doubt = "they fit if columns and rows are exchanged in [pattern]"
             else:
-                doubt = _other_place(eye, projector, rays[known], coordinates) or doubt
+                doubt = _other_place(eye, projector, rays[valid], coordinates) or doubt
             out.append(f"view rays miss the light that they decode by {error:.1f} projector px in the median: {doubt}")
     return out
 
@@ -103,8 +107,8 @@ def _other_place(eye: Camera, projector: Camera, rays: Floats, coordinates: dict
         "they fit if R and T go from the projector's frame to the camera's: invert them": inverted,
         "they fit if T has the opposite sign": Transform(turn, -camera_from_projector.translation),
     }
-    for words, place in readings.items():
-        moved = replace(projector, sensor_from_camera=eye.sensor_from_camera @ place)
+    for words, pose in readings.items():
+        moved = replace(projector, sensor_from_camera=eye.sensor_from_camera @ pose)
         depth, miss = meeting(eye, moved, rays, coordinates)
         if np.mean(depth > 0) > 1 - _BEHIND / 3 and np.nanmedian(np.abs(miss)) < LARGEST_MISS_PX:
             return words
@@ -142,13 +146,15 @@ def meeting(eye: Camera, projector: Camera, rays: Floats, coordinates: dict[Axis
             projector.rays(np.stack([coordinates["columns"], coordinates["rows"]], axis=-1))
         )
         # closest points of two lines
-        a, b, c = (np.einsum("ij,ij->i", one, other) for one, other in ((rays, rays), (rays, light), (light, light)))
+        a, b, c = (
+            np.einsum("ij,ij->i", vector, other) for vector, other in ((rays, rays), (rays, light), (light, light))
+        )
         d, e = rays @ start, light @ start
         along = (b * e - c * d) / (a * c - b * b)
-        place = projector.project(eye.centre + along[:, None] * rays)
+        projected = projector.project(eye.centre + along[:, None] * rays)
         # across the epipolar line: no depth explains it
-        step = projector.project(eye.centre + 1.001 * along[:, None] * rays) - place
-        off = place - np.stack([coordinates["columns"], coordinates["rows"]], axis=-1)
+        step = projector.project(eye.centre + 1.001 * along[:, None] * rays) - projected
+        off = projected - np.stack([coordinates["columns"], coordinates["rows"]], axis=-1)
         with np.errstate(invalid="ignore", divide="ignore"):
             return along, (off[:, 0] * step[:, 1] - off[:, 1] * step[:, 0]) / np.linalg.norm(step, axis=1)
     ((axis, value),) = coordinates.items()
@@ -172,7 +178,7 @@ def meet_light_planes(eye: Camera, projector: Camera, rays: Floats, value: Float
     last = (projector.height if axis == "columns" else projector.width) - 1.0
     ends = [np.full_like(value, end) for end in (0.0, last)]
     pixels = [np.stack([value, end] if axis == "columns" else [end, value], axis=-1) for end in ends]
-    first, second = (projector.sensor_from_camera.directions(projector.rays_to_fold(each)) for each in pixels)
+    first, second = (projector.sensor_from_camera.directions(projector.rays_to_fold(end)) for end in pixels)
     normal = np.cross(first, second)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(-(normal @ (eye.centre - projector.centre)) / np.einsum("ij,ij->i", normal, rays))

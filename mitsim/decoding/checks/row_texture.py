@@ -94,11 +94,16 @@ def textured_row_error(
 
     ``textures`` [DN] and ``columns`` [projector px], (H, W) each: raw left and right, NaN where unknown.
     """
-    left, right = (np.where(np.isfinite(texture), own, np.nan) for texture, own in zip(textures, columns, strict=True))
+    left, right = (
+        np.where(np.isfinite(texture), coordinate, np.nan)
+        for texture, coordinate in zip(textures, columns, strict=True)
+    )
     left = rectified(left, geometry.map_left, geometry.seen_left)
     right = rectified(right, geometry.map_right, geometry.seen_right)
-    place = np.stack([find_coordinates(one, other)[0] for one, other in zip(left, right, strict=True)])
-    errors = _of_patches(*textures, geometry, np.arange(place.shape[1]) - place, _ROWS)
+    right_columns = np.stack(
+        [find_coordinates(left_row, right_row)[0] for left_row, right_row in zip(left, right, strict=True)]
+    )
+    errors = _of_patches(*textures, geometry, np.arange(right_columns.shape[1]) - right_columns, _ROWS)
     if len(errors) < _LEAST:
         return float("nan")
     middle = float(np.median(errors))
@@ -113,17 +118,17 @@ def _spread(errors: Floats) -> float:
 
 def _of_patches(left: Floats, right: Floats, geometry: StereoGeometry, disparity: Floats, reach: int) -> Floats:
     """Return the row errors [px] of patches of raw images whose pixels have a disparity (H, W), NaN for none."""
-    known = np.isfinite(disparity)
-    height, width = known.shape
+    matched = np.isfinite(disparity)
+    height, width = matched.shape
     corners = [
         (row, column)
         for row in range(0, height - _PATCH + 1, _PATCH)
         for column in range(0, width - _PATCH + 1, _PATCH)
-        if known[row : row + _PATCH, column : column + _PATCH].mean() >= _MATCHED
+        if matched[row : row + _PATCH, column : column + _PATCH].mean() >= _MATCHED
     ]
     errors = []
     for row, column in corners[:: -(-len(corners) // _MOST) or 1]:
-        rows, columns = np.nonzero(known[row : row + _PATCH, column : column + _PATCH])
+        rows, columns = np.nonzero(matched[row : row + _PATCH, column : column + _PATCH])
         rows, columns = rows + row, columns + column
         errors.append(row_error(left, right, geometry, rows, columns, disparity[rows, columns], reach))
     return np.array(errors, float)[np.isfinite(errors)] if errors else np.empty(0)

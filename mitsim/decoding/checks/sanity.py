@@ -33,8 +33,8 @@ def with_warnings(capture: Capture) -> Capture:
     if capture.technology != "structured_light":
         return capture
     images = CodedImages.of(capture, *decoder_settings(capture))
-    found = Findings() if images is None else code_findings(images, capture.rig, capture.source == "device")
-    warnings = list(dict.fromkeys([*capture.settings.get("warnings", []), *found.warnings]))
+    findings = Findings() if images is None else code_findings(images, capture.rig, capture.source == "device")
+    warnings = list(dict.fromkeys([*capture.settings.get("warnings", []), *findings.warnings]))
     return replace(capture, settings=capture.settings | ({"warnings": warnings} if warnings else {}))
 
 
@@ -62,7 +62,7 @@ def code_findings(images: CodedImages, rig: Rig, recorded: bool, geometry: Stere
     if out or not coordinates:
         return Findings(out)
     if images.settings.triangulate == "cameras":
-        if any("columns" not in each for each in coordinates.values()):
+        if any("columns" not in by_axis for by_axis in coordinates.values()):
             return Findings()  # decoding reports a code that two cameras cannot be matched by
         try:
             return pair_findings(images, rig, geometry or stereo_geometry(rig))
@@ -97,7 +97,7 @@ def pair_contradiction(capture: Capture, geometry: StereoGeometry | None = None)
     return plain_pair_warning((left, right), capture.rig, geometry or stereo_geometry(capture.rig))
 
 
-def row_error_in_words(capture: Capture, settings: Settings, found: Findings, matched: float) -> str:
+def row_error_in_words(capture: Capture, settings: Settings, findings: Findings, matched: float) -> str:
     """Describe the row error of the second camera, or that it is unknown; "" if only one camera measures.
 
     Parameters
@@ -106,7 +106,7 @@ def row_error_in_words(capture: Capture, settings: Settings, found: Findings, ma
         Capture that is decoded.
     settings
         Settings of its decoder.
-    found
+    findings
         Findings of the checks.
     matched
         Row error of a pair decoded by a matcher, from :func:`pair_row_error` [px].
@@ -117,10 +117,10 @@ def row_error_in_words(capture: Capture, settings: Settings, found: Findings, ma
     """
     if np.isfinite(matched):
         return f"row error of the second camera: {matched:+.2f} px"
-    if np.isfinite(found.row_error):
-        return f"row error of the second camera: {found.row_error:+.2f} px, {found.row_error_source}"
+    if np.isfinite(findings.row_error):
+        return f"row error of the second camera: {findings.row_error:+.2f} px, {findings.row_error_source}"
     paired = isinstance(settings, DecoderSettings) and settings.triangulate == "cameras"
-    if capture.technology != "structured_light" or not paired or found.warnings:
+    if capture.technology != "structured_light" or not paired or findings.warnings:
         return ""
     return (
         "row error of the second camera: unknown; the code has no rows and the surface too little texture. Project "

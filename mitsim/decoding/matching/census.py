@@ -45,17 +45,17 @@ def census_words(image: NDArray[np.uint8], window: int) -> list[Words]:
     height, width = image.shape
     reach = window // 2
     padded = np.pad(image, reach, mode="edge")
-    places = [(down, right) for down in range(window) for right in range(window) if (down, right) != (reach, reach)]
+    offsets = [(down, right) for down in range(window) for right in range(window) if (down, right) != (reach, reach)]
     words = list[Words]()
-    for begin in range(0, len(places), 64):
-        some = places[begin : begin + 64]
-        size = next(size for size in (1, 2, 4, 8) if 8 * size >= len(some))
+    for begin in range(0, len(offsets), 64):
+        block = offsets[begin : begin + 64]
+        size = next(size for size in (1, 2, 4, 8) if 8 * size >= len(block))
         # bit by bit in a byte of its own, with an eighth of the memory that a word has
         code = np.zeros((*image.shape, size), np.uint8)
         byte, darker = np.empty(image.shape, np.uint8), np.empty(image.shape, bool)
-        for number in range(0, len(some), 8):
+        for number in range(0, len(block), 8):
             byte[:] = 0
-            for down, right in some[number : number + 8]:
+            for down, right in block[number : number + 8]:
                 np.less(padded[down : down + height, right : right + width], image, out=darker)
                 np.add(byte, byte, out=byte)
                 byte |= darker.view(np.uint8)
@@ -102,19 +102,19 @@ def match_census_both_ways(
     p1 = max(round(settings.p1 * scale), 1)
     penalties = _Penalties(p1, max(round(settings.p2 * scale), p1 + 1))
     fit: Fit = "equiangular" if settings.sub_pixel == "equiangular" else "parabola"
-    found = np.full((height, width), np.nan, np.float32)
+    disparities = np.full((height, width), np.nan, np.float32)
     back = np.full((height, width + 2 * count), np.nan, np.float32)
     exists = (source - first >= 0) & (source - first < whole)
     for shared, inner in strips(height, width, count):
-        mine, theirs = ([each[shared] for each in words] for words in (reference, other))
+        mine, theirs = ([word[shared] for word in words] for words in (reference, other))
         cost = _block_costs(mine, theirs, count, shift, settings.block_size)
         total = _summed_paths(cost, penalties, settings.mode)[inner]
         rows = slice(shared.start + inner.start, shared.start + inner.stop)
         least = _least_sums(total)
-        found[rows] = _best_disparities(least, count, settings.uniqueness_percent, fit)
+        disparities[rows] = _best_disparities(least, count, settings.uniqueness_percent, fit)
         back[rows, : width + count][:, exists] = least.of_right[:, exists]
     matched_back = pixels_matched_back(back)[:, count : count + width]
-    return Matches(found + np.float32(first), both_ways_disagreement(found, back, count), matched_back)
+    return Matches(disparities + np.float32(first), both_ways_disagreement(disparities, back, count), matched_back)
 
 
 def _shift(bits: int, penalties: float) -> int:
@@ -141,9 +141,9 @@ def _block_costs(reference: list[Words], other: list[Words], count: int, shift: 
     """
     height, width, reach = len(reference[0]), reference[0].shape[1] - count, block // 2
     # the pixels compared with column x, at x - d
-    compared = [sliding_window_view(each, width, axis=1)[:, count:0:-1] for each in other]
+    compared = [sliding_window_view(codes, width, axis=1)[:, count:0:-1] for codes in other]
     along = np.empty((height, count, width), np.int16)
-    different, bits = [np.empty((count, width), each.dtype) for each in reference], np.empty((count, width), np.uint8)
+    different, bits = [np.empty((count, width), codes.dtype) for codes in reference], np.empty((count, width), np.uint8)
     padded = np.empty((count, width + 2 * reach), np.int16)
     middle = padded[:, reach : reach + width]
     for row, sums in enumerate(along):
@@ -267,15 +267,15 @@ def _least_sums(total: Costs) -> _Least:
     of_left, of_seen = _Places(count, width), _Places(count, width + count)
     for row, sums in enumerate(total):
         padded[:, count : count + width] = sums
-        least, place = of_seen.of_least(seen)
-        of_right[row] = np.where(least < _LARGEST, place, np.nan)
+        least, position = of_seen.of_least(seen)
+        of_right[row] = np.where(least < _LARGEST, position, np.nan)
         _, best[row] = of_left.of_least(sums)
     first = np.arange(height)[:, None] * count * width + np.arange(width)
     beside = [first + width * np.clip(best + step, 0, count - 1) for step in (-1, 0, 1)]
     flat = total.reshape(-1)
-    chosen = np.stack([flat[each] for each in beside])
-    for each in beside:
-        flat[each] = _LARGEST
+    chosen = np.stack([flat[index] for index in beside])
+    for indices in beside:
+        flat[indices] = _LARGEST
     second = total.min(axis=1)
     return _Least(best, chosen, second, of_right)
 
@@ -284,9 +284,9 @@ class _Places:
     """Places of the least of each column of an array (count, n); NumPy's argmin along columns takes several times."""
 
     def __init__(self, count: int, width: int) -> None:
-        self.count, places = count, np.arange(count, 0, -1).astype(np.uint8 if count < 256 else np.uint16)
-        self._before_end = np.ascontiguousarray(np.broadcast_to(places[:, None], (count, width)))
-        self._is_least, self._place = np.empty((count, width), bool), np.empty((count, width), places.dtype)
+        self.count, positions = count, np.arange(count, 0, -1).astype(np.uint8 if count < 256 else np.uint16)
+        self._before_end = np.ascontiguousarray(np.broadcast_to(positions[:, None], (count, width)))
+        self._is_least, self._place = np.empty((count, width), bool), np.empty((count, width), positions.dtype)
 
     def of_least(self, costs: Costs) -> tuple[Costs, NDArray[np.intp]]:
         """Return the least (n,) of each column, and the first place (n,) that has it."""

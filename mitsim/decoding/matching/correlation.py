@@ -90,9 +90,9 @@ def correlate_both_ways(
         return _matched(left[:, around], right[:, around], inner, search, settings, noisy_right)
 
     results = in_threads(match_rows, range(0, height, rows))
-    found, back = (np.concatenate(each) for each in zip(*results, strict=True))
-    disagreement, matched_back = both_ways_disagreement(found, back, count), pixels_matched_back(back)
-    return Matches(found + np.float32(first), disagreement, matched_back[:, count : count + width])
+    disparities, back = (np.concatenate(arrays) for arrays in zip(*results, strict=True))
+    disagreement, matched_back = both_ways_disagreement(disparities, back, count), pixels_matched_back(back)
+    return Matches(disparities + np.float32(first), disagreement, matched_back[:, count : count + width])
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def _matched(
     variance_left, variance_right = _block_variance(left, mean_left, block), _block_variance(right, mean_right, block)
     lag = _lag_covariance(right, mean_right, block)
     right, mean_right, variance_right, lag = (
-        each[..., reach:-reach] for each in (right, mean_right, variance_right, lag)
+        array[..., reach:-reach] for array in (right, mean_right, variance_right, lag)
     )
     scale_left = 1 / np.sqrt(variance_left[inner] + blank)
     scale_right = 1 / np.sqrt(variance_right[inner] + blank)
@@ -158,11 +158,11 @@ def _matched(
 
     requested, shift = slice(begin - low, end - low), begin - low
     back_requested = np.full((len(back), end - begin + 2 * count), np.nan, np.float32)
-    known = min(back_requested.shape[1], back.shape[1] - shift)
-    back_requested[:, :known] = back[:, shift : shift + known]
+    shared_width = min(back_requested.shape[1], back.shape[1] - shift)
+    back_requested[:, :shared_width] = back[:, shift : shift + shared_width]
     right_statistics = (variance_right[inner, shift:], lag[inner, shift:])
-    found = _best_disparities(score[:, :, requested], *right_statistics, settings, noisy_right)
-    return found, back_requested
+    disparities = _best_disparities(score[:, :, requested], *right_statistics, settings, noisy_right)
+    return disparities, back_requested
 
 
 def _sliding_sums(values: Floats, count: int, length: int) -> Floats:
@@ -199,7 +199,7 @@ def _block_variance(images: Floats, means: Floats, block: int) -> Floats:
 
 def _lag_covariance(images: Floats, means: Floats, block: int) -> Floats:
     """Return the covariance of each block with that of the column before (h, w), summed over the frames."""
-    previous, mean_previous = (np.concatenate([each[:, :, :1], each[:, :, :-1]], axis=2) for each in (images, means))
+    previous, mean_previous = (np.concatenate([array[:, :, :1], array[:, :, :-1]], axis=2) for array in (images, means))
     total = _block_mean((images * previous).sum(axis=0)[None], block)[0]
     return np.asarray(total - (means * mean_previous).sum(axis=0))
 
@@ -269,6 +269,6 @@ def _sub_pixel(
 def _peak_height(lower: Floats, peak: Floats, upper: Floats) -> Floats:
     """Return the height of the Gaussian through three neighbouring correlations, limited to 0.1 to 1."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        a, b, c = (np.log(np.maximum(each, np.float32(1e-3))) for each in (lower, peak, upper))
+        a, b, c = (np.log(np.maximum(array, np.float32(1e-3))) for array in (lower, peak, upper))
         height = np.exp(b - (a - c) ** 2 / (8 * (a - 2 * b + c)))
     return np.clip(np.where(np.isfinite(height), height, peak), _MINIMUM_PEAK, 1)

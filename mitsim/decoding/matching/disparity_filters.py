@@ -26,13 +26,13 @@ def without_speckles(disparity: Disparities, most_px: int, range_px: float) -> D
 
     Neighbours within ``range_px`` of one another belong to one region.
     """
-    known = np.isfinite(disparity)
-    if most_px == 0 or not known.any():
+    finite = np.isfinite(disparity)
+    if most_px == 0 or not finite.any():
         return disparity
-    middle = np.float32(np.median(disparity[known]))
+    middle = np.float32(np.median(disparity[finite]))
     limit = np.float32(np.iinfo(np.int16).max)
     steps = np.clip(np.rint((disparity - middle) * _STEPS_PER_PX), -limit, limit)
-    image = np.where(known, steps, _NONE).astype(np.int16)
+    image = np.where(finite, steps, _NONE).astype(np.int16)
     cv2.filterSpeckles(image, _NONE, most_px, round(range_px * _STEPS_PER_PX))
     return np.where(image == _NONE, np.float32(np.nan), disparity)
 
@@ -42,9 +42,9 @@ def median_of_neighbours(disparity: Disparities, side: int) -> Disparities:
 
     A neighbour without a disparity counts as the nearest one that has one.
     """
-    known = np.isfinite(disparity)
-    if side == 0 or not known.any():
+    finite = np.isfinite(disparity)
+    if side == 0 or not finite.any():
         return disparity
-    filled = nearest_value(np.where(known, disparity, 0).astype(np.float32), known, 0.0)
+    filled = nearest_value(np.where(finite, disparity, 0).astype(np.float32), finite, 0.0)
     smooth = cv2.medianBlur(filled, side) if side <= 5 else median_filter(filled, side, mode="nearest")
-    return np.where(known, smooth, np.float32(np.nan)).astype(np.float32)
+    return np.where(finite, smooth, np.float32(np.nan)).astype(np.float32)

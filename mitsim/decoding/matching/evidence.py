@@ -35,15 +35,15 @@ def block_saturated(full: NDArray[np.uint8], block: int) -> NDArray[np.bool_]:
     return np.asarray(share >= 255 * SATURATED_SHARE)
 
 
-def nearest_value(values: NDArray[np.float32], known: NDArray[np.bool_], fallback: float) -> NDArray[np.float32]:
-    """Return the value (H, W) of each pixel, or of the nearest ``known`` pixel; ``fallback`` if none is known."""
-    if not known.any():
+def nearest_value(values: NDArray[np.float32], valid: NDArray[np.bool_], fallback: float) -> NDArray[np.float32]:
+    """Return the value (H, W) of each pixel, or of the nearest ``valid`` pixel; ``fallback`` if none is valid."""
+    if not valid.any():
         return np.full(values.shape, fallback, np.float32)
     _, labels = cv2.distanceTransformWithLabels(
-        (~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+        (~valid).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
     value_of_label = np.empty(int(labels.max()) + 1, np.float32)
-    value_of_label[labels[known]] = values[known]
+    value_of_label[labels[valid]] = values[valid]
     return np.asarray(value_of_label[labels])
 
 

@@ -203,7 +203,7 @@ def _reference_image(
 ) -> NDArray[np.float32]:
     """Return the image (H, W) of a pattern at the samples (n, 2, H * W) of each pixel, blurred by the lens."""
     field = pattern.patterns()[0] if isinstance(pattern, ProjectorImages) else dot_frames(pattern, *size)[0]
-    image = np.mean([map_coordinates(field, each, order=1, mode="constant") for each in samples], axis=0)
+    image = np.mean([map_coordinates(field, coordinates, order=1, mode="constant") for coordinates in samples], axis=0)
     kernel = point_spread(blur_px)
     blurred = cv2.sepFilter2D(
         image.reshape(shape).astype(np.float64), -1, kernel, kernel, borderType=cv2.BORDER_REFLECT

@@ -169,13 +169,13 @@ def match_both_ways(
     from_left, *from_right = in_threads(
         lambda pair: _disparities(pair[0], pair[1], count, settings, pair[2]), pairs, workers
     )
-    found = from_left[:, count:]
+    disparities = from_left[:, count:]
     back = np.full((left.shape[0], padded_left.shape[1]), np.nan, np.float32)
     if from_right:
         back[:, start:stop] = from_right[0][:, count:][:, ::-1]
 
     matched_back = pixels_matched_back(back)[:, count : count + width]
-    return Matches(found + np.float32(first), both_ways_disagreement(found, back, count), matched_back)
+    return Matches(disparities + np.float32(first), both_ways_disagreement(disparities, back, count), matched_back)
 
 
 def _disparities(
@@ -204,8 +204,8 @@ def _disparities(
     )
     # the other modes hold the costs of one row
     parts = strips(height, width - count, count) if settings.mode == "hh" else [(slice(None), slice(None))]
-    found = [matcher.compute(reference[shared], other[shared])[inner] for shared, inner in parts]
-    sixteenths = np.concatenate(found).astype(np.float32)
+    disparities = [matcher.compute(reference[shared], other[shared])[inner] for shared, inner in parts]
+    sixteenths = np.concatenate(disparities).astype(np.float32)
     if settings.sub_pixel == "opencv":
         return np.where(sixteenths < 0, np.float32(np.nan), sixteenths / 16)
     offset = np.mod(sixteenths, 16)  # 0 to 8 are not negative; 9 to 15 are -7 to -1
@@ -213,24 +213,26 @@ def _disparities(
     return np.where(sixteenths < 0, np.float32(np.nan), (sixteenths - too_large) / 16)
 
 
-def both_ways_disagreement(found: NDArray[np.float32], back: NDArray[np.float32], count: int) -> NDArray[np.float32]:
+def both_ways_disagreement(
+    disparities: NDArray[np.float32], back: NDArray[np.float32], count: int
+) -> NDArray[np.float32]:
     """Return the least difference [px] between a left match and the matches of the two right pixels at its position.
 
     Parameters
     ----------
-    found
+    disparities
         (h, w) disparities of left pixels, less the first of the range.
     back
         (h, w + 2 count) disparities of right pixels.
     count
         Number of disparities.
     """
-    right_column = np.arange(count, count + found.shape[1], dtype=np.float32) - found
-    matched = np.isfinite(found)
+    right_column = np.arange(count, count + disparities.shape[1], dtype=np.float32) - disparities
+    matched = np.isfinite(disparities)
     column = np.floor(np.where(matched, right_column, 0)).astype(np.intp)
     next_column = np.minimum(column + (right_column > column), back.shape[1] - 1)
-    lower = np.abs(np.take_along_axis(back, column, axis=1) - found)
-    upper = np.abs(np.take_along_axis(back, next_column, axis=1) - found)
+    lower = np.abs(np.take_along_axis(back, column, axis=1) - disparities)
+    upper = np.abs(np.take_along_axis(back, next_column, axis=1) - disparities)
     return np.asarray(np.fmin(lower, upper))
 
 

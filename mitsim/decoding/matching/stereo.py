@@ -183,7 +183,7 @@ def decode_stereo(
     geometry = rig if isinstance(rig, StereoGeometry) else stereo_geometry(rig)
     grid, rectification = geometry.grid, geometry.rectification
     full_scale, roi, read_out = context.full_scale, context.roi, context.read_out
-    left, right = (each[None] if each.ndim == 2 else each for each in (left, right))
+    left, right = (image[None] if image.ndim == 2 else image for image in (left, right))
     _check_images("left", left, geometry.raw_size[0], full_scale)
     _check_images("right", right, geometry.raw_size[1], full_scale)
     if len(left) != len(right) or (settings.method == "sgbm" and len(left) > 1):

@@ -26,7 +26,7 @@ def offset_of_minimum(lower: NDArray[Any], least: NDArray[Any], upper: NDArray[A
         ``parabola``: (l - u) / (2 (l + u - 2 m)). ``equiangular``: two lines of opposite slope,
         (l - u) / (2 (max(l, u) - m)).
     """
-    below, above = (np.subtract(each, least, dtype=np.float32) for each in (lower, upper))
+    below, above = (np.subtract(cost, least, dtype=np.float32) for cost in (lower, upper))
     width = below + above if fit == "parabola" else np.maximum(below, above)
     with np.errstate(divide="ignore", invalid="ignore"):
         offset = (below - above) / (2 * width)

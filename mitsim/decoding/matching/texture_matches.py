@@ -47,15 +47,15 @@ def texture_matches(textures: tuple[Floats, Floats], columns: tuple[Floats, Floa
     empty if fewer than :data:`LEAST_PAIRS` features match, or their offsets do not agree.
     """
     none = np.empty((0, 2)), np.empty((0, 2))
-    found = [_features(*each) for each in zip(textures, columns, strict=True)]
-    if min(len(pixels) for pixels, _ in found) < LEAST_PAIRS:
+    features = [_features(*pair) for pair in zip(textures, columns, strict=True)]
+    if min(len(pixels) for pixels, _ in features) < LEAST_PAIRS:
         return none
-    nearest = cv2.BFMatcher(cv2.NORM_L2).knnMatch(found[0][1], found[1][1], 2)
+    nearest = cv2.BFMatcher(cv2.NORM_L2).knnMatch(features[0][1], features[1][1], 2)
     pairs = [(best.queryIdx, best.trainIdx) for best, second in nearest if best.distance < _RATIO * second.distance]
     if len(pairs) < LEAST_PAIRS:
         return none
     first, second = (
-        pixels[list(numbers)] for (pixels, _), numbers in zip(found, zip(*pairs, strict=True), strict=True)
+        pixels[list(numbers)] for (pixels, _), numbers in zip(features, zip(*pairs, strict=True), strict=True)
     )
     seen = [
         map_coordinates(values, pixels.T[::-1], order=1, cval=np.nan)
@@ -73,15 +73,15 @@ def texture_matches(textures: tuple[Floats, Floats], columns: tuple[Floats, Floa
 
 def _features(texture: Floats, columns: Floats) -> tuple[Floats, NDArray[np.float32]]:
     """Return the pixels (n, 2) of features of a texture where the column is known, and their descriptors (n, 128)."""
-    known = np.isfinite(texture) & np.isfinite(columns)
-    if not known.any():
+    finite = np.isfinite(texture) & np.isfinite(columns)
+    if not finite.any():
         return np.empty((0, 2)), np.empty((0, 128), np.float32)
-    low, high = np.percentile(texture[known], [1, 99])
-    image = np.clip(255 * (np.where(known, texture, low) - low) / max(high - low, 1.0), 0, 255).astype(np.uint8)
+    low, high = np.percentile(texture[finite], [1, 99])
+    image = np.clip(255 * (np.where(finite, texture, low) - low) / max(high - low, 1.0), 0, 255).astype(np.uint8)
     scale = max(1.0, max(image.shape) / _LONGEST_PX)
     size = (round(image.shape[1] / scale), round(image.shape[0] / scale))
     small, mask = (
-        cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (image, 255 * known.astype(np.uint8))
+        cv2.resize(array, size, interpolation=cv2.INTER_AREA) for array in (image, 255 * finite.astype(np.uint8))
     )
     points, descriptors = cv2.SIFT.create(_FEATURES).detectAndCompute(small, (mask == 255).astype(np.uint8))
     if not points:

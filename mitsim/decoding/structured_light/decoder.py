@@ -93,7 +93,7 @@ def decode_coordinates(  # noqa: PLR0913 - options, all by name
     image_roles = roles(code, *size)
     check_stack(stack, image_roles)
     check_full_scale(stack, full_scale)
-    found: dict[Axis, ProjectorCoordinate] = {}
+    coordinates: dict[Axis, ProjectorCoordinate] = {}
     for axis in axes(code):
         if only not in (None, axis):
             continue
@@ -110,19 +110,19 @@ def decode_coordinates(  # noqa: PLR0913 - options, all by name
             assert coded_axis is not None
             decoded = decode_stripes(images, axis_roles, axis, settings.bit_share)
             saturated = (stack if isinstance(code, GrayCode) else images).max(axis=0) >= full_scale
-            found[axis] = stripe_coordinate(decoded, coded_axis, saturated, settings, full_scale)
+            coordinates[axis] = stripe_coordinate(decoded, coded_axis, saturated, settings, full_scale)
             if interpolate and axis == "columns":
-                found[axis] = interpolated_columns(found[axis], decoded, images, axis_roles, coded_axis)
+                coordinates[axis] = interpolated_columns(coordinates[axis], decoded, images, axis_roles, coded_axis)
             continue
         fringes = Fringes.of([image_roles[i] for i in phases], code.mean, code.contrast)
         if coded_axis is not None:
-            found[axis] = decode_gray_fringes(
+            coordinates[axis] = decode_gray_fringes(
                 images, axis_roles, coded_axis, fringes, settings, full_scale=full_scale, imager=imager
             )
             continue
         plain = {role.kind: image for role, image in zip(axis_roles, images, strict=True) if role.axis is None}
         white_black = (plain["white"], plain["black"]) if len(plain) == 2 else None
-        found[axis] = decode_fringes(
+        coordinates[axis] = decode_fringes(
             images[len(shared) :],
             fringes,
             extent,
@@ -131,7 +131,7 @@ def decode_coordinates(  # noqa: PLR0913 - options, all by name
             imager=imager,
             white_black=white_black,
         )
-    return found
+    return coordinates
 
 
 def decode_structured_light(
@@ -202,7 +202,7 @@ def decode_structured_light(
     roi = checked_roi(context.roi, camera.width, camera.height, "decode_structured_light")
     region = roi.slices
     if decoded_before is not None:
-        coordinates = {axis: each.part(region) for axis, each in decoded_before.items()}
+        coordinates = {axis: coordinate.part(region) for axis, coordinate in decoded_before.items()}
     else:
         coordinates = decode_coordinates(
             np.ascontiguousarray(stack[:, *region]),
@@ -230,8 +230,8 @@ def triangulate_coordinate(
     names sensor and source.
     """
     whole = Roi.whole(geometry.camera.width, geometry.camera.height)
-    found = _triangulated(coordinate, geometry, (geometry.near, geometry.far), whole.slices)
-    return _cloud(*found, whole, geometry, context)
+    triangulated = _triangulated(coordinate, geometry, (geometry.near, geometry.far), whole.slices)
+    return _cloud(*triangulated, whole, geometry, context)
 
 
 def _cloud(
@@ -279,7 +279,7 @@ def _points(
     points, sigma = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)
     in_range, unsolved = np.empty(shape, bool), np.zeros(shape, bool)
     value, value_sigma = coordinate.value.ravel(), coordinate.sigma.ravel()
-    nodes, differences = (each[:, *region].reshape(count, -1) for each in (geometry.nodes, geometry.differences))
+    nodes, differences = (array[:, *region].reshape(count, -1) for array in (geometry.nodes, geometry.differences))
     rays, seen = geometry.ray[region].reshape(-1, 3), geometry.seen[region].ravel()
     nearest_w, farthest_w = 1 / range_mm[0], 1 / range_mm[1]
 
@@ -320,13 +320,13 @@ def _reject_contradictions(
     / sqrt(12), half a stripe is sqrt(3) sigma.
     """
     both = np.flatnonzero((status == Status.VALID) & (second.status == Status.VALID))
-    places, values, sigmas = points.reshape(-1, 3), second.value.ravel(), second.sigma.ravel()
+    flat_points, values, sigmas = points.reshape(-1, 3), second.value.ravel(), second.sigma.ravel()
     judged, component = status.reshape(-1), 0 if axis == "columns" else 1
 
     def compare(blocks: list[slice]) -> None:
         for block in blocks:
             pixels = both[block]
-            projected = projector.project(places[pixels].astype(np.float64))[:, component]
+            projected = projector.project(flat_points[pixels].astype(np.float64))[:, component]
             stripe_margin = np.nan_to_num(np.maximum(np.sqrt(3.0) * sigmas[pixels] - 0.5, 0.0))
             contradicted = ~(np.abs(projected - values[pixels]) <= tolerance_px + stripe_margin)
             judged[pixels[contradicted]] = Status.PHASE_INCONSISTENT

@@ -158,9 +158,9 @@ def _prepared(
     with np.errstate(divide="ignore", invalid="ignore"):
         local = rays / rays[..., 2:]
     ray = camera.sensor_from_camera.directions(local)
-    known = np.isfinite(local).all(axis=-1)
+    finite = np.isfinite(local).all(axis=-1)
     low, high = _depth_limits(camera, projector, ray, near_mm, far_mm)
-    seen = (high > low) & known
+    seen = (high > low) & finite
     low, high = np.where(seen, low, 1 / far_mm), np.where(seen, high, 1 / near_mm)
     if inverse_fold_radii(projector.distortion, projector.model).any():
         _shorten(camera, projector, ray, low, high, seen)
@@ -183,7 +183,7 @@ def _prepared(
             break
     nodes, differences = polynomial(coordinate, ray, low, high, _START_COUNT if iterated else count)
     monotonic, changes = monotony(nodes, MINIMUM_CHANGE_PX)
-    undetermined = ~known | (seen & ~monotonic & changes)
+    undetermined = ~finite | (seen & ~monotonic & changes)
     seen &= monotonic & changes
     if not seen.any():
         raise InputError(
@@ -278,8 +278,8 @@ def _shorten(
     @np.errstate(invalid="ignore")
     def find(rows: slice) -> None:
         for end in (low, high):
-            places = camera.centre + ray[rows] / end[rows][..., None]
-            leaves[rows] |= np.isnan(projector.project(places)).any(axis=-1)
+            points = camera.centre + ray[rows] / end[rows][..., None]
+            leaves[rows] |= np.isnan(projector.project(points)).any(axis=-1)
 
     in_threads(find, row_bands(*seen.shape))
     outside = np.nonzero(seen & leaves)
@@ -298,13 +298,13 @@ def _shorten(
         last = np.where(run > longest, index, last)
         longest = np.maximum(run, longest)
     ray_number = np.arange(inside.shape[1])
-    found = longest > 1
-    first = np.where(found, last - longest + 1, 0)
+    in_field = longest > 1
+    first = np.where(in_field, last - longest + 1, 0)
     low[outside], high[outside] = (
-        np.where(found, tried[first, ray_number], low[outside]),
-        np.where(found, tried[last, ray_number], high[outside]),
+        np.where(in_field, tried[first, ray_number], low[outside]),
+        np.where(in_field, tried[last, ray_number], high[outside]),
     )
-    seen[outside] = found
+    seen[outside] = in_field
 
 
 def exact_inverse_depth(
@@ -328,8 +328,8 @@ def exact_inverse_depth(
     component = 0 if geometry.axis == "columns" else 1
 
     def missed(inverse_depth: Floats, chosen: NDArray[np.intp]) -> Floats:
-        places = geometry.camera.centre + ray[chosen] / inverse_depth[:, None]
-        return _projected_component(geometry.projector, places, component) - u[chosen]
+        points = geometry.camera.centre + ray[chosen] / inverse_depth[:, None]
+        return _projected_component(geometry.projector, points, component) - u[chosen]
 
     everywhere = np.arange(len(u))
     with np.errstate(all="ignore"):
@@ -341,9 +341,9 @@ def exact_inverse_depth(
             if not active.size:
                 break
             moved = w[active] - error[active] * slope[active]
-            found = missed(moved, active)
-            slope[active] = (moved - w[active]) / (found - error[active])
-            w[active], error[active] = moved, found
+            moved_error = missed(moved, active)
+            slope[active] = (moved - w[active]) / (moved_error - error[active])
+            w[active], error[active] = moved, moved_error
         exact = np.abs(error) <= MAXIMUM_ERROR_PX
     return np.where(exact, w, np.nan), np.where(exact, slope, np.nan)
 

@@ -79,8 +79,8 @@ def measured_noise(
         residuals = [
             _residuals(stack, image_roles, full_scale, axis) for stack in stacks for axis in ("columns", "rows")
         ]
-    levels = np.concatenate([each[0] for each in residuals])
-    squares = np.concatenate([each[1] for each in residuals])
+    levels = np.concatenate([residual[0] for residual in residuals])
+    squares = np.concatenate([residual[1] for residual in residuals])
     if len(levels) < _MINIMUM_PIXELS:
         return None
     order = np.argsort(levels)

@@ -235,8 +235,8 @@ def gamma_corrected(
         gamma = gamma_from_white(phases.offset, *white_black, mean, contrast, used)
     return np.stack(
         [
-            correct_phase(each - np.float32(shifts[0]), gamma, n, mean, contrast) + np.float32(shifts[0])
-            for each, n, shifts in zip(phases.phase, steps, fringes.shifts, strict=True)
+            correct_phase(phase - np.float32(shifts[0]), gamma, n, mean, contrast) + np.float32(shifts[0])
+            for phase, n, shifts in zip(phases.phase, steps, fringes.shifts, strict=True)
         ]
     )
 

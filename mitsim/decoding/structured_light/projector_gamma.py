@@ -134,9 +134,9 @@ def equidistant_order(shifts: NDArray[np.floating]) -> NDArray[np.intp]:
     angle[angle > 2 * np.pi - 1e-6] = 0.0
     order = np.argsort(angle)
     if not np.allclose(angle[order], 2 * np.pi * np.arange(len(shifts)) / len(shifts), atol=1e-4):
-        found = np.round(np.degrees(shifts), 2).tolist()
+        degrees = np.round(np.degrees(shifts), 2).tolist()
         raise InputError(
-            "gamma", "shifts", f"{found} deg", "equidistant steps: the error by gamma is not known for others"
+            "gamma", "shifts", f"{degrees} deg", "equidistant steps: the error by gamma is not known for others"
         )
     return order
 

@@ -238,8 +238,8 @@ class _CameraCoordinates:
             for values in (raw.value, raw.sigma)
         )
         column, row = (
-            np.clip(np.rint(each), 0, size - 1).astype(np.intp)
-            for each, size in zip(positions, raw.status.shape[::-1], strict=True)
+            np.clip(np.rint(position), 0, size - 1).astype(np.intp)
+            for position, size in zip(positions, raw.status.shape[::-1], strict=True)
         )
         return cls(coordinate, sigma, raw.status[row, column], seen, positions)
 
@@ -324,15 +324,15 @@ def find_coordinates(
     step = row[columns + 1] - row[columns]
     columns = columns[(step > 0) & (step <= LARGEST_STEP_PX)]
     found_columns, ambiguous = np.full(coordinates.shape, np.nan), np.zeros(coordinates.shape, bool)
-    known = np.flatnonzero(np.isfinite(coordinates))
-    if columns.size == 0 or known.size == 0:
+    finite = np.flatnonzero(np.isfinite(coordinates))
+    if columns.size == 0 or finite.size == 0:
         return found_columns, ambiguous
     low, high = row[columns], row[columns + 1]
     # the number of segments that enclose u is the number that start at or below u, less the number that end there
-    u = coordinates[known]
+    u = coordinates[finite]
     started = np.searchsorted(np.sort(low), u, side="right")
     ended = np.searchsorted(np.sort(high), u, side="right")
-    ambiguous[known] = started - ended > 1
+    ambiguous[finite] = started - ended > 1
     single = started - ended == 1
     # nearly always u lies in the segment that started last; if that one has ended and an older one encloses u, u is
     # unmatched
@@ -340,5 +340,5 @@ def find_coordinates(
     segment = order[started[single] - 1]
     enclosed = u[single] < high[segment]
     fraction = (u[single] - low[segment]) / (high[segment] - low[segment])
-    found_columns[known[single]] = np.where(enclosed, columns[segment] + fraction, np.nan)
+    found_columns[finite[single]] = np.where(enclosed, columns[segment] + fraction, np.nan)
     return found_columns, ambiguous

@@ -199,10 +199,10 @@ def _beats(periods: tuple[float, ...]) -> list[Beat]:
     weights += [single[fine] - single[coarse] for coarse, fine in combinations(range(len(periods)), 2)]
     weights += [single[i] - 2 * single[i + 1] + single[i + 2] for i in range(len(periods) - 2)]
     beats = []
-    for each in weights:
-        value = float(each @ frequency)
+    for weight in weights:
+        value = float(weight @ frequency)
         if abs(value) > 1e-9:
-            beats.append(Beat(tuple(int(c) for c in np.sign(value) * each), 1 / abs(value)))
+            beats.append(Beat(tuple(int(c) for c in np.sign(value) * weight), 1 / abs(value)))
     return sorted(beats, key=lambda beat: -beat.period)
 
 
@@ -215,8 +215,8 @@ def _residual_gain(coarse: Beat, fine: Beat) -> NDArray[np.float64]:
 def beat_cycles(phase: NDArray[np.float32], beat: Beat) -> NDArray[np.float32]:
     """Return the phase (...) of a beat, 0 to 1 cycles, from phases (n, ...) [rad]."""
     out = np.zeros(phase.shape[1:], np.float32)
-    for each, weight in zip(phase, beat.weights, strict=True):
+    for angle, weight in zip(phase, beat.weights, strict=True):
         if weight:
-            out += each * np.float32(weight / (2 * np.pi))
+            out += angle * np.float32(weight / (2 * np.pi))
     out -= np.floor(out)
     return out
