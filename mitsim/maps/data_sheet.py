@@ -174,7 +174,7 @@ def measure_sensor(sensor: Sensor, seed: int = 1, workers: Executor | None = Non
     asked += [("recovery", ("matt white", distance, NOISE_TILT_DEG)) for distance in distances]
     asked += [("recovery", (metal, mid, tilt)) for metal in METALS for tilt in TILTS_DEG]
     asked += [("residuals", (mid,))]
-    pieces = [SheetPiece(sensor, seed + number, *one) for number, one in enumerate(asked)]
+    pieces = [SheetPiece(sensor, seed + number, *request) for number, request in enumerate(asked)]
     done = results_of(pieces, measure_piece, workers, sensor.name)
     planes, noise, metal = done[:2], done[3 : 3 + DISTANCES], done[3 + DISTANCES : -1]
     return DataSheet(sensor, mid, planes, radius, done[2], noise, metal, done[-1])
@@ -245,7 +245,7 @@ class _SimulatedTargets:
         cloud, coupon = self._plate(finish, float(distance), tilt_deg, Noise())
         patches = measure_patches(cloud, coupon)
         sigma = patches.ray_noise_inliers.values
-        known = sigma[np.isfinite(sigma)]
+        finite = sigma[np.isfinite(sigma)]
         points, view, _ = _on_plate(cloud, coupon)
         spread = float(_about_plane(points, view).std()) if len(points) > 100 else math.nan
         return Recovery(
@@ -253,7 +253,7 @@ class _SimulatedTargets:
             float(distance),
             tilt_deg,
             float(patches.recovered_fraction.mean()),
-            float(np.median(known)) if len(known) else math.nan,
+            float(np.median(finite)) if len(finite) else math.nan,
             spread,
         )
 

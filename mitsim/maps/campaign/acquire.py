@@ -136,13 +136,13 @@ def measured(capture: Capture, shot: Shot, geometry: Geometry, sensor: Sensor, k
     --------
     coupon_cloud : the cloud that it measures
     """
-    sample, place = shot.series.sample, coupon_place(capture, shot)
-    coupon = sample.at(place)
+    sample, pose = shot.series.sample, coupon_place(capture, shot)
+    coupon = sample.at(pose)
     if own_sensor(capture, sensor) is not sensor:
         geometry = capture_geometry(capture, sensor.settings)
     decode = partial(coupon_cloud, capture, geometry=geometry, sensor=sensor)
     cloud = decode(coupon)
-    if capture.source != "simulated" and (doubt := pose_doubt(cloud, decode, sample, place)):
+    if capture.source != "simulated" and (doubt := pose_doubt(cloud, decode, sample, pose)):
         say(f"warning: {shot.series.name}, {shot.name}: {doubt}")
     patches = measure_patches(cloud, coupon)
     if not keep_images:
@@ -155,7 +155,7 @@ def measured(capture: Capture, shot: Shot, geometry: Geometry, sensor: Sensor, k
     return Finished(patches, capture.source, replace(capture, settings={**capture.settings, "coupon": shown}))
 
 
-def check_directions(campaign: Campaign, found: dict[Path, Shot]) -> None:
+def check_directions(campaign: Campaign, shots: dict[Path, Shot]) -> None:
     """Check a few captures of :func:`found_shots`, of all tilts, for poses that are inverted as a whole.
 
     Raises
@@ -164,16 +164,16 @@ def check_directions(campaign: Campaign, found: dict[Path, Shot]) -> None:
         If the points of two or more lie in the plane of the coupon at the inverse pose, and those of none at its pose.
     """
     told = []
-    tilted = [place for place, shot in found.items() if may_be_inverted(shot.series.sample, shot.sensor_from_coupon)]
-    tilted.sort(key=lambda place: found[place].normal[2])
-    for place in tilted[:: max(len(tilted) // _CHECKED, 1)]:
-        capture, shot = read_capture(place), found[place]
+    tilted = [folder for folder, shot in shots.items() if may_be_inverted(shot.series.sample, shot.sensor_from_coupon)]
+    tilted.sort(key=lambda folder: shots[folder].normal[2])
+    for folder in tilted[:: max(len(tilted) // _CHECKED, 1)]:
+        capture, shot = read_capture(folder), shots[folder]
         decode = partial(
             coupon_cloud, capture, geometry=capture_geometry(capture, campaign.sensor.settings), sensor=campaign.sensor
         )
         if capture.source == "simulated" or fits(decode, shot.series.sample.at(shot.sensor_from_coupon)):
             return
-        told += [place] if fits_inverted(decode, shot.series.sample, shot.sensor_from_coupon) else []
+        told += [folder] if fits_inverted(decode, shot.series.sample, shot.sensor_from_coupon) else []
     if len(told) > 1:
         inside = f"poses that fit the points only if they are inverted, also in {', '.join(map(str, told[1:]))}"
         raise InputError(told[0] / "pose.json", "world_from_sensor", inside, "from sensor to coupon", DIRECTION)
@@ -251,23 +251,25 @@ def found_shots(folder: str | Path, campaign: Campaign) -> dict[Path, Shot]:
         If there is no capture, one whose sample or distance is not in the campaign, or two of one pose.
     """
     folder = Path(folder)
-    places = sorted(path.parent for path in folder.rglob("capture.json"))
-    if not places:
+    folders = sorted(path.parent for path in folder.rglob("capture.json"))
+    if not folders:
         raise InputError(folder, "", "no captures", "a folder with captures of coupons")
-    found: dict[tuple[str, str], Path] = {}
-    shots = {place: _found_shot(place, campaign) for place in places}
-    for place, shot in shots.items():
-        other = found.setdefault((shot.series.name, shot.name), place)
-        if other != place:
+    folder_of: dict[tuple[str, str], Path] = {}
+    shots = {capture_folder: _found_shot(capture_folder, campaign) for capture_folder in folders}
+    for capture_folder, shot in shots.items():
+        other = folder_of.setdefault((shot.series.name, shot.name), capture_folder)
+        if other != capture_folder:
             hint = "the pose was not written anew, or keep one capture of each orientation"
-            raise InputError(place / "pose.json", "", f"the orientation of {other}", "another for each capture", hint)
+            raise InputError(
+                capture_folder / "pose.json", "", f"the orientation of {other}", "another for each capture", hint
+            )
     return shots
 
 
-def out_of_range(campaign: Campaign, found: dict[Path, Shot] | None = None) -> list[str]:
+def out_of_range(campaign: Campaign, shots: dict[Path, Shot] | None = None) -> list[str]:
     """Return a warning for each capture whose coupon centre is outside the depth range of the decoder.
 
-    Captures in ``found`` count by their own poses, else planned ones count once for each sample and distance. At most
+    Captures in ``shots`` count by their own poses, else planned ones count once for each sample and distance. At most
     :data:`NAMED` captures have a line each; one more line has the number of the others.
     """
     sensor = campaign.sensor
@@ -277,16 +279,16 @@ def out_of_range(campaign: Campaign, found: dict[Path, Shot] | None = None) -> l
         for series in campaign.series
         if series.variant is None
     }
-    shown = planned if found is None else {str(place): shot for place, shot in found.items()}
-    known = "by the plan" if found is None else "by its pose"
+    shown = planned if shots is None else {str(folder): shot for folder, shot in shots.items()}
+    reason = "by the plan" if shots is None else "by its pose"
     lines = []
     for name, shot in shown.items():
         coupon = shot.series.sample.at(shot.sensor_from_coupon)
-        places = np.concatenate([coupon.centre[None], coupon.corners()])
-        middle, *depths = depths_of(places, sensor.rig, sensor.settings)
+        points = np.concatenate([coupon.centre[None], coupon.corners()])
+        middle, *depths = depths_of(points, sensor.rig, sensor.settings)
         if not sensor.settings.near_mm <= middle <= sensor.settings.far_mm:
             reach = (float(min(depths)), float(max(depths)))
-            warned = range_warning(f"{name}: the coupon", reach, sensor.settings, sensor.name, known)
+            warned = range_warning(f"{name}: the coupon", reach, sensor.settings, sensor.name, reason)
             lines.append(f"warning: {warned}")
     if len(lines) > NAMED:
         lines[NAMED:] = [f"warning: and {len(lines) - NAMED} of {len(shown)} more are outside the range"]
@@ -295,33 +297,33 @@ def out_of_range(campaign: Campaign, found: dict[Path, Shot] | None = None) -> l
 
 def found_source(shots: dict[Path, Shot]) -> CaptureSource:
     """Return a source of the captures from :func:`found_shots`, which are read when needed."""
-    places = {(shot.series.name, shot.name): place for place, shot in shots.items()}
-    return lambda shot: read_capture(places[shot.series.name, shot.name])
+    folders = {(shot.series.name, shot.name): folder for folder, shot in shots.items()}
+    return lambda shot: read_capture(folders[shot.series.name, shot.name])
 
 
-def _found_shot(place: Path, campaign: Campaign) -> Shot:
-    sensor, settings, world_from_sensor = read_settings_and_pose(place)
+def _found_shot(folder: Path, campaign: Campaign) -> Shot:
+    sensor, settings, world_from_sensor = read_settings_and_pose(folder)
     if sensor != campaign.sensor.name:
-        raise InputError(place / "capture.json", "sensor", sensor, campaign.sensor.name, "or choose another --sensor")
+        raise InputError(folder / "capture.json", "sensor", sensor, campaign.sensor.name, "or choose another --sensor")
     shown = settings.get("coupon")
     label = shown.get("sample") if isinstance(shown, dict) else None
     labels = [sample.label() for sample in campaign.samples]
     if label not in labels:
         hint = "the label of a sample of the campaign"
-        raise InputError(place / "settings.json", "coupon.sample", repr(label), ", ".join(labels), hint)
+        raise InputError(folder / "settings.json", "coupon.sample", repr(label), ", ".join(labels), hint)
     if world_from_sensor is None:
         hint = "mitsim import --coupon COLUMN ROW WIDTH HEIGHT takes it from the plane of a coupon's points"
-        raise InputError(place / "pose.json", "world_from_sensor", "null", "the pose, in the coupon's frame", hint)
+        raise InputError(folder / "pose.json", "world_from_sensor", "null", "the pose, in the coupon's frame", hint)
     if world_from_sensor.translation[2] <= 0:
         found, allowed = "a sensor behind the coupon", "a position with z over 0 in the coupon's frame"
-        raise InputError(place / "pose.json", "world_from_sensor", found, allowed, "the coupon's z faces the sensor")
+        raise InputError(folder / "pose.json", "world_from_sensor", found, allowed, "the coupon's z faces the sensor")
     pose = world_from_sensor.inverse()
     distance = float(np.linalg.norm(pose.translation - campaign.sensor.rig.reference.sensor_from_camera.translation))
     nominal = min(campaign.distances, key=lambda planned: abs(np.log(distance / planned)))
     if abs(distance / nominal - 1) > DISTANCE_SLACK:
         allowed = f"within 5 % of {', '.join(f'{planned:g}' for planned in campaign.distances)} mm"
         hint = "add this distance to distances_mm"
-        raise InputError(place / "pose.json", "distance", f"{distance:.1f} mm", allowed, hint)
+        raise InputError(folder / "pose.json", "distance", f"{distance:.1f} mm", allowed, hint)
     series = next(
         s for s in campaign.series if s.variant is None and s.distance == nominal and s.sample.label() == label
     )

@@ -53,8 +53,8 @@ _DIGEST = "finish_digest"
 
 def cache_folder() -> Path:
     """Return the cache folder, according to the XDG base directory specification."""
-    given = os.environ.get("XDG_CACHE_HOME", "")
-    root = Path(given) if given and Path(given).is_absolute() else Path.home() / ".cache"
+    root_name = os.environ.get("XDG_CACHE_HOME", "")
+    root = Path(root_name) if root_name and Path(root_name).is_absolute() else Path.home() / ".cache"
     return root / "mitsim" / "finishes"
 
 
@@ -65,14 +65,14 @@ def kept_finish(finish: OneFinish, distance: float) -> PerformanceMap | None:
     if not is_file(path):
         return None
     try:
-        found = PerformanceMap.load(path)
+        performance_map = PerformanceMap.load(path)
     except InputError as error:
         say(f"{path} is not valid and is made again: {error.found}")
         return None
-    if found.data.attrs.get(_DIGEST) != digest or len(found.samples) != 1:
+    if performance_map.data.attrs.get(_DIGEST) != digest or len(performance_map.samples) != 1:
         say(f"{path} is not valid and is made again: it belongs to another finish")
         return None
-    return found
+    return performance_map
 
 
 def made_finish(finish: OneFinish, simulated: SimulatedSensor, distance: float) -> PerformanceMap:
@@ -128,7 +128,7 @@ def _rates() -> dict[str, float]:
     if not isinstance(stored, dict):
         return {}
     return {
-        str(name): float(one)
-        for name, one in stored.items()
-        if isinstance(one, int | float) and not isinstance(one, bool) and 0 < one < 1e5
+        str(name): float(rate)
+        for name, rate in stored.items()
+        if isinstance(rate, int | float) and not isinstance(rate, bool) and 0 < rate < 1e5
     }

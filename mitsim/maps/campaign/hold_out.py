@@ -71,15 +71,18 @@ def distances_between(performance_map: PerformanceMap) -> list[float]:
 
     The distances at both ends are moved slightly inward.
     """
-    known = performance_map.data["distance"].values.astype(float)
-    if len(known) == 1:
-        return [float(known[0])]
+    distances = performance_map.data["distance"].values.astype(float)
+    if len(distances) == 1:
+        return [float(distances[0])]
     # a tilted coupon extends nearer and farther than its middle, and the map ends at the middles of its coupons
     ends = np.exp(
-        [0.85 * math.log(known[0]) + 0.15 * math.log(known[1]), 0.15 * math.log(known[-2]) + 0.85 * math.log(known[-1])]
+        [
+            0.85 * math.log(distances[0]) + 0.15 * math.log(distances[1]),
+            0.15 * math.log(distances[-2]) + 0.85 * math.log(distances[-1]),
+        ]
     )
-    middles = np.sqrt(known[1:] * known[:-1])
-    return [float(f"{distance:.4g}") for distance in (ends[0], *sorted([*known[1:-1], *middles]), ends[1])]
+    middles = np.sqrt(distances[1:] * distances[:-1])
+    return [float(f"{distance:.4g}") for distance in (ends[0], *sorted([*distances[1:-1], *middles]), ends[1])]
 
 
 def held_out_campaign(path: str | Path, sensor: Sensor, performance_map: PerformanceMap) -> Campaign:
@@ -122,8 +125,8 @@ def held_out_live(
     --------
     held_out_campaign : simulated coupons in place of a device
     """
-    known = performance_map.data["distance"].values.astype(float)
-    live = plan_live(path, file, sensor, (known.min() * (1 + LIVE_MARGIN), known.max() * (1 - LIVE_MARGIN)))
+    distances = performance_map.data["distance"].values.astype(float)
+    live = plan_live(path, file, sensor, (distances.min() * (1 + LIVE_MARGIN), distances.max() * (1 - LIVE_MARGIN)))
     _check_map(live.campaign, performance_map)
     return live
 
@@ -222,9 +225,9 @@ def compared(
     repeated = [replace(shot, series=replace(shot.series, seed=seed)) for seed in seeds]
     first = take(repeated[0])
     sample, pose = shot.series.sample, coupon_place(first, shot)
-    own = own_sensor(first, sensor)
-    if own is not sensor:
-        prepared = PreparedSensor(own)
+    capture_sensor = own_sensor(first, sensor)
+    if capture_sensor is not sensor:
+        prepared = PreparedSensor(capture_sensor)
     coupon = sample.at(pose)
     predictor = prepared.predictor
     surfaces = predictor.surfaces(sample.scene, pose.inverse())
@@ -232,28 +235,30 @@ def compared(
     fraction, sigma = performance(ideal, sample.scene, performance_map)
     rng = np.random.default_rng([shot.seed, 1])
     measured, predicted = list[_Measured](), list[_Measured]()
-    known = np.empty(0, np.int64)  # patches for which the map has a value; all captures have this pose
+    mapped_patches = np.empty(0, np.int64)  # patches for which the map has a value; all captures have this pose
     taken = [first]
     del first
-    for number, one in enumerate(repeated):
+    for number, repetition in enumerate(repeated):
         if number >= repeats:
-            pooled = _pooled(measured, known)
+            pooled = _pooled(measured, mapped_patches)
             if not pooled.sigma_error > LARGEST_SIGMA_ERROR * pooled.sigma:  # known, or impossible to estimate
                 break
         # keep only one capture and cloud at a time; with many pixels they have 100 MB each
         measured.append(
-            _measure(coupon_cloud(taken.pop() if taken else take(one), coupon, prepared.geometry, sensor), coupon)
+            _measure(
+                coupon_cloud(taken.pop() if taken else take(repetition), coupon, prepared.geometry, sensor), coupon
+            )
         )
         predicted.append(_measure(predictor.draw(sample.scene, ideal, labels, fraction, sigma, rng), coupon))
         if number == 0:
-            known = np.flatnonzero(_known(measured[0][0], sample, performance_map))
+            mapped_patches = np.flatnonzero(_known(measured[0][0], sample, performance_map))
     return Pair(
         sample.finish,
         sample.roughness,
         shot.series.distance,
         math.acos(min(1.0, float(shot.normal[2]))),
-        _pooled(measured, known),
-        _pooled(predicted, known),
+        _pooled(measured, mapped_patches),
+        _pooled(predicted, mapped_patches),
         np.concatenate([residuals for _, residuals in measured]),
         np.concatenate([residuals for _, residuals in predicted]),
     )
@@ -322,17 +327,17 @@ def _measure(cloud: PointCloud, coupon: Coupon) -> _Measured:
     return measure_patches(cloud, coupon), patch_residuals(cloud, coupon)
 
 
-def _pooled(measurements: list[_Measured], known: NDArray[np.int64]) -> Overall:
-    return overall(xr.concat([patches.isel(patch=known) for patches, _ in measurements], "patch"))
+def _pooled(measurements: list[_Measured], patch_indices: NDArray[np.int64]) -> Overall:
+    return overall(xr.concat([patches.isel(patch=patch_indices) for patches, _ in measurements], "patch"))
 
 
 def _known(patches: xr.Dataset, sample: Sample, performance_map: PerformanceMap) -> NDArray[np.bool_]:
     """Return the patches for which the map has a value over their whole extent, which a tilted coupon may exceed."""
     across = np.stack([patches["normal_x"].values, patches["normal_y"].values], axis=-1)
     normals = np.column_stack([across, np.sqrt(np.maximum(1 - (across**2).sum(axis=1), 0))])
-    known = np.ones(len(normals), bool)
+    mapped = np.ones(len(normals), bool)
     for reach in (1 - PATCH_REACH, 1 + PATCH_REACH):
         distance = reach * patches["distance"].values
         answer = performance_map.query(sample.finish, sample.roughness, distance, normals, sample.light)
-        known &= np.isfinite(answer.fraction)
-    return known
+        mapped &= np.isfinite(answer.fraction)
+    return mapped

@@ -90,37 +90,41 @@ def plan_live(
             raise InputError(path, f"samples.{number}.spread", "true", "false: a real coupon has one finish")
     eye = sensor.rig.reference.centre
     files = [stage.calibration] if isinstance(stage.calibration, str) else stage.calibration
-    found = {}
+    calibration_of = {}
     for name in files:
         calibration = read_stage_calibration(path.parent / name)
         distance = _planned(path, file.distances_mm, calibration.distance(eye))
-        if distance in found:
+        if distance in calibration_of:
             raise InputError(path, "stage.calibration", f"two at {distance:g} mm", "one for each distance")
-        found[distance] = calibration
-    if missing := set(file.distances_mm or ()) - set(found):
-        allowed = ", ".join(f"{one:g}" for one in sorted(found))
+        calibration_of[distance] = calibration
+    if missing := set(file.distances_mm or ()) - set(calibration_of):
+        allowed = ", ".join(f"{distance_mm:g}" for distance_mm in sorted(calibration_of))
         hint = "calibrate the stage at each distance, since it does not move the coupon"
         raise InputError(path, "distances_mm", f"{min(missing):g}", allowed, hint)
-    calibrations = {distance: found[distance] for distance in sorted(found) if range_mm[0] <= distance <= range_mm[1]}
+    calibrations = {
+        distance: calibration_of[distance]
+        for distance in sorted(calibration_of)
+        if range_mm[0] <= distance <= range_mm[1]
+    }
     if not calibrations:
-        known = ", ".join(f"{one:g} mm" for one in sorted(found))
+        calibrated = ", ".join(f"{distance_mm:g} mm" for distance_mm in sorted(calibration_of))
         allowed = f"a place within {range_mm[0]:.4g} to {range_mm[1]:.4g} mm"
-        raise InputError(path, "stage.calibration", known, allowed, "calibrate the stage there")
+        raise InputError(path, "stage.calibration", calibrated, allowed, "calibrate the stage there")
     stages = {distance: calibration.stage(stage, eye) for distance, calibration in calibrations.items()}
     kept = file.model_copy(update={"keep_images": True})
-    campaign = plan_campaign(path, kept, sensor, places=stages)
+    campaign = plan_campaign(path, kept, sensor, stage_tables=stages)
     return LiveCampaign(campaign, device, stage.connection, stages, calibrations)
 
 
-def _planned(path: Path, distances: list[float] | None, found: float) -> float:
+def _planned(path: Path, distances: list[float] | None, distance_mm: float) -> float:
     """Return the planned distance at which a stage was calibrated; without a plan, the distance of the calibration."""
     if not distances:
-        return float(f"{found:.4g}")
-    nearest = min(distances, key=lambda distance: abs(math.log(found / distance)))
-    if abs(found / nearest - 1) > DISTANCE_SLACK:
+        return float(f"{distance_mm:.4g}")
+    nearest = min(distances, key=lambda distance: abs(math.log(distance_mm / distance)))
+    if abs(distance_mm / nearest - 1) > DISTANCE_SLACK:
         planned = ", ".join(f"{distance:g}" for distance in distances)
         hint = "the stage was calibrated there"
-        raise InputError(path, "distances_mm", planned, f"{found:.4g}, within 5 %", hint)
+        raise InputError(path, "distances_mm", planned, f"{distance_mm:.4g}, within 5 %", hint)
     return nearest
 
 

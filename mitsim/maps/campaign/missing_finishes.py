@@ -53,7 +53,7 @@ class NeededFinishes:
     screening: bool = False
 
 
-def unknown_finishes(known: Samples, finishes: dict[str, Finish]) -> dict[str, Finish]:
+def unknown_finishes(samples: Samples, finishes: dict[str, Finish]) -> dict[str, Finish]:
     """Return the finishes that no sample matches, by shape name; each finish once."""
     out: dict[str, Finish] = {}
     seen = set[str]()
@@ -63,7 +63,7 @@ def unknown_finishes(known: Samples, finishes: dict[str, Finish]) -> dict[str, F
             continue
         seen.add(key)
         try:
-            known.representing(finish.name, finish.roughness, finish.light)
+            samples.representing(finish.name, finish.roughness, finish.light)
         except InputError:
             out[name] = finish
     return out
@@ -94,11 +94,11 @@ def map_with_finishes(
         If a finish is missing and may not be characterised, or the map was not simulated. Not if the map serves for
         screening alone.
     """
-    others = {name for name in needed.finishes if needed.measured is not None and name not in needed.measured}
-    measured = {name: finish for name, finish in needed.finishes.items() if name not in others}
+    unmeasured = {name for name in needed.finishes if needed.measured is not None and name not in needed.measured}
+    measured = {name: finish for name, finish in needed.finishes.items() if name not in unmeasured}
     missing = unknown_finishes(performance_map.known, measured)
     completed = _characterised(performance_map, needed, missing, ask) if missing else performance_map
-    unseen = unknown_finishes(completed.known, {name: needed.finishes[name] for name in others})
+    unseen = unknown_finishes(completed.known, {name: needed.finishes[name] for name in unmeasured})
     return with_nearest(completed, unseen)[0] if unseen else completed
 
 
@@ -109,15 +109,15 @@ def with_nearest(
 
     A finish of unknown optical properties, or a map without them, has none: it stays missing.
     """
-    found, maps = dict[str, Nearest](), list[PerformanceMap]()
+    nearest_by_name, maps = dict[str, Nearest](), list[PerformanceMap]()
     for name, finish in missing.items():
         nearest = None if finish.light is None else nearest_sample(performance_map, finish.light)
         if nearest is not None and finish.light is not None:
-            found[name] = nearest
+            nearest_by_name[name] = nearest
             maps.append(standing_for(performance_map, nearest, finish.name, finish.roughness, finish.light))
     if not maps:
         return performance_map, {}
-    return with_samples(performance_map, maps), found
+    return with_samples(performance_map, maps), nearest_by_name
 
 
 def _characterised(
@@ -133,7 +133,7 @@ def _characterised(
     largest = largest_incidence_deg(performance_map)
     ones = {name: OneFinish(finish, needed.sensor, largest) for name, finish in missing.items()}
     kept = {(name, at): kept_finish(one_finish, at) for name, one_finish in ones.items() for at in distances}
-    to_make = [key for key, found in kept.items() if found is None]
+    to_make = [key for key, kept_map in kept.items() if kept_map is None]
     if to_make:
         seconds = sum(expected_seconds(ones[name]) for name, _ in to_make)
         names = list(dict.fromkeys(name for name, _ in to_make))
@@ -144,16 +144,16 @@ def _characterised(
         if ask is None or not ask(question):
             standing, nearest = with_nearest(performance_map, missing) if needed.screening else (performance_map, {})
             if len(nearest) == len(missing):
-                for name, one in nearest.items():
-                    say(_standing_in_words(performance_map, needed, missing[name], one, about))
+                for name, standing_in in nearest.items():
+                    say(_standing_in_words(performance_map, needed, missing[name], standing_in, about))
                 return standing
             hint = f"add --yes to characterise it now, in {about}; the result is kept"
             raise _unknown_finish_error(performance_map, needed, names[0], missing[names[0]], hint)
         say(f"{needed.sensor.name}: characterising {lacking} in {about}; kept in {cache_folder()}")
         kept |= _characterise(ones, to_make, needed.sensor)
-    found = [one for one in kept.values() if one is not None]
-    joined = with_samples(performance_map, found)
-    digests = sorted(str(one.data.attrs["finish_digest"]) for one in found)
+    kept_maps = [kept_map for kept_map in kept.values() if kept_map is not None]
+    joined = with_samples(performance_map, kept_maps)
+    digests = sorted(str(kept_map.data.attrs["finish_digest"]) for kept_map in kept_maps)
     joined.data.attrs["characterised_when_asked"] = ", ".join(digests)
     return joined
 
@@ -187,10 +187,10 @@ def distances_about(performance_map: PerformanceMap, between: tuple[float, float
 
     These are the distances in the interval and the next one beyond each end.
     """
-    known = performance_map.data["distance"].values.astype(float)
-    low = max(int(np.searchsorted(known, between[0], "right")) - 1, 0)
-    high = min(int(np.searchsorted(known, between[1], "left")), len(known) - 1)
-    return [float(one) for one in known[low : max(high, low) + 1]]
+    distances = performance_map.data["distance"].values.astype(float)
+    low = max(int(np.searchsorted(distances, between[0], "right")) - 1, 0)
+    high = min(int(np.searchsorted(distances, between[1], "left")), len(distances) - 1)
+    return [float(distance) for distance in distances[low : max(high, low) + 1]]
 
 
 def _unknown_finish_error(

@@ -144,8 +144,8 @@ class Shot:
     @property
     def seed(self) -> int:
         """Return the seed of all random values; the same for a sample and its variants."""
-        place = [round(1e6 * (1.0 + float(component))) for component in self.normal]
-        return int(np.random.SeedSequence([self.series.seed, *place]).generate_state(1)[0])
+        components = [round(1e6 * (1.0 + float(component))) for component in self.normal]
+        return int(np.random.SeedSequence([self.series.seed, *components]).generate_state(1)[0])
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ def plan_campaign(
     sensor: Sensor,
     distances_mm: list[float] | None = None,
     *,
-    places: Mapping[float, StageTable] | None = None,
+    stage_tables: Mapping[float, StageTable] | None = None,
 ) -> Campaign:
     """Plan a campaign file that has been read from ``path``.
 
@@ -217,28 +217,28 @@ def plan_campaign(
         Sensor to characterise.
     distances_mm
         Distances if the file has none.
-    places
+    stage_tables
         Live stage as calibrated at each distance, for captures with the file's ``device``.
 
     See Also
     --------
     read_campaign : the file
     """
-    if file.device is not None and places is None:
+    if file.device is not None and stage_tables is None:
         hint = "only campaigns and validations of maps take captures with a device"
         raise InputError(path, "device", f"a live {file.device.kind}", "no device: these captures are simulated", hint)
     stages: tuple[Stage, ...] = () if file.stage is None else (file.stage,)
-    if places is None:
+    if stage_tables is None:
         check_exposure(sensor)
         distances = tuple(sorted(set(file.distances_mm or distances_mm or covering(sensor, file.distance_ratio))))
     else:
-        distances, stages = tuple(sorted(places)), tuple(places.values())
-    calibrations = {distance: str(stage.calibration) for distance, stage in (places or {}).items()}
+        distances, stages = tuple(sorted(stage_tables)), tuple(stage_tables.values())
+    calibrations = {distance: str(stage.calibration) for distance, stage in (stage_tables or {}).items()}
     series = [
-        one
+        entry
         for index in range(len(file.samples))
         for distance in distances
-        for one in _series_of(Path(path), file, index, distance, sensor, calibrations.get(distance, ""))
+        for entry in _series_of(Path(path), file, index, distance, sensor, calibrations.get(distance, ""))
     ]
     campaign = Campaign(file, sensor, distances, tuple(series), stages)
     labels = [sample.label() for sample in campaign.samples]
@@ -295,8 +295,8 @@ def coupon_pose(
     z = view_axes(axis) @ normal
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x)
-    place = axis * distance + (0.0 if eye is None else eye)
-    return Transform(np.stack([x, np.cross(z, x), z], axis=1), place)
+    translation = axis * distance + (0.0 if eye is None else eye)
+    return Transform(np.stack([x, np.cross(z, x), z], axis=1), translation)
 
 
 def view_axes(axis: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -304,7 +304,9 @@ def view_axes(axis: NDArray[np.float64]) -> NDArray[np.float64]:
     return view_frame(axis, np.array([1.0, 0.0, 0.0])).T
 
 
-def _series_of(path: Path, file: CampaignFile, index: int, distance: float, sensor: Sensor, place: str) -> list[Series]:
+def _series_of(
+    path: Path, file: CampaignFile, index: int, distance: float, sensor: Sensor, calibration: str
+) -> list[Series]:
     entry = file.samples[index]
     parameters = {name: str(value) for name, value in entry.parameters.items()}
     if file.coupon_px is not None:
@@ -323,13 +325,13 @@ def _series_of(path: Path, file: CampaignFile, index: int, distance: float, sens
     if entry.spread:
         shown += [(name, load_sample(recipe.moved(deviation), where)) for name, deviation in VARIANTS.items()]
     made = []
-    for variant, one in shown:
-        name = f"{one.label()} {distance:g}mm".replace("/", "-").replace(" ", "_")
-        if variant is not None and one.origin != sample.origin:
+    for variant, shown_sample in shown:
+        name = f"{shown_sample.label()} {distance:g}mm".replace("/", "-").replace(" ", "_")
+        if variant is not None and shown_sample.origin != sample.origin:
             name += "_" + "_".join(variant)
-        digest = _digest(file, sensor, one, distance, place)
-        seed = int(_digest(file, sensor, sample, distance, place), 16) % 2**32
-        made.append(Series(one, distance, variant, f"{name}_{digest}", seed))
+        digest = _digest(file, sensor, shown_sample, distance, calibration)
+        seed = int(_digest(file, sensor, sample, distance, calibration), 16) % 2**32
+        made.append(Series(shown_sample, distance, variant, f"{name}_{digest}", seed))
     return made
 
 
@@ -356,7 +358,7 @@ _NUMPY_PRINTS: dict[str, Any] = {
 
 def _written(sensor: Sensor) -> str:
     # values of a single unit; a file without them keeps its former checksum, which existing maps have
-    own = [sensor.room, sensor.misalignment, sensor.imager.smoothing_px]
+    additions = [sensor.room, sensor.misalignment, sensor.imager.smoothing_px]
     lens, settings = sensor.imager.corner_blur_px, sensor.settings
     # keys of a decoder that came later, which its text does not have
     later = {
@@ -365,18 +367,18 @@ def _written(sensor: Sensor) -> str:
         if not field.repr and getattr(settings, key) != field.default
     }
     with np.printoptions(**_NUMPY_PRINTS):
-        said = repr(sensor) + (repr(own) if own != [None, MisalignmentTable(), 0.0] else "")
+        said = repr(sensor) + (repr(additions) if additions != [None, MisalignmentTable(), 0.0] else "")
         return said + ("" if lens is None else f"corner_blur_px={lens!r}") + (repr(later) if later else "")
 
 
-def _digest(file: CampaignFile, sensor: Sensor, sample: Sample, distance: float, place: str) -> str:
+def _digest(file: CampaignFile, sensor: Sensor, sample: Sample, distance: float, calibration: str) -> str:
     """Return twelve hexadecimal digits of everything that determines the captures of a series, except their normals.
 
-    ``place`` is the checksum of a live stage's calibration; connection and limits of the stage are not included.
+    ``calibration`` is the checksum of a live stage's calibration; connection and limits of the stage are not included.
     """
     common = [__version__, MEASUREMENT_VERSION, file.samples_per_pixel, file.keep_images, file.seed]
     written = [_written(sensor), sample.origin, sample.label(), f"{distance:.6g}"]
     if file.device is not None:  # campaigns without a device keep their former digest
-        written += [file.device.model_dump_json(exclude={"settings": _PATIENCE}), place]
+        written += [file.device.model_dump_json(exclude={"settings": _PATIENCE}), calibration]
     text = json.dumps([*common, *written])
     return hashlib.sha256(text.encode()).hexdigest()[:12]

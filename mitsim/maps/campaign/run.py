@@ -113,14 +113,14 @@ def _take_missing(
         if key in done or key in missing:
             continue
         try:
-            found = read_shot(captures, shot)
+            patches = read_shot(captures, shot)
         except InputError as error:
             damaged.append(error)
             continue
-        if found is None:
+        if patches is None:
             missing[key] = shot
         else:
-            done[key] = found
+            done[key] = patches
     if damaged:
         for fault in damaged[1:NAMED]:
             say(f"mitsim: {fault}")

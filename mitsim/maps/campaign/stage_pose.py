@@ -145,13 +145,13 @@ class StageCalibration:
         view = view_frame(ray / np.linalg.norm(ray), np.array([1.0, 0.0, 0.0]))
         axes = []
         for number, (axis, direction) in enumerate(zip(table.axes, self.fit.axes.directions, strict=True)):
-            found = view @ direction
-            apart = math.degrees(math.acos(np.clip(axis.unit() @ found, -1, 1)))
+            direction_seen = view @ direction
+            apart = math.degrees(math.acos(np.clip(axis.unit() @ direction_seen, -1, 1)))
             if apart > LARGEST_MISMATCH_DEG:
-                place, far = f"axes.{number}.direction", f"{axis.name} {apart:.0f} deg from that of [stage]"
+                field, far = f"axes.{number}.direction", f"{axis.name} {apart:.0f} deg from that of [stage]"
                 hint = "another axis, or one that turns the other way: correct [stage], or the gear of its connection"
-                raise InputError(self.where, place, far, f"up to {LARGEST_MISMATCH_DEG:g} deg", hint)
-            axes.append(axis.model_copy(update={"direction": tuple(map(float, found))}))
+                raise InputError(self.where, field, far, f"up to {LARGEST_MISMATCH_DEG:g} deg", hint)
+            axes.append(axis.model_copy(update={"direction": tuple(map(float, direction_seen))}))
         normal = tuple(map(float, view @ zero.rotation[:, 2]))
         return table.model_copy(update={"axes": axes, "normal": normal, "calibration": self.checksum})
 

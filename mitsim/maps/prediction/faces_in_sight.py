@@ -44,8 +44,8 @@ def faces_in_sight(predictor: Predictor, scene: Scene, world_from_sensor: Transf
     seen = seen_faces(scene, world_from_sensor.points(ideal.point), normal, world_from_sensor.directions(ideal.ray))
     out = {}
     for number, name in enumerate(scene.names):
-        own = seen[(ideal.shape == number) & np.isfinite(seen[:, 0])]
-        share = float(own.mean(axis=0).max()) if len(own) else 0.0
+        shares = seen[(ideal.shape == number) & np.isfinite(seen[:, 0])]
+        share = float(shares.mean(axis=0).max()) if len(shares) else 0.0
         if share >= LEAST_SHARE:
             out[name] = round(share, 3)
     return out

@@ -137,11 +137,11 @@ class InterreflectionImage:
 
         Points outside the region have rho NaN, and 0 for the other values.
         """
-        places = np.nan_to_num(self.camera.project(np.asarray(points, float)), nan=-9)
-        column, row = (np.rint(places).astype(int) - [self.region.left, self.region.top]).T
+        pixels = np.nan_to_num(self.camera.project(np.asarray(points, float)), nan=-9)
+        column, row = (np.rint(pixels).astype(int) - [self.region.left, self.region.top]).T
         inside = (column >= 0) & (row >= 0) & (column < self.region.width) & (row < self.region.height)
-        rho, *others = self.values[:, np.where(inside, row, 0), np.where(inside, column, 0)]
-        return Interreflections(np.where(inside, rho, np.nan), *(np.where(inside, one, 0.0) for one in others))
+        rho, *values = self.values[:, np.where(inside, row, 0), np.where(inside, column, 0)]
+        return Interreflections(np.where(inside, rho, np.nan), *(np.where(inside, value, 0.0) for value in values))
 
 
 class InterreflectionEffect:
@@ -172,39 +172,40 @@ class InterreflectionEffect:
         self.middles = PixelRays.of_camera(self.coarse)
         self.light = _light(sensor)
         self.poses, self.ready = list(poses), dict[int, InterreflectionImage]()
-        self.places = {_key(pose): place for place, pose in enumerate(self.poses)}
+        self.indices = {_key(pose): index for index, pose in enumerate(self.poses)}
 
     def __call__(self, view: SceneView) -> Perturbation:
         """Return the perturbation of the ideal points of a view."""
-        found = self._rendered_with_next(view.scene, view.world_from_sensor).at(view.ideal.point)
-        rho = np.where(np.isfinite(found.rho), found.rho, 0.0)
+        interreflections = self._rendered_with_next(view.scene, view.world_from_sensor).at(view.ideal.point)
+        rho = np.where(np.isfinite(interreflections.rho), interreflections.rho, 0.0)
         nothing = Perturbation.none(len(rho))
         if isinstance(self.sensor.settings, MatcherSettings):
             noisier = 1 + rho / (1 + rho / (NOISIEST - 1))
             return replace(nothing, kept=found_share(rho, losses().matched), noisier=noisier)
         kept, displaced, scattered = found_share(rho, losses().coded), nothing.displaced, nothing.scattered
         if isinstance(self.sensor.pattern, AmplitudeModulation):
-            kept = 1.0 - found.rejected
+            kept = 1.0 - interreflections.rejected
             light_source = self.sensor.projector.optics.centre
-            displaced = range_bias(found.displaced, light_source, view.ideal)
+            displaced = range_bias(interreflections.displaced, light_source, view.ideal)
         elif self.fringe is not None:
             displaced, scattered = (
-                self.fringe.range_bias(phase, view.ideal) for phase in (found.displaced, found.scattered)
+                self.fringe.range_bias(phase, view.ideal)
+                for phase in (interreflections.displaced, interreflections.scattered)
             )
         return Perturbation(kept, np.sqrt(1 + rho), displaced, np.abs(scattered), nothing.shared)
 
     def _rendered_with_next(self, scene: Scene, pose: Transform) -> InterreflectionImage:
         """Return the image of a view; if it is one of ``poses``, render it together with those that follow."""
-        place = self.places.get(_key(pose))
-        if place is None:
+        index = self.indices.get(_key(pose))
+        if index is None:
             return self.render(scene, pose)
-        if place not in self.ready:
-            end = place + TOGETHER
+        if index not in self.ready:
+            end = index + TOGETHER
             if len(self.poses) == end + 1:  # a render of one view would be another kernel
                 end += 1
-            images = self.render_views(scene, self.poses[place:end])
-            self.ready = dict(enumerate(images, place))
-        return self.ready.pop(place)
+            images = self.render_views(scene, self.poses[index:end])
+            self.ready = dict(enumerate(images, index))
+        return self.ready.pop(index)
 
     def render(self, scene: Scene, world_from_sensor: Transform, seed: int = 1) -> InterreflectionImage:
         """Render the interreflections in a view."""
@@ -213,14 +214,14 @@ class InterreflectionEffect:
     def render_views(self, scene: Scene, poses: Sequence[Transform], seed: int = 1) -> list[InterreflectionImage]:
         """Render the interreflections in several views at once; each image is the one that :meth:`render` returns."""
         region = self._region(scene, poses)
-        given = scene, self.rays, self.light, poses
-        direct = trace_poses(*given, LightPaths(samples=self.samples, seed=seed), region)
+        arguments = scene, self.rays, self.light, poses
+        direct = trace_poses(*arguments, LightPaths(samples=self.samples, seed=seed), region)
         paths = LightPaths(self.samples, 2 * seed, self.depth, photons=self.photons, indirect_only=True)
         halves = range(1 if self.fringe is None else 2)
-        indirect = [trace_poses(*given, replace(paths, seed=2 * seed + half), region) for half in halves]
+        indirect = [trace_poses(*arguments, replace(paths, seed=2 * seed + half), region) for half in halves]
         middles = self.middles.within(region)
         return [
-            self._image(region, shapes_met(scene, middles, pose), direct[k], [one[k] for one in indirect])
+            self._image(region, shapes_met(scene, middles, pose), direct[k], [views[k] for views in indirect])
             for k, pose in enumerate(poses)
         ]
 
@@ -229,10 +230,10 @@ class InterreflectionEffect:
         whole = self.rays.whole
         steps = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, _BOX_POINTS)] * 3), axis=-1).reshape(-1, 3)
         box = scene.bounds[0] + steps * (scene.bounds[1] - scene.bounds[0])
-        places = np.concatenate([self.coarse.project(pose.inverse().points(box)) for pose in poses])
-        if not np.isfinite(places).all():
+        pixels = np.concatenate([self.coarse.project(pose.inverse().points(box)) for pose in poses])
+        if not np.isfinite(pixels).all():
             return whole
-        first, last = np.floor(places.min(axis=0)) - _AROUND_PX, np.ceil(places.max(axis=0)) + _AROUND_PX + 1
+        first, last = np.floor(pixels.min(axis=0)) - _AROUND_PX, np.ceil(pixels.max(axis=0)) + _AROUND_PX + 1
         return Roi.between(*first, *last).overlap(whole) or Roi.whole(1, 1)
 
     def _image(
@@ -248,8 +249,13 @@ class InterreflectionEffect:
         """
         code = self.sensor.pattern
         # number of images whose mean is the total light
-        own = code.steps if isinstance(code, AmplitudeModulation) else 1
-        white = np.stack([direct[:own].mean(axis=0), np.mean([one[:own].mean(axis=0) for one in indirect], axis=0)])
+        white_count = code.steps if isinstance(code, AmplitudeModulation) else 1
+        white = np.stack(
+            [
+                direct[:white_count].mean(axis=0),
+                np.mean([images[:white_count].mean(axis=0) for images in indirect], axis=0),
+            ]
+        )
         first, other = smoothed(white, shape, SMOOTHED_PX / self.step).astype(float)
         with np.errstate(divide="ignore", invalid="ignore"):
             rho = np.where(first > 0, other / first, np.nan)
@@ -267,8 +273,10 @@ class InterreflectionEffect:
                 self.step,
             )
         elif self.fringe is not None:
-            one, *two = (amplitude(images[1:]) for images in (direct, *indirect))
-            displaced, scattered = phase_bias(one, (two[0], two[1]), shape, self.step)
+            direct_amplitude, *indirect_amplitudes = (amplitude(images[1:]) for images in (direct, *indirect))
+            displaced, scattered = phase_bias(
+                direct_amplitude, (indirect_amplitudes[0], indirect_amplitudes[1]), shape, self.step
+            )
         return InterreflectionImage(self.coarse, region, np.stack([rho, displaced, scattered, rejected]))
 
     def _levels(self, region: Roi) -> float | Floats:

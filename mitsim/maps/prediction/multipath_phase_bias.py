@@ -73,11 +73,11 @@ class Fringe:
 
     def range_bias(self, phase: Floats, ideal: Ideal) -> Floats:
         """Return the range bias (n,) [mm] along the rays for a phase bias ``phase`` (n,) [rad]; positive is too far."""
-        place = ideal.point - self.centre
+        offset = ideal.point - self.centre
         with np.errstate(divide="ignore", invalid="ignore"):
-            read = (place @ self.along) / (place @ self.optical_axis) + phase / (2 * math.pi) * self.period
+            read = (offset @ self.along) / (offset @ self.optical_axis) + phase / (2 * math.pi) * self.period
             normal = self.along - read[:, None] * self.optical_axis  # of the plane of points with this coordinate
-            moved = -(normal * place).sum(1) / (normal * ideal.ray).sum(1)
+            moved = -(normal * offset).sum(1) / (normal * ideal.ray).sum(1)
         return np.where(np.isfinite(moved), moved, 0.0)
 
 
@@ -118,7 +118,7 @@ def amplitude(images: NDArray[np.floating]) -> Complex:
 
 
 def phase_bias(
-    direct: Complex, others: tuple[Complex, Complex], shape: NDArray[np.integer], step: int
+    direct: Complex, indirect: tuple[Complex, Complex], shape: NDArray[np.integer], step: int
 ) -> tuple[Floats, Floats]:
     """Return the bias arg(1 + z) (H, W) [rad] of each pixel, and the standard deviation of its phase about the bias.
 
@@ -128,7 +128,7 @@ def phase_bias(
     ----------
     direct
         A_1 (H, W).
-    others
+    indirect
         Two renders of A_2 (H, W).
     shape
         (H, W) shape that each pixel shows, -1 for none.
@@ -137,13 +137,13 @@ def phase_bias(
     """
     size = np.abs(direct)
     # scale first: squares of radiances are too small for single precision
-    unit = max(np.finfo(float).tiny, *(float(np.abs(one).max()) for one in (direct, *others)))
-    turned = [other / unit * np.exp(-1j * np.angle(direct)) for other in others]
+    unit = max(np.finfo(float).tiny, *(float(np.abs(light).max()) for light in (direct, *indirect)))
+    turned = [other / unit * np.exp(-1j * np.angle(direct)) for other in indirect]
 
     def mean(layers: list[Floats], width: float) -> Floats:
         return smoothed(np.array(layers, np.float32), shape, width / step).astype(float)
 
-    parts = mean([part for one in turned for part in (one.real, one.imag)], WINDOW_PX)
+    parts = mean([part for ratio in turned for part in (ratio.real, ratio.imag)], WINDOW_PX)
     first, second = parts[0] + 1j * parts[1], parts[2] + 1j * parts[3]
     middle = (first + second) / 2
     every = (turned[0] * turned[1].conj()).real
@@ -151,5 +151,5 @@ def phase_bias(
     with np.errstate(divide="ignore", invalid="ignore"):
         z = middle * np.clip(agreed / power, 0.0, 1.0) / (size / unit)
         left = np.sqrt(np.maximum(whole - np.maximum(agreed, 0.0), 0.0) / 2) / (size / unit)
-    known = np.isfinite(z) & np.isfinite(left)
-    return np.asarray(np.angle(1 + np.where(known, z, 0.0))), np.where(known, np.minimum(left, math.pi), 0.0)
+    finite = np.isfinite(z) & np.isfinite(left)
+    return np.asarray(np.angle(1 + np.where(finite, z, 0.0))), np.where(finite, np.minimum(left, math.pi), 0.0)

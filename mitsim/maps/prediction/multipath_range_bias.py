@@ -33,8 +33,8 @@ WINDOW_PX = 1.5
 
 def path_amplitudes(images: NDArray[np.floating], code: AmplitudeModulation) -> Complex:
     """Return the complex amplitude (F, H, W) of the correlations (P, H, W); its argument is the phase."""
-    each = np.asarray(images, float).reshape(-1, code.steps, *images.shape[1:])
-    return np.asarray(np.einsum("k,fkij->fij", np.exp(1j * code.delays) * 2 / code.steps, each))
+    by_frequency = np.asarray(images, float).reshape(-1, code.steps, *images.shape[1:])
+    return np.asarray(np.einsum("k,fkij->fij", np.exp(1j * code.delays) * 2 / code.steps, by_frequency))
 
 
 def path_bias(
@@ -61,8 +61,8 @@ def path_bias(
     step
         Number of sensor pixels per pixel along an axis.
     """
-    size, own = np.abs(direct), np.angle(direct)
-    turned = other * np.exp(-1j * own)
+    size, direct_phase = np.abs(direct), np.angle(direct)
+    turned = other * np.exp(-1j * direct_phase)
     layers = np.concatenate([turned.real, turned.imag]).astype(np.float32)
     mean = smoothed(layers, shape, WINDOW_PX / step).astype(float)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -71,13 +71,13 @@ def path_bias(
     z = np.where(lit, z, 0.0)
     noise = np.stack(
         [
-            sample_variance(one, float(contrast), imager) * 2 / code.steps / np.maximum(one, 1e-3) ** 2
-            for one, contrast in zip((size * np.abs(1 + z)).astype(np.float32), code.contrasts, strict=True)
+            sample_variance(level, float(contrast), imager) * 2 / code.steps / np.maximum(level, 1e-3) ** 2
+            for level, contrast in zip((size * np.abs(1 + z)).astype(np.float32), code.contrasts, strict=True)
         ]
     ).astype(np.float32)
     nominal, read = (
         joint_path(np.mod(phase, 2 * math.pi).astype(np.float32), noise, code, settings.systematic_rad)
-        for phase in (own, own + np.angle(1 + z))
+        for phase in (direct_phase, direct_phase + np.angle(1 + z))
     )
     rejected = lit & (read[2] > settings.consistency_sigma**2)
     return np.where(lit, read[0] - nominal[0], 0.0), rejected.astype(float)

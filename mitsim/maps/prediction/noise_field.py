@@ -99,14 +99,17 @@ def correlated_noise(
 
         def ask(run: slice, chosen: NDArray[np.intp] = chosen, finish: Finish = finish) -> None:
             at = chosen[run]
-            found = noise_structure(
+            structure = noise_structure(
                 performance_map, finish.name, finish.roughness, distance[at], normal[at].astype(float), finish.light
             )
-            area[at], share[at] = found.area, np.hypot(found.persistent_share, np.nan_to_num(found.bias_share))
+            area[at], share[at] = (
+                structure.area,
+                np.hypot(structure.persistent_share, np.nan_to_num(structure.bias_share)),
+            )
 
         _run_in_threads(ask, len(chosen), _LOOK_UP_POINTS)
-    own, strength = own_field(area, fraction)
-    noise = averaging_field(own, pixel, rng) * strength
+    field_area, strength = own_field(area, fraction)
+    noise = averaging_field(field_area, pixel, rng) * strength
     for chosen in members.values():
         lasting = np.nan_to_num(share[chosen]).astype(np.float32)
         if lasting.any():
@@ -123,22 +126,22 @@ def own_field(area: Floats, fraction: NDArray[np.floating]) -> tuple[Floats, Sin
     """
     with np.errstate(divide="ignore"):
         correlated = np.nan_to_num(np.maximum(area + 1 - 1 / fraction, 1.0), nan=1.0, neginf=1.0)
-    own = own_area(correlated, DISC_RADIUS)
-    return own, np.sqrt(correlated / own).astype(np.float32)
+    field_area = own_area(correlated, DISC_RADIUS)
+    return field_area, np.sqrt(correlated / field_area).astype(np.float32)
 
 
 def averaging_field(area: Floats, pixel: NDArray[np.int64], rng: np.random.Generator) -> Singles:
     """Return a Gaussian field of unit variance with the area (n,) [px^2], at least 1, at pixels (n, 2)."""
     if not len(pixel):
         return np.empty(0, np.float32)
-    place = pixel - pixel.min(axis=0)
+    offset = pixel - pixel.min(axis=0)
     low = np.floor(np.log2(np.maximum(area, 1.0))).astype(np.int64)
     used = np.flatnonzero(np.bincount(low)).tolist()
     border = math.ceil(_BORDER * math.sqrt(2.0 ** (used[-1] + 1)))
-    size = tuple(scipy.fft.next_fast_len(int(side) + 1 + border, real=True) for side in place.max(axis=0))
+    size = tuple(scipy.fft.next_fast_len(int(side) + 1 + border, real=True) for side in offset.max(axis=0))
     white = rng.standard_normal(size, dtype=np.float32)
     spectrum = scipy.fft.rfft2(white, workers=thread_count())
-    at = place @ np.array([size[1], 1])
+    at = offset @ np.array([size[1], 1])
 
     @lru_cache(maxsize=2)
     def graded(number: int) -> Singles:
@@ -167,7 +170,7 @@ def _ratio(area: Floats, lower: float, upper: float, correlation: float) -> Floa
 def _grade_correlation(number: int, size: tuple[int, ...]) -> float:
     """Return the correlation c between the fields of two neighbouring grades from the same white noise."""
     near, far = (_root_spectra(2.0**i, size) for i in (number, number + 1))
-    return math.prod(float(np.mean(one * other)) for one, other in zip(near, far, strict=True))
+    return math.prod(float(np.mean(factor * other)) for factor, other in zip(near, far, strict=True))
 
 
 def _root_spectra(area: float, size: tuple[int, ...]) -> list[Floats]:
@@ -182,15 +185,15 @@ def _root_spectra(area: float, size: tuple[int, ...]) -> list[Floats]:
 
 def persistent_field(pixel: NDArray[np.int64], normal: NDArray[np.floating], rng: np.random.Generator) -> Singles:
     """Return a field of unit variance that is similar at near pixels (n, 2) with similar normals (n, 3)."""
-    place = np.concatenate([pixel.T / PERSISTENT_REACH_PX, normal.T / PERSISTENT_TURN]).astype(np.float32)
-    frequency = rng.standard_normal((len(place), COSINES, 1), np.float32)
+    coordinates = np.concatenate([pixel.T / PERSISTENT_REACH_PX, normal.T / PERSISTENT_TURN]).astype(np.float32)
+    frequency = rng.standard_normal((len(coordinates), COSINES, 1), np.float32)
     phase = rng.uniform(0, 2 * math.pi, (COSINES, 1)).astype(np.float32)
-    total = np.empty(place.shape[1], np.float32)
+    total = np.empty(coordinates.shape[1], np.float32)
 
     def add(run: slice) -> None:
-        waves = phase + frequency[0] * place[0, run]  # no matrix product: BLAS threads would compete with ours
-        for along, one in zip(frequency[1:], place[1:], strict=True):
-            waves += along * one[run]
+        waves = phase + frequency[0] * coordinates[0, run]  # no matrix product: BLAS threads would compete with ours
+        for along, coordinate in zip(frequency[1:], coordinates[1:], strict=True):
+            waves += along * coordinate[run]
         total[run] = np.cos(waves, out=waves).sum(axis=0)
 
     _run_in_threads(add, len(total), _WAVE_POINTS)

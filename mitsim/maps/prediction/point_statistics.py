@@ -45,8 +45,8 @@ def performance(
     """
     fraction = np.full(len(ideal.pixel), np.nan)
     sigma = np.full(len(ideal.pixel), np.nan)
-    for index, own in enumerate(scene.finishes):
-        used = finish or own
+    for index, scene_finish in enumerate(scene.finishes):
+        used = finish or scene_finish
         mask = (ideal.shape == index) & (ideal.status == Status.VALID)
         if used is None or not mask.any():
             continue
@@ -106,7 +106,7 @@ def expected_points(
     if finish is None:
         mask[:] = False
     distance, normal = ideal.distance[mask], ideal.normal[mask]
-    place = np.stack(np.divmod(ideal.pixel[mask], labels.shape[1]), axis=-1)
+    pixel = np.stack(np.divmod(ideal.pixel[mask], labels.shape[1]), axis=-1)
     unknown = np.full(len(distance), np.nan)
     fraction, fraction_error, sigma, area, persistent = unknown, unknown, unknown, unknown, unknown
     displaced = np.zeros(len(distance))
@@ -118,7 +118,7 @@ def expected_points(
         area, persistent = structure.area, structure.persistent_share * sigma
         displaced = np.nan_to_num(structure.bias_share * sigma)
         if perturbation is not None:
-            fraction, fraction_error = (one * perturbation.kept[mask] for one in (fraction, fraction_error))
+            fraction, fraction_error = (value * perturbation.kept[mask] for value in (fraction, fraction_error))
             sigma = np.hypot(sigma * perturbation.noisier[mask], perturbation.scattered[mask])
             displaced = displaced + perturbation.displaced[mask]
     possible = np.isfinite(fraction) & (fraction > 0) & np.isfinite(sigma)
@@ -126,7 +126,7 @@ def expected_points(
     return ExpectedPoints(
         world_from_sensor.points(ideal.point[mask][possible]),
         ideal.ray[mask][possible] @ world_from_sensor.rotation.T,
-        np.rint(place[possible] * np.sqrt(view.thinning)).astype(np.int64),
+        np.rint(pixel[possible] * np.sqrt(view.thinning)).astype(np.int64),
         normal[possible],
         fraction,
         np.nan_to_num(fraction_error[possible]),

@@ -87,12 +87,12 @@ class Predictor:
         self.margin = -(-edge_margin_px // step)  # margin in cast rays, rounded up
         self.grid = grid = grid.thinned(step) if step > 1 else grid
         self.seen = seen_by_reference[step // 2 :: step, step // 2 :: step]
-        others = list(rig.cameras.values())[1:]
-        self.view = ViewRays(grid, self.seen, rig.baseline_direction, others, rig.projector)
+        cameras = list(rig.cameras.values())[1:]
+        self.view = ViewRays(grid, self.seen, rig.baseline_direction, cameras, rig.projector)
         self.rays = self.view.rays
         self.directions = grid.rays().reshape(-1, 3)
         self.single_directions = self.directions.astype(np.float32).reshape(grid.height, grid.width, 3)
-        self.eyes = [*others, *([rig.projector] if rig.projector else [])]
+        self.eyes = [*cameras, *([rig.projector] if rig.projector else [])]
 
     @staticmethod
     def of_sensor(sensor: Sensor, geometry: Geometry) -> Predictor:
@@ -168,18 +168,18 @@ class Predictor:
         rows, columns = np.nonzero((shape >= 0) & (labels < 0))
         if self.step == 1 or not len(rows):
             return labels
-        own = shape[rows, columns]
+        shapes = shape[rows, columns]
         beside = self.edge_margin_px * np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j])[..., None]
         row, column = (
-            np.clip((start + one) * self.step + self.step // 2 + aside, 0, size - 1)
-            for one, start, aside, size in (
+            np.clip((start + index) * self.step + self.step // 2 + aside, 0, size - 1)
+            for index, start, aside, size in (
                 (rows, roi.top, beside[:, 0], self.every.height),
                 (columns, roi.left, beside[:, 1], self.every.width),
             )
         )
         rays = PixelRays(self.every.origin, self.every.rays_at(column, row))
-        agree = (shapes_met(scene, rays, world_from_sensor) == own).all(axis=0)
-        labels[rows[agree], columns[agree]] = own[agree]
+        agree = (shapes_met(scene, rays, world_from_sensor) == shapes).all(axis=0)
+        labels[rows[agree], columns[agree]] = shapes[agree]
         return labels
 
     def look_up(
@@ -297,11 +297,11 @@ class Predictor:
         """Return points with errors ``noise`` (h, w) in units of sigma, kept if ``chance``, R_U (h, w), is below F."""
         part, size = seen.roi.slices, (self.grid.height, self.grid.width)
         visible = seen.status == Status.VALID
-        known = np.isfinite(seen.fraction) & (np.isfinite(seen.sigma) | (seen.fraction == 0))
-        kept = visible & known & (chance < seen.fraction)
+        mapped = np.isfinite(seen.fraction) & (np.isfinite(seen.sigma) | (seen.fraction == 0))
+        kept = visible & mapped & (chance < seen.fraction)
         status, spread = np.full(size, Status.NO_SURFACE, np.uint8), np.full(size, np.nan, np.float32)
         points = np.full((*size, 3), np.nan, np.float32)
-        lost = np.where(known, np.uint8(Status.DROPPED), np.uint8(Status.OUT_OF_RANGE))
+        lost = np.where(mapped, np.uint8(Status.DROPPED), np.uint8(Status.OUT_OF_RANGE))
         status[part] = np.where(visible & ~kept, lost, seen.status)
         spread[part] = np.where(kept, seen.sigma, np.nan)
         distance = np.where(kept, seen.distance + noise * seen.sigma, np.nan).astype(np.float32, copy=False)

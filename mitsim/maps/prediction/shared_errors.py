@@ -40,8 +40,8 @@ class SharedErrors:
         """
         with np.errstate(invalid="ignore", divide="ignore"):
             weight = normal / (normal * ray).sum(1, keepdims=True)
-        known = terms(points)
-        moved = [((known @ coefficient) * weight).sum(1) for coefficient in self.coefficients]
+        values = terms(points)
+        moved = [((values @ coefficient) * weight).sum(1) for coefficient in self.coefficients]
         return np.stack(moved, axis=1) if moved else np.zeros((len(points), 0))
 
 
@@ -57,15 +57,15 @@ def independent_fields(points: Floats, moves: Floats) -> SharedErrors:
     variance = np.cumsum(size**2)
     count = int(np.searchsorted(variance, (1 - LEFT_OUT) * variance[-1])) + 1 if variance[-1] > 0 else 0
     fields = (size[:count, None] * axes[:count]).reshape(count, fine.sum(), 3)
-    known = terms(points[fine])
-    solution, *_ = np.linalg.lstsq(known, np.moveaxis(fields, 0, 1).reshape(len(known), 3 * count), rcond=None)
-    return SharedErrors(np.moveaxis(solution.reshape(known.shape[1], count, 3), 1, 0))
+    values = terms(points[fine])
+    solution, *_ = np.linalg.lstsq(values, np.moveaxis(fields, 0, 1).reshape(len(values), 3 * count), rcond=None)
+    return SharedErrors(np.moveaxis(solution.reshape(values.shape[1], count, 3), 1, 0))
 
 
 def terms(points: Floats) -> Floats:
     """Return polynomial terms (n, 30): direction to the third order, times distance to the powers 0, 1 and 2."""
     depth = points[:, 2]
     x, y, z = points[:, 0] / depth, points[:, 1] / depth, depth / _SCALE_MM
-    one = np.ones(len(points))
-    shape = [one, x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3]
+    constant = np.ones(len(points))
+    shape = [constant, x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3]
     return np.stack([term * z**power for power in (0, 1, 2) for term in shape], axis=1)
