@@ -261,7 +261,7 @@ def lens_model(
     Raises
     ------
     InputError
-        If the model is none of OpenCV's, or contradicts the given one.
+        If the model is none of OpenCV's, or contradicts ``model``.
     """
     stated_model: str | None = None
     for name in LENS_MODELS:

@@ -59,7 +59,7 @@ def offset_in_pixels(offset: Offset | None, bits: int, stripe: float, extent: in
 
 
 def origin_shift(wave: Wave, at: Origin, period: float) -> float:
-    """Return what a wave and its origin add to the shift delta of a cosine that counts from the edge [rad].
+    """Return the shift [rad] that a wave and its origin add to that of a cosine that counts from the edge, delta.
 
     cos(2 pi u / P - delta) = cos(2 pi (u + 0.5) / P - delta - pi / P), and sin(x) = cos(x - pi / 2).
     """

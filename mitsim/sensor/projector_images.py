@@ -77,7 +77,7 @@ class ProjectorImages:
 
     @property
     def description(self) -> ImagesDescription:
-        """Return what a capture says of the images."""
+        """Return the description of the images that a capture keeps."""
         return ImagesDescription(kind=self.kind, count=self.count, sha256=self.sha256)
 
     def patterns(self) -> NDArray[np.float32]:

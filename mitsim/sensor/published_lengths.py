@@ -44,7 +44,7 @@ class PublishedLengths(Document):
         return self
 
     def one_sigma(self, distance_mm: float) -> float:
-        """Return the standard deviation of a normal error with this share, at a distance; NaN outside the given ones.
+        """Return the standard deviation of a normal error with this share, at a distance; NaN outside its distances.
 
         Between distances it is linear.
         """

@@ -33,7 +33,7 @@ class PublishedNoise(Document):
         return self
 
     def at(self, distance_mm: ArrayLike) -> NDArray[np.float64]:
-        """Interpolate sigma [mm] at distances [mm], linearly in the logarithms; NaN outside the given ones."""
+        """Interpolate sigma [mm] at distances [mm], linearly in the logarithms; NaN outside its distances."""
         with np.errstate(divide="ignore"):
             x, knots = np.log(np.asarray(distance_mm, float)), np.log(self.distance_mm)
         inside = (x >= knots[0] - 1e-9) & (x <= knots[-1] + 1e-9)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mitsim.sensor.sensor import Sensor
 
-#: share of full scale that a matt white plate reaches at most by light of the room. It is chosen: what is left is for
+#: share of full scale that a matt white plate reaches at most by light of the room. It is chosen: the remainder is for
 #: slopes toward the light, interreflections and fixed pattern
 FULLEST = 0.9
 

@@ -190,7 +190,7 @@ class FringeChange:
         return np.asarray(listed + origin_shift(wave, at, fringes.period) + np.pi * self.half_turn)
 
     def in_words(self, fringes: DescribedFringes) -> str:
-        """Return what to write in the sensor file."""
+        """Return the keys to write in the sensor file, in words."""
         parts = [
             (self.reverse, "the shifts in the reverse order"),
             (

@@ -218,7 +218,7 @@ def _states_origins(code: LightCode) -> bool:
 
 
 def _in_words(origins: Origins) -> str:
-    """Return what to write in the sensor file."""
+    """Return the key to write in the sensor file, in words."""
     offset = next(iter(origins.values()))
     value = f'"{offset}"' if isinstance(offset, str) else f"{offset:g}"
     return f"the Gray code of the {' and '.join(origins)} has offset_px = {value} in [pattern]"

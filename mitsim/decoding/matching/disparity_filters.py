@@ -17,7 +17,7 @@ Disparities = NDArray[np.float32]
 #: steps of a disparity in which regions are compared [1/px]: those of OpenCV's matchers
 _STEPS_PER_PX = 16
 
-#: integer of a pixel without a disparity: known ones are clipped to stay above it
+#: integer of a pixel without a disparity: disparities are clipped to stay above it
 _NONE = np.iinfo(np.int16).min
 
 

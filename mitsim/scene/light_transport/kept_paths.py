@@ -220,7 +220,7 @@ def mattering(
     index, probability = order[kept], probability[kept]
     del size, pixel, order, reached
     rows, chosen, first = list[NDArray[np.integer]](), list[CandidatePaths](), 0
-    for part in parts:  # never all candidates together, which are many times as large as what is kept
+    for part in parts:  # never all candidates together, which are many times as large as the kept paths
         of_part = np.flatnonzero((index >= first) & (index < first + len(part)))
         rows.append(of_part)
         chosen.append(part.chosen(index[of_part] - first))

@@ -96,7 +96,7 @@ class _BsdfOfLane:
 
 
 def intersect_plane(plane: Any, ray: Any) -> Any:
-    """Return what ``mi.Scene.ray_intersect`` returns for a scene that is a :func:`single_plane`."""
+    """Return the intersection of a ray with a :func:`single_plane`, as ``mi.Scene.ray_intersect`` does."""
     intersection = plane.ray_intersect_preliminary(ray)
     hit = intersection.is_valid()
     surface = plane.compute_surface_interaction(ray, intersection, mi.RayFlags.All, hit)

@@ -38,7 +38,7 @@ class SeenSurfaces:
 
     @classmethod
     def of(cls, scene: Scene, rays: PixelRays, world_from_sensor: Transform, roi: Roi | None = None) -> SeenSurfaces:
-        """Return what rays meet.
+        """Return the surfaces that rays meet.
 
         Parameters
         ----------

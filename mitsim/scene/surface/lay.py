@@ -19,7 +19,7 @@ LayLeftOut = Literal["round"]
 
 
 def lay_left_out(scatter: Scatter | None) -> LayLeftOut | None:
-    """Return what a map leaves out of the lay of a face; None if it leaves out nothing."""
+    """Return the simplification of a face's lay in a map; None if there is none."""
     return "round" if scatter is not None and scatter.lay_open and scatter.turn_deg is None else None
 
 
