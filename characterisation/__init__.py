@@ -82,8 +82,8 @@ def __getattr__(name: str) -> Any:
     """Import a public name when it is first used (PEP 562)."""
     if name not in _NAMES:
         raise AttributeError(f"module 'characterisation' has no attribute {name!r}")
-    found = globals()[name] = getattr(import_module(_NAMES[name]), name)
-    return found
+    member = globals()[name] = getattr(import_module(_NAMES[name]), name)
+    return member
 
 
 def __dir__() -> list[str]:

@@ -169,8 +169,8 @@ def _cloud_of(points: ArrayLike, viewpoint: ArrayLike, grid: ViewGrid | None) ->
         raise InputError(where, "points", f"an array {array.shape}", "(H, W, 3): one point per sensor pixel", hint)
     if eye.shape != (3,) or not np.isfinite(eye).all():
         raise InputError(where, "viewpoint", eye.tolist(), "three numbers [mm]")
-    known = np.isfinite(array).all(axis=-1)
-    array = np.where(known[..., None], array, np.nan)
+    finite = np.isfinite(array).all(axis=-1)
+    array = np.where(finite[..., None], array, np.nan)
     if grid is None:
         fitted = pinhole_of(array - eye)
         if fitted is None or fitted.rms > PINHOLE_RMS_PX:
@@ -185,9 +185,9 @@ def _cloud_of(points: ArrayLike, viewpoint: ArrayLike, grid: ViewGrid | None) ->
                 "give the grid of the pixels' rays; or points in camera axes (x right, y down, z forward) "
                 "with the camera's optical centre as viewpoint",
             )
-        height, width = known.shape
+        height, width = finite.shape
         grid = ViewGrid(fitted.fx, fitted.fy, fitted.cx, fitted.cy, width, height, origin=eye)
-    status = np.where(known, Status.VALID, Status.NO_SURFACE).astype(np.uint8)
+    status = np.where(finite, Status.VALID, Status.NO_SURFACE).astype(np.uint8)
     try:
         return PointCloud(array.astype(np.float32), status, grid, "own", "device")
     except ValueError as error:
@@ -238,7 +238,7 @@ def _coupon_seen(cloud: PointCloud) -> Coupon:
     across = across - (across @ plane.normal) * plane.normal
     across /= np.linalg.norm(across)
     along = np.cross(plane.normal, across)
-    ends = np.array([[np.min(met @ one), np.max(met @ one)] for one in (across, along)])
+    ends = np.array([[np.min(met @ direction), np.max(met @ direction)] for direction in (across, along)])
     middle = ends.mean(axis=1)
     centre = middle[0] * across + middle[1] * along + (plane.point @ plane.normal) * plane.normal
     size = np.ptp(ends, axis=1) * (1 + _BEYOND)

@@ -17,8 +17,8 @@ def lambert_projection(normals: NDArray[np.floating]) -> Floats:
     return np.asarray(normals[..., :2] * np.sqrt(2.0 / np.maximum(1.0 + z, 1e-12))[..., None])
 
 
-def inverse_lambert_projection(places: NDArray[np.floating]) -> Floats:
+def inverse_lambert_projection(positions: NDArray[np.floating]) -> Floats:
     """Return the unit normals (..., 3) of projected points (..., 2)."""
-    r2 = (np.asarray(places, float) ** 2).sum(-1)
+    r2 = (np.asarray(positions, float) ** 2).sum(-1)
     scale = np.sqrt(np.maximum(1.0 - r2 / 4.0, 0.0))
-    return np.concatenate([places * scale[..., None], (1.0 - r2 / 2.0)[..., None]], axis=-1)
+    return np.concatenate([positions * scale[..., None], (1.0 - r2 / 2.0)[..., None]], axis=-1)

@@ -43,12 +43,12 @@ def pinhole_of(points: NDArray[np.floating]) -> Pinhole | None:
     if len(z) < LEAST_POINTS or not (z > 0).all():
         return None
     lines = []
-    for slope, place in ((x / z, columns), (y / z, rows)):
-        if np.ptp(slope) < 1e-6 or np.ptp(place) < 8:
+    for slope, pixels in ((x / z, columns), (y / z, rows)):
+        if np.ptp(slope) < 1e-6 or np.ptp(pixels) < 8:
             return None
         design = np.stack([slope, np.ones(len(z))], axis=1)
-        (focal, centre), *_ = np.linalg.lstsq(design, place.astype(float), rcond=None)
-        lines.append((focal, centre, float(np.mean((design @ [focal, centre] - place) ** 2))))
+        (focal, centre), *_ = np.linalg.lstsq(design, pixels.astype(float), rcond=None)
+        lines.append((focal, centre, float(np.mean((design @ [focal, centre] - pixels) ** 2))))
     (fx, cx, error_x), (fy, cy, error_y) = lines
     if fx <= 0 or fy <= 0:
         return None

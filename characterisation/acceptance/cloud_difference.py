@@ -71,11 +71,11 @@ def difference_along_rays(cloud: PointCloud, reference: PointCloud, window: Wind
         allowed = f"the grid of the reference: {_described(reference.grid)}"
         hint = "or use the difference to the surface"
         raise InputError("difference along rays", "grid", _described(cloud.grid), allowed, hint)
-    one, other = (
-        np.linalg.norm(each.points[window].astype(np.float64) - each.grid.origin, axis=-1)
-        for each in (cloud, reference)
+    distance, reference_distance = (
+        np.linalg.norm(compared.points[window].astype(np.float64) - compared.grid.origin, axis=-1)
+        for compared in (cloud, reference)
     )
-    return np.asarray(one - other)
+    return np.asarray(distance - reference_distance)
 
 
 def difference_to_surface(
@@ -118,8 +118,8 @@ def difference_to_surface(
     searched = _Searched(surface, points, float(farthest.max(initial=0.0)))
     height = np.full(len(points), np.nan)
     for start in progress(range(0, len(points), _BLOCK)):
-        some = slice(start, start + _BLOCK)
-        height[some] = _to_surface(points[some], farthest[some], searched, cloud.grid.origin)
+        block = slice(start, start + _BLOCK)
+        height[block] = _to_surface(points[block], farthest[block], searched, cloud.grid.origin)
     out = np.full(valid.shape, np.nan)
     out[valid] = height
     return out
@@ -127,14 +127,21 @@ def difference_to_surface(
 
 def distribution(difference: Floats, points_given: int) -> Difference:
     """Return the distribution of a difference, for a cloud that has ``points_given`` points."""
-    known = difference[np.isfinite(difference)]
-    if len(known) < 2:
-        return Difference(len(known), points_given, *[float("nan")] * 6)
-    median = float(np.median(known))
-    low, high = np.quantile(known, [0.025, 0.975])
-    robust = MEDIAN_TO_STD * float(np.median(np.abs(known - median)))
+    finite = difference[np.isfinite(difference)]
+    if len(finite) < 2:
+        return Difference(len(finite), points_given, *[float("nan")] * 6)
+    median = float(np.median(finite))
+    low, high = np.quantile(finite, [0.025, 0.975])
+    robust = MEDIAN_TO_STD * float(np.median(np.abs(finite - median)))
     return Difference(
-        len(known), points_given, float(known.mean()), median, float(known.std(ddof=1)), robust, float(low), float(high)
+        len(finite),
+        points_given,
+        float(finite.mean()),
+        median,
+        float(finite.std(ddof=1)),
+        robust,
+        float(low),
+        float(high),
     )
 
 

@@ -36,10 +36,10 @@ def flatness_uncertainty(points: ArrayLike, rejected_share: float = REJECTED_SHA
 
     It is NaN if fewer than :data:`LEAST_REJECTED` points are rejected.
     """
-    known = _finite(points)
-    centred = known - known.mean(axis=0)
+    finite = _finite(points)
+    centred = finite - finite.mean(axis=0)
     axes = np.linalg.svd(centred, full_matrices=False)[2]
-    return _range_uncertainty(centred @ axes[:2].T, plane_distances(known), rejected_share)
+    return _range_uncertainty(centred @ axes[:2].T, plane_distances(finite), rejected_share)
 
 
 def form_error_uncertainty(points: ArrayLike, centre: ArrayLike, rejected_share: float = REJECTED_SHARE) -> float:
@@ -59,13 +59,13 @@ def _finite(points: ArrayLike) -> Floats:
     return np.asarray(array[np.isfinite(array).all(axis=1)])
 
 
-def _range_uncertainty(places: Floats, deviations: Floats, rejected_share: float) -> float:
-    """Return the standard deviation of the range of deviations (n,) at places (n, 2) whose noise is drawn again."""
+def _range_uncertainty(positions: Floats, deviations: Floats, rejected_share: float) -> float:
+    """Return the standard deviation of the range of deviations (n,) at positions (n, 2) whose noise is drawn again."""
     stay = len(deviations) - int(rejected_share * len(deviations))
     if len(deviations) - stay < LEAST_REJECTED:
         return float("nan")
-    low, high = places.min(axis=0), places.max(axis=0)
-    u, v = (2 * (places - low) / np.maximum(high - low, 1e-12) - 1).T
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    u, v = (2 * (positions - low) / np.maximum(high - low, 1e-12) - 1).T
     pairs = [(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
     along, across = legvander(u, DEGREE), legvander(v, DEGREE)
     modes = np.column_stack([along[:, i] * across[:, j] for i, j in pairs])

@@ -137,8 +137,10 @@ def sphere_spacing_error(
     if not calibrated_distance > 0:
         raise InputError("sphere_spacing_error", "calibrated_distance", calibrated_distance, "a positive length in mm")
     # the diameter does not affect the centre
-    one, other = (probing_error(points, calibrated_distance, rejected_share).centre for points in (first, second))
-    return float(np.linalg.norm(one - other) - calibrated_distance)
+    first_centre, second_centre = (
+        probing_error(points, calibrated_distance, rejected_share).centre for points in (first, second)
+    )
+    return float(np.linalg.norm(first_centre - second_centre) - calibrated_distance)
 
 
 def plane_distances(points: Floats) -> Floats:
@@ -174,8 +176,8 @@ def _sphere(points: Floats) -> tuple[Floats, float]:
     return middle + solution[:3], float(solution[3])
 
 
-def _usable(where: str, given: ArrayLike, least: int, rejected_share: float) -> Floats:
-    points: Floats = np.array(given, np.float64)
+def _usable(where: str, values: ArrayLike, least: int, rejected_share: float) -> Floats:
+    points: Floats = np.array(values, np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(where, "points", f"shape {points.shape}", "(n, 3)", "cloud.of_feature(name) gives such points")
     if not 0 <= rejected_share <= 0.1:

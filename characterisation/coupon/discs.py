@@ -62,10 +62,10 @@ def independent_share(centres: ArrayLike, radius: float) -> Floats:
     share = lens_share(np.linalg.norm(centres[pairs[:, 0]] - centres[pairs[:, 1]], axis=-1), radius)
     if not share.any():
         return np.ones(count)
-    one, other = pairs[share > 0].T
+    first, second = pairs[share > 0].T
     share = share[share > 0]
-    weight = 1.0 / (1.0 + np.bincount(one, share, count) + np.bincount(other, share, count))
-    groups, group = connected_components(coo_matrix((share, (one, other)), (count, count)), directed=False)
-    shared = np.bincount(group[one], share * weight[one] * weight[other], groups)
+    weight = 1.0 / (1.0 + np.bincount(first, share, count) + np.bincount(second, share, count))
+    groups, group = connected_components(coo_matrix((share, (first, second)), (count, count)), directed=False)
+    shared = np.bincount(group[first], share * weight[first] * weight[second], groups)
     variance = np.bincount(group, weight**2, groups) + 2.0 * shared
     return np.asarray(weight * (np.bincount(group, weight, groups) / variance)[group])

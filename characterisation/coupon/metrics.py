@@ -81,16 +81,16 @@ def ray_noise_std(points: NDArray[np.floating]) -> RayNoise:
     points = np.asarray(points, np.float64)
     shape = points.shape[:-2]
     # coordinates before points in memory, so that every sum runs along the last axis
-    place = np.ascontiguousarray(points.reshape(-1, *points.shape[-2:]).swapaxes(1, 2))
-    present = np.asarray(np.isfinite(place).all(1))
-    place[~np.broadcast_to(present[:, None], place.shape)] = 0.0
+    coordinates = np.ascontiguousarray(points.reshape(-1, *points.shape[-2:]).swapaxes(1, 2))
+    present = np.asarray(np.isfinite(coordinates).all(1))
+    coordinates[~np.broadcast_to(present[:, None], coordinates.shape)] = 0.0
     count = present.sum(-1)
-    distance = np.sqrt((place**2).sum(1))
-    mean_ray = (place / np.where(present, distance, 1.0)[:, None]).sum(-1)
+    distance = np.sqrt((coordinates**2).sum(1))
+    mean_ray = (coordinates / np.where(present, distance, 1.0)[:, None]).sum(-1)
     length = np.linalg.norm(mean_ray, axis=-1, keepdims=True)
     mean_ray = np.where(length > 0, mean_ray / np.where(length > 0, length, 1.0), [0.0, 0.0, 1.0])
 
-    inverse, residual, sigma = _fit_and_spread(place, distance, present, mean_ray)
+    inverse, residual, sigma = _fit_and_spread(coordinates, distance, present, mean_ray)
     enough = count > PLANE_PARAMETERS
     with np.errstate(divide="ignore", invalid="ignore"):
         robust = np.where(enough, _robust_sigma(residual, present), np.nan)
@@ -99,7 +99,7 @@ def ray_noise_std(points: NDArray[np.floating]) -> RayNoise:
         again = far.any(-1)
         if again.any():
             near = (present & ~far)[again]
-            inliers = np.where(near[:, None], place[again], 0.0), np.where(near, distance[again], 0.0)
+            inliers = np.where(near[:, None], coordinates[again], 0.0), np.where(near, distance[again], 0.0)
             inlier_residual = residual.copy()
             _, inlier_residual[again], inlier_sigma[again] = _fit_and_spread(*inliers, near, mean_ray[again])
         fields = RayNoise(
@@ -117,7 +117,7 @@ def ray_noise_std(points: NDArray[np.floating]) -> RayNoise:
 
 
 def _fit_and_spread(
-    place: Floats, distance: Floats, present: NDArray[np.bool_], mean_ray: Floats
+    coordinates: Floats, distance: Floats, present: NDArray[np.bool_], mean_ray: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """Fit planes along the rays; return them with the residuals and their standard deviations.
 
@@ -125,13 +125,13 @@ def _fit_and_spread(
     - The residuals along the rays, (p, n).
     - Their standard deviations with n - 3 degrees of freedom, (p,).
 
-    All are NaN where the points span no plane. ``place`` (p, 3, n) and ``distance`` (p, n) are 0 where ``present`` is
-    false.
+    All are NaN where the points span no plane. ``coordinates`` (p, 3, n) and ``distance`` (p, n) are 0 where
+    ``present`` is false.
     """
     # axes across and along the mean ray of the patch: its rays are almost parallel, so in other axes the normal
     # equations would be nearly singular. A row is t (d t) . a = t, which is 1/t = a.d with the weight t^2
     frame = _frame(mean_ray)
-    local = frame @ place
+    local = frame @ coordinates
     rows = local * distance[:, None]
     matrix = rows @ rows.swapaxes(1, 2)
     vector = (rows * distance[:, None]).sum(-1)
@@ -278,6 +278,6 @@ def reference_fraction(
         # the published quotient of (product - below), rearranged to avoid cancellation
         lower = np.where(theta > 0, low * (2 * theta - low) / (product + below), 0.0)
         upper = np.minimum((product + above) / (low_0 * (2 * theta_0 - low_0)), 1.0)
-        known = theta_0 > 0
-        fraction, excess = clipped(np.where(known, theta / theta_0, np.nan))
-    return fraction, np.where(known, np.minimum(lower, fraction), np.nan), np.where(known, upper, np.nan), excess
+        covered = theta_0 > 0
+        fraction, excess = clipped(np.where(covered, theta / theta_0, np.nan))
+    return fraction, np.where(covered, np.minimum(lower, fraction), np.nan), np.where(covered, upper, np.nan), excess

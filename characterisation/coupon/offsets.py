@@ -81,13 +81,13 @@ def neighbour_products(offset: Floats, centres: NDArray[np.integer], radius_px: 
     ``centres`` is (p, 2) [px]. The product is NaN where a patch or all of its neighbours have no offset.
     """
     out = np.full((2, len(offset)), np.nan)
-    known = np.flatnonzero(np.isfinite(offset))
-    if len(known) < 2:
+    finite = np.flatnonzero(np.isfinite(offset))
+    if len(finite) < 2:
         return out[0], out[1]
-    tree = cKDTree(centres[known])
+    tree = cKDTree(centres[finite])
     pairs = tree.query_pairs(APART[1] * 2 * radius_px, output_type="ndarray")
-    apart = np.linalg.norm(np.diff(centres[known][pairs], axis=1)[:, 0], axis=-1) / (2 * radius_px)
-    first, second = known[pairs.T]
+    apart = np.linalg.norm(np.diff(centres[finite][pairs], axis=1)[:, 0], axis=-1) / (2 * radius_px)
+    first, second = finite[pairs.T]
     product = offset[first] * offset[second]
     for values, (low, high) in zip(out, (TOUCHING, APART), strict=True):
         chosen = (apart >= low) & (apart <= high)
@@ -132,8 +132,8 @@ def _areas(radius_px: float) -> tuple[Floats, Floats]:
     square = ((offsets[:, None] - offsets) ** 2).sum(-1)
     a = np.geomspace(1.0, 400.0, 60)
     kept = []
-    for one in a:
-        correlation = np.exp(-np.pi * square / one)
+    for area in a:
+        correlation = np.exp(-np.pi * square / area)
         trace = len(offsets) - np.einsum("ik,ij,jk->", plane, correlation, plane)
         kept.append(trace / (len(offsets) - 3))
     areas = a / np.array(kept)

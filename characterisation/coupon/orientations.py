@@ -146,14 +146,14 @@ def refine(
         middles = normals[ends].sum(axis=1)
         middles /= np.linalg.norm(middles, axis=1, keepdims=True)
         away, middle = tree.query(middles) if len(middles) else (np.zeros(0), np.zeros(0, np.int64))
-        known = away < 1e-6
-        half_way[middle[known]] = True
+        existing = away < 1e-6
+        half_way[middle[existing]] = True
         for number, (values, errors, tolerance) in enumerate(measures):
-            bent[number, middle[known]] = _bent(values, errors, ends[known], middle[known], BENT * tolerance)
+            bent[number, middle[existing]] = _bent(values, errors, ends[existing], middle[existing], BENT * tolerance)
         halved = np.zeros(len(edges), bool)
         halved[of_faces[rough[of_faces].any(axis=1)]] = True
         halved[measured] |= uncertain[ends].any(axis=1) & has_sigma[ends].all(axis=1)
-        wanted = halved[measured] & ~known & (np.arccos(np.clip(middles[:, 2], -1, 1)) <= largest_angle)
+        wanted = halved[measured] & ~existing & (np.arccos(np.clip(middles[:, 2], -1, 1)) <= largest_angle)
         added.append(middles[wanted])
     new = np.concatenate(added) if added else np.empty((0, 3))
     # an edge belongs to one subdivision, so its midpoint is found only once

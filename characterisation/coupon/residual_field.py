@@ -37,10 +37,10 @@ class Autocorrelation:
         reach = len(self.values) // 2
         row, column = np.mgrid[-reach : reach + 1, -reach : reach + 1]
         square = row**2 + column**2
-        known = np.isfinite(self.values) & (square <= reach**2) & (self.pairs > 0)
-        lengths, ring = np.unique(square[known], return_inverse=True)
-        total = np.bincount(ring, (self.pairs * self.values)[known], len(lengths))
-        return np.sqrt(lengths), total / np.bincount(ring, self.pairs[known], len(lengths))
+        usable = np.isfinite(self.values) & (square <= reach**2) & (self.pairs > 0)
+        lengths, ring = np.unique(square[usable], return_inverse=True)
+        total = np.bincount(ring, (self.pairs * self.values)[usable], len(lengths))
+        return np.sqrt(lengths), total / np.bincount(ring, self.pairs[usable], len(lengths))
 
     def length(self) -> float:
         """Return the correlation length [px]; NaN if the field is unknown or rho stays above 1/e to the largest lag."""

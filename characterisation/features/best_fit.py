@@ -2,7 +2,7 @@
 
 Signal chain: points of each shape from each view, in one frame, as the poses are known before -> orthogonal distance of
 every point to its shape -> one least-squares adjustment of the poses of all views and of the parameters of all shapes,
-with what is known of the poses before -> motion of each view.
+with the prior of the poses -> motion of each view.
 
 Neither poses nor shapes are given: the shapes start as nominal and are free. A pose therefore has the error of
 generalised least squares (:mod:`characterisation.scores.joining`). Directions that the shapes leave open, as a plane
@@ -13,7 +13,7 @@ Points of a view and shape weigh by their variance s^2 and by the number a of th
     a = 1 + sum over all others j of rho_ij,
 
 with rho the correlation of their residuals about a shape of their own. Without it, information of thousands of points
-that are correlated would outweigh what is known of the poses.
+that are correlated would outweigh the prior of the poses.
 
 Clouds are not laid on one another point by point (iterative closest point). A decoder that matches windows has noise of
 bumps a few mm wide. The normals of a cloud follow the bumps, and so seem to determine what the shapes leave open.
@@ -86,7 +86,7 @@ def best_fit(
     views: Sequence[Mapping[str, Floats]],
     shapes: Mapping[str, Surface],
     about: Floats,
-    known: Floats,
+    pose_covariance: Floats,
     seed: int = 0,
 ) -> list[Floats]:
     """Return the motion (4, 4) of each view, in their order.
@@ -99,7 +99,7 @@ def best_fit(
         Nominal shapes in the frame of the points.
     about
         (3,) [mm] Centre of the rotations.
-    known
+    pose_covariance
         (6, 6) covariance of the motion [w (rad), t (mm)] that is expected of each view, of mean 0.
     seed
         Selects the random numbers of the fit.
@@ -116,7 +116,7 @@ def best_fit(
     fitted = {name: shapes[name] for name in names}
     motions = [np.eye(4) for _ in views]
     span = max(float(np.linalg.norm(part.points - about, axis=1).max()) for part in parts)
-    prior, chosen = np.linalg.inv(known), list[_Chosen]()
+    prior, chosen = np.linalg.inv(pose_covariance), list[_Chosen]()
     sizes = [fitted[name].parameter_count for name in names]
     starts = dict(zip(names, 6 * len(views) + np.cumsum([0, *sizes[:-1]]), strict=True))
     for number in range(STEPS):
@@ -127,12 +127,12 @@ def best_fit(
         normal = block_diag(*[prior] * len(views), np.zeros((sum(sizes), sum(sizes))))
         pull = np.zeros(len(normal))
         pull[: 6 * len(views)] = np.concatenate([prior @ _step_of(motion, about) for motion in motions])
-        for part, (_, residual, by_pose, by_shape), some in zip(parts, rows, chosen, strict=True):
-            g = np.hstack([by_pose, by_shape])[some.near]
+        for part, (_, residual, by_pose, by_shape), choice in zip(parts, rows, chosen, strict=True):
+            g = np.hstack([by_pose, by_shape])[choice.near]
             first = starts[part.shape]
             at = np.r_[6 * part.view : 6 * part.view + 6, first : first + by_shape.shape[1]]
-            normal[np.ix_(at, at)] += some.weight * g.T @ g
-            pull[at] += some.weight * g.T @ residual[some.near]
+            normal[np.ix_(at, at)] += choice.weight * g.T @ g
+            pull[at] += choice.weight * g.T @ residual[choice.near]
         step = _solved(normal, -pull)
         motions = [motion_matrix(step[6 * v : 6 * v + 6], about) @ motion for v, motion in enumerate(motions)]
         fitted = {
@@ -150,8 +150,8 @@ def _parts(views: Sequence[Mapping[str, Floats]], rng: np.random.Generator) -> l
     for number, view in enumerate(views):
         for name, points in view.items():
             if len(points) >= LEAST:
-                some = points if len(points) <= POINTS else points[rng.choice(len(points), POINTS, replace=False)]
-                parts.append(_Part(number, name, some, len(points) / len(some)))
+                sample = points if len(points) <= POINTS else points[rng.choice(len(points), POINTS, replace=False)]
+                parts.append(_Part(number, name, sample, len(points) / len(sample)))
     return parts
 
 
@@ -168,14 +168,14 @@ def _check_connected(parts: Sequence[_Part], count: int) -> None:
 
 def _linearised(part: _Part, motion: Floats, shape: Surface, about: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """Return places (n, 3), residuals (n,), and their derivatives by the motion (n, 6) and by the shape (n, p)."""
-    place = part.points @ motion[:3, :3].T + motion[:3, 3]
-    residual, by_shape, _ = shape.linearised(np.zeros(shape.parameter_count), place, None)
-    normal = shape.meet(place, None).normal
-    return place, residual, np.hstack([np.cross(place - about, normal), normal]), by_shape
+    points = part.points @ motion[:3, :3].T + motion[:3, 3]
+    residual, by_shape, _ = shape.linearised(np.zeros(shape.parameter_count), points, None)
+    normal = shape.meet(points, None).normal
+    return points, residual, np.hstack([np.cross(points - about, normal), normal]), by_shape
 
 
 def _choose(
-    place: Floats, residual: Floats, by_pose: Floats, by_shape: Floats, part: _Part, rng: np.random.Generator
+    points: Floats, residual: Floats, by_pose: Floats, by_shape: Floats, part: _Part, rng: np.random.Generator
 ) -> _Chosen:
     """Choose points within :data:`CLIP` robust standard deviations; weight them by residuals about their own shape.
 
@@ -187,15 +187,15 @@ def _choose(
     g = by_shape[near]
     left = residual[near] - g @ np.linalg.lstsq(g, residual[near], rcond=1e-9)[0]
     variance = max(float(left @ left) / len(left), np.finfo(float).tiny)
-    return _Chosen(near, part.thinning / (variance * counted_as_one(place[near], left, part.thinning, rng)))
+    return _Chosen(near, part.thinning / (variance * counted_as_one(points[near], left, part.thinning, rng)))
 
 
-def counted_as_one(place: Floats, residual: Floats, thinning: float, rng: np.random.Generator) -> float:
+def counted_as_one(points: Floats, residual: Floats, thinning: float, rng: np.random.Generator) -> float:
     """Return the number a of points whose residuals (n,), at places (n, 3), are as good as one; at least 1.
 
     Parameters
     ----------
-    place
+    points
         (n, 3) [mm].
     residual
         (n,) [mm].
@@ -204,10 +204,10 @@ def counted_as_one(place: Floats, residual: Floats, thinning: float, rng: np.ran
     rng
         Chooses the points about which correlation is summed.
     """
-    middles = rng.choice(len(place), min(_MIDDLES, len(place)), replace=False)
-    apart = cdist(place[middles], place)
+    middles = rng.choice(len(points), min(_MIDDLES, len(points)), replace=False)
+    apart = cdist(points[middles], points)
     product = residual[middles, None] * residual
-    near = min(4, len(place) - 1)
+    near = min(4, len(points) - 1)
     width = max(float(np.median(np.partition(apart[:20], near, axis=1)[:, near])), np.finfo(float).tiny)
     apart /= width
     np.minimum(apart, _RINGS, out=apart)

@@ -61,7 +61,7 @@ def check_surface(
     fit: PlaneFit | CylinderFit | SphereFit | ConeFit,
     nominal: Surface,
     points: ArrayLike,
-    places: ArrayLike,
+    positions: ArrayLike,
     viewpoint: ArrayLike | None = None,
 ) -> None:
     """Check that the fit of a surface is credible.
@@ -74,7 +74,7 @@ def check_surface(
         Its nominal geometry and place, in the frame of the points.
     points
         (n, 3) [mm], those that can lie on the surface.
-    places
+    positions
         (k, 3) [mm] on the nominal surface, where the sensor sees it (:func:`places_seen`).
     viewpoint
         (3,) [mm], optical centre of the sensor; None for points of several views.
@@ -82,11 +82,11 @@ def check_surface(
     Raises
     ------
     UndeterminedError
-        If the points do not determine the surface over these places.
+        If the points do not determine the surface over these positions.
     FitError
         If the fit lies too far from nominal there, or its residuals exceed those of the nominal surface.
     """
-    array, where = np.asarray(points, float).reshape(-1, 3), np.asarray(places, float).reshape(-1, 3)
+    array, where = np.asarray(points, float).reshape(-1, 3), np.asarray(positions, float).reshape(-1, 3)
     if not len(where):
         return
     rays = rays_from(viewpoint, array)
@@ -94,7 +94,7 @@ def check_surface(
     used = (np.abs(cosine) > GRAZING_COSINE) & (np.abs(residual) <= CLIP * max(fit.residual_std, _ROUNDING))
     nominal_residual, _ = distances(nominal, array[used], None if rays is None else rays[used])
     if residual[used] @ residual[used] > (1 + _ROUNDING) * (nominal_residual @ nominal_residual) + _ROUNDING**2:
-        sizes = [float(np.sqrt(np.mean(one**2))) for one in (residual[used], nominal_residual)]
+        sizes = [float(np.sqrt(np.mean(residuals**2))) for residuals in (residual[used], nominal_residual)]
         raise FitError(
             f"the fit has residuals of {sizes[0]:.2g} mm (root mean square), the nominal {nominal.kind} {sizes[1]:.2g}"
         )
@@ -142,9 +142,9 @@ def check_figure(fit: CircleFit | EdgePointFit, nominal: Circle | EdgePoint, rea
         _check(fit, nominal.point[None], reach, 1.0, "nominal point of the edge")
 
 
-def _check(fit: Fit, places: Array, limit: float, factor: float, reference: str) -> None:
-    """Check the distance of a fit from places (k, 3) [mm], and its uncertainty, against a limit [mm]."""
-    distance, jacobian, _ = fit.linearised(np.zeros(fit.parameter_count), places, None)
+def _check(fit: Fit, positions: Array, limit: float, factor: float, reference: str) -> None:
+    """Check the distance of a fit from positions (k, 3) [mm], and its uncertainty, against a limit [mm]."""
+    distance, jacobian, _ = fit.linearised(np.zeros(fit.parameter_count), positions, None)
     variance = np.einsum("ij,jk,ik->i", jacobian, fit.covariance, jacobian)
     uncertainty = float(np.sqrt(factor * max(variance.max(), 0.0)))
     most = most_uncertain(fit, limit)

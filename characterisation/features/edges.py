@@ -56,16 +56,16 @@ LEAST_FRACTION = 0.3
 
 
 class Crossings(NamedTuple):
-    """Places where an edge crosses rows and columns of the grid.
+    """Points where an edge crosses rows and columns of the grid.
 
-    - ``places`` (n, 3) [mm] on the plane, sensor frame.
-    - ``spread`` [mm]: expected standard deviation of one place along its row or column.
+    - ``points`` (n, 3) [mm] on the plane, sensor frame.
+    - ``spread`` [mm]: expected standard deviation of one point along its row or column.
     - ``fraction``: F of the face beside the edge.
-    - ``shared`` [mm]: common displacement of all places by one standard error of F.
+    - ``shared`` [mm]: common displacement of all points by one standard error of F.
     - ``lines`` (n,): number of the column (or row) beside which each lies, by which an edge along one is recognised.
     """
 
-    places: Array
+    points: Array
     spread: float
     fraction: float
     shared: float
@@ -103,14 +103,14 @@ def fit_circle(cloud: PointCloud, plane: PlaneFit, nominal: Circle, near: float 
         (:mod:`characterisation.features.credibility`).
     """
     nominal = nominal.seen_from(cloud.grid.origin).on_moved_plane(plane)
-    found = _crossings(cloud, plane, nominal, near)
-    circle, kept = _fit(nominal, found)
+    crossings = _crossings(cloud, plane, nominal, near)
+    circle, kept = _fit(nominal, crossings)
     if not 0.5 < circle.radius / nominal.radius < 1.5:
         raise FitError(f"the edge leads away from the nominal circle (radius {circle.radius:.4g} mm)")
     circle = circle.seen_from(cloud.grid.origin)
-    residual, jacobian, _ = circle.linearised(np.zeros(3), found.places[kept])
+    residual, jacobian, _ = circle.linearised(np.zeros(3), crossings.points[kept])
     covariance, residual_std, count = covariance_of(residual, jacobian, circle.kind)
-    covariance[2, 2] += found.shared**2
+    covariance[2, 2] += crossings.shared**2
     fit = CircleFit(circle.centre, circle.normal, circle.radius, circle.ray, covariance, residual_std, count)
     check_figure(fit, nominal, nominal.radius)
     return fit
@@ -140,14 +140,14 @@ def fit_edge_point(
     fit_circle : the edge of a hole
     """
     nominal = nominal.seen_from(cloud.grid.origin).on_moved_plane(plane)
-    found = _crossings(cloud, plane, nominal, near, reach)
-    edge, kept = _fit(nominal, found)
+    crossings = _crossings(cloud, plane, nominal, near, reach)
+    edge, kept = _fit(nominal, crossings)
     edge = edge.seen_from(cloud.grid.origin)
-    residual, jacobian, _ = edge.linearised(np.zeros(2), found.places[kept])
+    residual, jacobian, _ = edge.linearised(np.zeros(2), crossings.points[kept])
     covariance, residual_std, count = covariance_of(residual, jacobian, edge.kind)
     pitch = _pitch(cloud, edge)
-    floor = pitch**2 / 12 / len(np.unique(found.lines[kept])) ** 2
-    covariance[0, 0] = max(covariance[0, 0], floor) + found.shared**2
+    floor = pitch**2 / 12 / len(np.unique(crossings.lines[kept])) ** 2
+    covariance[0, 0] = max(covariance[0, 0], floor) + crossings.shared**2
     fit = EdgePointFit(edge.point, edge.direction, edge.normal, edge.slope, edge.ray, covariance, residual_std, count)
     check_figure(fit, nominal, reach)
     return fit
@@ -156,19 +156,19 @@ def fit_edge_point(
 Figure = TypeVar("Figure", Circle, EdgePoint)
 
 
-def _fit(nominal: Figure, found: Crossings) -> tuple[Figure, NDArray[np.bool_]]:
-    count = len(found.places)
+def _fit(nominal: Figure, crossings: Crossings) -> tuple[Figure, NDArray[np.bool_]]:
+    count = len(crossings.points)
     if count < LEAST_CROSSINGS:
         raise FitError(f"{count} crossings of the edge, at least {LEAST_CROSSINGS} are required")
-    if found.fraction < LEAST_FRACTION:
-        raise FitError(f"only {100 * found.fraction:.0f} % of the points of the face beside the edge are recovered")
+    if crossings.fraction < LEAST_FRACTION:
+        raise FitError(f"only {100 * crossings.fraction:.0f} % of the points of the face beside the edge are recovered")
 
     def linearised(
         figure: Figure, parameters: Array, chosen: NDArray[Any], along_rays: bool
     ) -> tuple[Array, Array, Array]:
-        return figure.linearised(parameters, found.places[chosen])
+        return figure.linearised(parameters, crossings.points[chosen])
 
-    return robust_fit(nominal, linearised, count, found.spread)
+    return robust_fit(nominal, linearised, count, crossings.spread)
 
 
 class _Ends(NamedTuple):
@@ -196,27 +196,27 @@ def _crossings(
     rays = cloud.grid.rays_at(columns, rows)
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = (plane.point - cloud.grid.origin) @ plane.normal / (rays @ plane.normal)
-    places = cloud.grid.origin + distance[..., None] * rays
+    points = cloud.grid.origin + distance[..., None] * rays
     limit = max(NEAR_STD * plane.residual_std, NEAR_MM) if near is None else near
     with np.errstate(invalid="ignore"):
-        behind = np.sum((cloud.points[rows, columns] - places) * rays, axis=-1)
+        behind = np.sum((cloud.points[rows, columns] - points) * rays, axis=-1)
         on_face = (behind <= limit) & (behind >= -2 * limit)
-    signed_distance, band = _signed_distance(figure, places, reach)
+    signed_distance, band = _signed_distance(figure, points, reach)
     down, right = np.gradient(signed_distance)
     steep = np.abs(right) >= np.abs(down)  # the edge crosses this row more steeply than this column
-    along_rows = _ends(on_face, signed_distance, band, steep, np.sign(right), places)
-    along_columns = _ends(on_face.T, signed_distance.T, band.T, ~steep.T, np.sign(down).T, places.swapaxes(0, 1))
+    along_rows = _ends(on_face, signed_distance, band, steep, np.sign(right), points)
+    along_columns = _ends(on_face.T, signed_distance.T, band.T, ~steep.T, np.sign(down).T, points.swapaxes(0, 1))
     shown, deeper = along_rows.shown + along_columns.shown, along_rows.deeper + along_columns.deeper
     last, following = (np.concatenate(pair) for pair in zip(along_rows[:2], along_columns[:2], strict=True))
     if len(last) == 0 or shown == 0:
         return _NONE
     fraction = shown / deeper
-    found = last + (0.5 + (1 - fraction) / fraction) * (following - last)
+    positions = last + (0.5 + (1 - fraction) / fraction) * (following - last)
     pitch = float(np.median(np.linalg.norm(following - last, axis=1)))
     spread = float(pitch * np.sqrt(1 / 12 + (1 - fraction) / fraction**2))
     shared = float(pitch * np.sqrt(ACROSS_THE_EDGE * fraction * (1 - fraction) / deeper) / fraction**2)
     lines = np.concatenate([2 * along_rows.line, 2 * along_columns.line + 1])
-    return Crossings(found, spread, fraction, shared, lines)
+    return Crossings(positions, spread, fraction, shared, lines)
 
 
 def _ends(
@@ -225,7 +225,7 @@ def _ends(
     band: NDArray[np.bool_],
     steep: NDArray[np.bool_],
     sign: Array,
-    places: Array,
+    points: Array,
 ) -> _Ends:
     """Find the ends of the face along each row, from the pixels that are ``on_face``.
 
@@ -240,8 +240,8 @@ def _ends(
     key, depth, shows, row, column = key[order], depth[order], shows[order], row[order], column[order]
     last = np.flatnonzero(np.diff(key, append=-1) != 0)
     next_column = column[last] + sign[row[last], column[last]].astype(np.intp)
-    found = shows[last] & steep[row[last], column[last]] & (next_column >= 0) & (next_column < on_face.shape[1])
-    last, next_column = last[found], next_column[found]
+    usable = shows[last] & steep[row[last], column[last]] & (next_column >= 0) & (next_column < on_face.shape[1])
+    last, next_column = last[usable], next_column[usable]
     inside = band[row[last], next_column]  # otherwise the band ends here, not the face
     last, next_column = last[inside], next_column[inside]
     # F is counted deeper in the face than the last pixel, which shows the face by selection
@@ -249,24 +249,24 @@ def _ends(
     end[key[last]] = depth[last]
     deeper = depth < end[key]
     return _Ends(
-        places[row[last], column[last]],
-        places[row[last], next_column],
+        points[row[last], column[last]],
+        points[row[last], next_column],
         column[last].astype(np.int64),
         int((shows & deeper).sum()),
         int(deeper.sum()),
     )
 
 
-def _signed_distance(figure: Circle | EdgePoint, places: Array, reach: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Return how far places (..., 3) on the plane lie outside the face [mm], and which lie where its edge is searched.
+def _signed_distance(figure: Circle | EdgePoint, points: Array, reach: float) -> tuple[Array, NDArray[np.bool_]]:
+    """Return how far points (..., 3) on the plane lie outside the face [mm], and which lie where its edge is searched.
 
     The distance grows toward the middle of a hole, and along the line over an edge.
     """
     if isinstance(figure, Circle):
-        local = (places - figure.centre) @ tangents(figure.normal).T
+        local = (points - figure.centre) @ tangents(figure.normal).T
         signed_distance = figure.radius - np.linalg.norm(local, axis=-1)
         return signed_distance, (signed_distance >= -figure.radius) & (signed_distance <= figure.radius / 2)
-    local = places - figure.point
+    local = points - figure.point
     signed_distance = local @ figure.direction
     sideways = local @ np.cross(figure.normal, figure.direction)
     return signed_distance, (np.abs(signed_distance) <= reach) & (np.abs(sideways) <= reach)

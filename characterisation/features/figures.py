@@ -191,9 +191,9 @@ def edge_covariance(
     return variance * np.diag([1.0, 3.0 / reach**2])
 
 
-def _slid(place: Array, ray: Array, plane: Plane) -> Array:
-    """Return the point where the line through a place along a ray meets a plane."""
-    slid: Array = place + (plane.point - place) @ plane.normal / (ray @ plane.normal) * ray
+def _slid(point: Array, ray: Array, plane: Plane) -> Array:
+    """Return the point where the line through another along a ray meets a plane."""
+    slid: Array = point + (plane.point - point) @ plane.normal / (ray @ plane.normal) * ray
     return slid
 
 

@@ -272,14 +272,14 @@ def belonging(points: ArrayLike, nominal: Surface, viewpoint: ArrayLike | None =
     """
     array = np.asarray(points, float).reshape(-1, 3)
     distance = np.abs(distances(nominal, array, None)[0])
-    known = np.isfinite(distance)
+    accepted = np.isfinite(distance)
     if viewpoint is not None:
-        known[known] = _not_false(array[known], nominal, np.asarray(viewpoint, float))
-    if not known.any():
-        return known
-    scale = float(np.quantile(distance[known], 0.25)) / QUARTER_TO_STD
+        accepted[accepted] = _not_false(array[accepted], nominal, np.asarray(viewpoint, float))
+    if not accepted.any():
+        return accepted
+    scale = float(np.quantile(distance[accepted], 0.25)) / QUARTER_TO_STD
     with np.errstate(invalid="ignore"):
-        return known & np.asarray(distance <= max(GATE * scale, LEAST_GATE_MM))
+        return accepted & np.asarray(distance <= max(GATE * scale, LEAST_GATE_MM))
 
 
 def _not_false(points: Array, nominal: Surface, viewpoint: Array) -> NDArray[np.bool_]:

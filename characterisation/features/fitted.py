@@ -96,6 +96,6 @@ def with_covariance(
     matrix = np.asarray(covariance, float)
     if matrix.shape != (shape.parameter_count,) * 2:
         raise ValueError(f"covariance is {matrix.shape}, a {shape.kind} has {shape.parameter_count} parameters")
-    plain = next(one for one in _FITS if isinstance(shape, one))
+    plain = next(fit_class for fit_class in _FITS if isinstance(shape, fit_class))
     geometry = {field.name: getattr(shape, field.name) for field in fields(plain)}
     return _FITS[plain](**geometry, covariance=matrix, residual_std=residual_std, count=count)

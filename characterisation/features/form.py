@@ -126,10 +126,10 @@ def node_modes(kind: str) -> Array:
     about its axis.
     """
     nodes = np.linspace(-1, 1, NODES)
-    u, v = (one.ravel() for one in np.meshgrid(nodes, nodes, indexing="ij"))
+    u, v = (grid.ravel() for grid in np.meshgrid(nodes, nodes, indexing="ij"))
     rigid = [(0, 0), (1, 0), (0, 1)] + ([(2, 0), (1, 1)] if kind == "cylinder" else [])
-    others = [(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) if (i, j) not in rigid]
-    columns = [legvander(u, DEGREE)[:, i] * legvander(v, DEGREE)[:, j] for i, j in [*rigid, *others]]
+    smooth_degrees = [(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) if (i, j) not in rigid]
+    columns = [legvander(u, DEGREE)[:, i] * legvander(v, DEGREE)[:, j] for i, j in [*rigid, *smooth_degrees]]
     modes: Array = np.linalg.qr(np.column_stack(columns))[0][:, len(rigid) :]
     return modes
 
@@ -180,19 +180,25 @@ class _Points:
     coordinates: Array
 
     @classmethod
-    def of(cls, surface: Plane | Cylinder, points: Array, rays: Array | None, at: Meeting, some: Any) -> _Points:
+    def of(cls, surface: Plane | Cylinder, points: Array, rays: Array | None, at: Meeting, selection: Any) -> _Points:
         """Return some of the points (n, 3), chosen by mask or slice, of which all meet a surface."""
-        rays, coordinates = None if rays is None else rays[some], _coordinates(surface, at.foot[some])
-        return cls(points[some], rays, at.residual[some], at.slope[some], np.array(coordinates))
+        rays, coordinates = None if rays is None else rays[selection], _coordinates(surface, at.foot[selection])
+        return cls(points[selection], rays, at.residual[selection], at.slope[selection], np.array(coordinates))
 
-    def among(self, some: NDArray[np.bool_]) -> _Points:
+    def among(self, selection: NDArray[np.bool_]) -> _Points:
         """Return the chosen points."""
-        rays = None if self.rays is None else self.rays[some]
-        return _Points(self.points[some], rays, self.residual[some], self.slope[some], self.coordinates[:, some])
+        rays = None if self.rays is None else self.rays[selection]
+        return _Points(
+            self.points[selection],
+            rays,
+            self.residual[selection],
+            self.slope[selection],
+            self.coordinates[:, selection],
+        )
 
-    def are_wider(self, some: NDArray[np.bool_]) -> bool:
-        """Return whether the points extend farther than some of them."""
-        extent, less = (np.ptp(places, axis=1) for places in (self.coordinates, self.coordinates[:, some]))
+    def are_wider(self, selection: NDArray[np.bool_]) -> bool:
+        """Return whether the points extend farther than a selection of them."""
+        extent, less = (np.ptp(values, axis=1) for values in (self.coordinates, self.coordinates[:, selection]))
         return bool((less < (1 - SAME_EXTENT) * extent).any())
 
 
@@ -203,7 +209,7 @@ def _rows(surface: Plane | Cylinder, at: _Points) -> tuple[Array, int]:
     """
     _check_count(surface, len(at.points))
     _, jacobian, _ = surface.linearised(np.zeros(surface.parameter_count), at.points, at.rays)
-    along_u, along_v = (np.ascontiguousarray(legvander(_scaled(places), DEGREE).T) for places in at.coordinates)
+    along_u, along_v = (np.ascontiguousarray(legvander(_scaled(values), DEGREE).T) for values in at.coordinates)
     rigid, _ = np.linalg.qr(jacobian / np.linalg.norm(jacobian, axis=0))
     first, second = np.nonzero(np.add.outer(np.arange(DEGREE + 1), np.arange(DEGREE + 1)) <= DEGREE)
     rows = np.empty((rigid.shape[1] + len(first), len(at.points)))
@@ -288,7 +294,7 @@ def fit_form(points: ArrayLike, surface: Plane | Cylinder, viewpoint: ArrayLike 
         variance * np.eye(count),
         float(np.sqrt(variance)),
         len(deviation),
-        np.column_stack([_scaled(places) for places in among.coordinates[:, chosen]]),
+        np.column_stack([_scaled(values) for values in among.coordinates[:, chosen]]),
         modes @ coefficients,
         float(np.sqrt(noise / len(deviation) * np.mean(slope**2))),
     )

@@ -128,11 +128,11 @@ def fit_pose(
         residual, cosine, jacobian = np.empty(len(chosen)), np.empty(len(chosen)), np.empty((len(chosen), 6))
         for number, surface in enumerate(surfaces):
             mine = np.flatnonzero(member[chosen] == number)
-            own = stacked[chosen[mine]]
+            surface_points = stacked[chosen[mine]]
             seen = rays[chosen[mine]] if along_rays and rays is not None else None
             placed = surface.placed(moved.sensor_from_part)
-            residual[mine], _, _, _, cosine[mine] = placed.meet(own, seen)
-            jacobian[mine] = pose_jacobian(placed, own, seen, moved.about)
+            residual[mine], _, _, _, cosine[mine] = placed.meet(surface_points, seen)
+            jacobian[mine] = pose_jacobian(placed, surface_points, seen, moved.about)
         jacobian[:, :3] = jacobian[:, :3] @ _left_jacobian(parameters[:3])
         return residual, jacobian, cosine
 
@@ -188,12 +188,12 @@ def _in_words(motions: Array, size: float, pose: Pose) -> list[str]:
     if len(shifts):
         basis, _ = np.linalg.qr(shifts.T)
         carried = carried - carried @ basis @ basis.T
-    words = [f"shift along {_formatted(one)}" for one in _reduced(shifts)]
+    words = [f"shift along {_formatted(shift)}" for shift in _reduced(shifts)]
     if rank:
         # t = w x (c - p) of all rotations: p is the common point of the axes nearest to the origin
         crosses = np.concatenate([np.cross(vector, np.eye(3)).T for vector in vectors])
         middle = np.linalg.lstsq(crosses, (np.cross(vectors, about) - carried).ravel(), rcond=1e-9)[0]
-        words += [f"turn about {_formatted(one)} through {_formatted(middle, size)}" for one in _reduced(vectors)]
+        words += [f"turn about {_formatted(vector)} through {_formatted(middle, size)}" for vector in _reduced(vectors)]
     return words
 
 
@@ -209,8 +209,8 @@ def _reduced(directions: Array) -> Array:
             continue
         rows[[done, best]] = rows[[best, done]]
         rows[done] /= rows[done, column]
-        others = np.arange(len(rows)) != done
-        rows[others] -= np.outer(rows[others, column], rows[done])
+        other_rows = np.arange(len(rows)) != done
+        rows[other_rows] -= np.outer(rows[other_rows, column], rows[done])
         done += 1
     unit_rows: Array = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
     return unit_rows

@@ -94,14 +94,14 @@ def robust_fit(
     """
     zero = np.zeros(shape.parameter_count)
     # the orthogonal distance converges from far; two passes, since the first scale is that of the starting geometry
-    some = np.arange(0, count, 1 + count // 4000)  # enough points for a starting value
+    sample = np.arange(0, count, 1 + count // 4000)  # enough points for a starting value
     for _ in range(2):
-        residual, _, _ = linearised(shape, zero, some, False)
-        shape = _solve(shape, linearised, some, False, "cauchy", max(robust_std(residual), least_scale))
+        residual, _, _ = linearised(shape, zero, sample, False)
+        shape = _solve(shape, linearised, sample, False, "cauchy", max(robust_std(residual), least_scale))
     every = np.arange(count)
-    found = _stepwise(shape, linearised, every, least_scale)
-    if found is not None:
-        return found
+    solution = _stepwise(shape, linearised, every, least_scale)
+    if solution is not None:
+        return solution
     kept = np.zeros(count, bool)
     for _ in range(CHOICES):
         residual, _, cosine = linearised(shape, zero, every, True)

@@ -47,8 +47,8 @@ def cylinder_start(points: ArrayLike) -> Cylinder:
     """
     points = usable(points, Cylinder.kind, Cylinder.parameter_count)
     count = min(max(_LEAST_NEIGHBOURS, round(_NEIGHBOUR_SHARE * len(points))), _MOST_NEIGHBOURS, len(points))
-    some = points[:: 1 + len(points) // _NORMALS]
-    _, index = cKDTree(points).query(some, count)
+    sample = points[:: 1 + len(points) // _NORMALS]
+    _, index = cKDTree(points).query(sample, count)
     patches = points[index] - points[index].mean(axis=1, keepdims=True)
     axis = _across(np.linalg.svd(patches, full_matrices=False)[2][:, -1])
     basis = tangents(axis)
@@ -81,20 +81,20 @@ def _across(normals: Array) -> Array:
     return axis if np.median(np.abs(normals @ axis)) * _MUCH < np.median(sines) else squares
 
 
-def _robust_circle(places: Array) -> tuple[Array, float]:
-    """Return centre (2,) and radius of the circle through most of the places (n, 2)."""
-    centre, radius = _circle(places)
-    return _nearer(places, centre, radius)
+def _robust_circle(points: Array) -> tuple[Array, float]:
+    """Return centre (2,) and radius of the circle through most of the points (n, 2)."""
+    centre, radius = _circle(points)
+    return _nearer(points, centre, radius)
 
 
-def _circle(places: Array) -> tuple[Array, float]:
-    """Return centre (2,) and radius of the circle through places (n, 2), by Pratt's algebraic fit.
+def _circle(points: Array) -> tuple[Array, float]:
+    """Return centre (2,) and radius of the circle through points (n, 2), by Pratt's algebraic fit.
 
     For a short arc, the simple algebraic fit (Kasa) gives too small a circle. Pratt's constraint B^2 + C^2 - 4 A D = 1
     avoids this (Chernov, Circular and Linear Regression, CRC 2010, section 5.5).
     """
-    scale = float(np.abs(places).max())
-    x, y = (places / scale).T
+    scale = float(np.abs(points).max())
+    x, y = (points / scale).T
     design = np.column_stack([x**2 + y**2, x, y, np.ones(len(x))])
     constraint = np.zeros((4, 4))
     constraint[0, 3] = constraint[3, 0] = -2.0
@@ -103,7 +103,7 @@ def _circle(places: Array) -> tuple[Array, float]:
     values = np.where(np.isfinite(values) & (np.abs(values.imag) < 1e-9), values.real, -1.0)
     allowed = np.flatnonzero(values > -1e-9)
     if not len(allowed):
-        raise FitError(f"{len(places)} points that do not determine a circle")
+        raise FitError(f"{len(points)} points that do not determine a circle")
     a, b, c, d = vectors[:, allowed[np.argmin(values[allowed])]].real
     if abs(a) < 1e-12:
         return np.zeros(2), np.inf
@@ -138,17 +138,17 @@ def _nearer(local: Array, centre: Array, radius: float) -> tuple[Array, float]:
     corners = _some_of(local, local.shape[1] + 1)
     middles = corners.mean(axis=1)
     sizes = np.maximum(np.ptp(corners, axis=1).max(axis=1), 1e-9 * extent)
-    places = (corners - middles[:, None]) / sizes[:, None, None]
-    designs = _linear(places)
+    scaled_corners = (corners - middles[:, None]) / sizes[:, None, None]
+    designs = _linear(scaled_corners)
     usable = np.abs(np.linalg.det(designs)) > 1e-6
     if not usable.any():
         return centre, radius
-    solved = np.linalg.solve(designs[usable], np.sum(places[usable] ** 2, axis=-1)[..., None])[..., 0]
+    solved = np.linalg.solve(designs[usable], np.sum(scaled_corners[usable] ** 2, axis=-1)[..., None])[..., 0]
     centres = solved[:, :-1]
     radii = sizes[usable] * np.sqrt(np.maximum(solved[:, -1] + np.sum(centres**2, axis=1), 0.0))
     centres = middles[usable] + sizes[usable, None] * centres
-    some = local[:: 1 + len(local) // _SOME]
-    apart = np.linalg.norm(some[:, None] - centres, axis=-1)
+    sample = local[:: 1 + len(local) // _SOME]
+    apart = np.linalg.norm(sample[:, None] - centres, axis=-1)
     medians = np.median(np.abs(apart - radii), axis=0)
     best = int(np.argmin(medians))
     if medians[best] * _MORE < np.median(off):
@@ -156,9 +156,9 @@ def _nearer(local: Array, centre: Array, radius: float) -> tuple[Array, float]:
     return centre, radius
 
 
-def _width(places: Array) -> float:
-    """Return the largest width over the axes of places (n, d), without the outer fifth of them on each axis."""
-    low, high = np.quantile(places, (0.1, 0.9), axis=0)
+def _width(points: Array) -> float:
+    """Return the largest width over the axes of points (n, d), without the outer fifth of them on each axis."""
+    low, high = np.quantile(points, (0.1, 0.9), axis=0)
     return float((high - low).max())
 
 
@@ -181,23 +181,23 @@ def plane_start(points: Array) -> Plane:
     if moments[0] < _THIN**2 * moments[1]:
         return squares
     rng = np.random.default_rng(len(points))
-    some = points if len(points) <= _SOME else points[rng.choice(len(points), _SOME, replace=False)]
-    corners = some[rng.integers(len(some), size=(_TRIPLES, 3))]
+    sample = points if len(points) <= _SOME else points[rng.choice(len(points), _SOME, replace=False)]
+    corners = sample[rng.integers(len(sample), size=(_TRIPLES, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1)
     usable = lengths > 1e-9 * lengths.max(initial=1e-300)
     if not usable.any():
         return squares
     normals, corners = normals[usable] / lengths[usable, None], corners[usable]
-    offsets = np.abs(some @ normals.T - np.einsum("ij,ij->i", corners[:, 0], normals))
+    offsets = np.abs(sample @ normals.T - np.einsum("ij,ij->i", corners[:, 0], normals))
     medians = np.median(offsets, axis=0)
     best = int(np.argmin(medians))
-    half = some[offsets[:, best] <= medians[best]]
-    place = half.mean(axis=0)
-    normal = np.linalg.eigh((half - place).T @ (half - place))[1][:, 0]
-    nearest = np.median(np.abs((some - place) @ normal))
-    if nearest * _MUCH < np.median(np.abs((some - middle) @ squares.normal)):
-        return Plane(place, normal)
+    half = sample[offsets[:, best] <= medians[best]]
+    centre = half.mean(axis=0)
+    normal = np.linalg.eigh((half - centre).T @ (half - centre))[1][:, 0]
+    nearest = np.median(np.abs((sample - centre) @ normal))
+    if nearest * _MUCH < np.median(np.abs((sample - middle) @ squares.normal)):
+        return Plane(centre, normal)
     return squares
 
 

@@ -129,13 +129,15 @@ class Plane:
         length = float(np.linalg.norm(self.normal + parameters[1:] @ basis))
         # by coordinate in the frame of normal, e1 and e2: rows of numbers, ten times faster than rows of points
         frame = np.array([moved.normal, *basis])
-        distance, *places = frame @ points.T - (frame @ moved.point)[:, None]
+        distance, *coordinates = frame @ points.T - (frame @ moved.point)[:, None]
         along = np.broadcast_to(moved.normal, points.shape) if rays is None else rays
         cosine, *rising = frame @ along.T
         slope = _guarded(cosine)
         residual = distance / slope
         by_shift = np.full(len(points), -(self.normal @ moved.normal))
-        by_tilts = [(place - residual * rise) / length for place, rise in zip(places, rising, strict=True)]
+        by_tilts = [
+            (coordinate - residual * rise) / length for coordinate, rise in zip(coordinates, rising, strict=True)
+        ]
         jacobian = np.array([by_shift, *by_tilts]) / slope
         return residual, jacobian.T, cosine
 
@@ -309,9 +311,9 @@ class Cone:
         length = float(np.linalg.norm(self.axis + parameters[2:4] @ basis))
         sine, cosine = np.sin(moved.half_angle), np.cos(moved.half_angle)
         # g = (reach - radius) cos - along sin, at the foot with rays and at the point without
-        place = (points if rays is None else at.foot) - moved.point
-        along = place @ moved.axis
-        radial = place - along[:, None] * moved.axis
+        offset = (points if rays is None else at.foot) - moved.point
+        along = offset @ moved.axis
+        radial = offset - along[:, None] * moved.axis
         reach = np.maximum(lengths(radial), 1e-12)
         sideways = radial / reach[:, None] @ basis.T
         lever = (cosine * along + sine * reach) / length

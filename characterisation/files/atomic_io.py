@@ -193,7 +193,7 @@ def write_json(path: str | Path, data: Any) -> None:
 def json_values(value: Any) -> Any:
     """Return a value for JSON: null for numbers that are not finite, lists for tuples; also inside lists and tables."""
     if isinstance(value, dict):
-        return {key: json_values(one) for key, one in value.items()}
+        return {key: json_values(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [json_values(one) for one in value]
+        return [json_values(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

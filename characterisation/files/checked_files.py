@@ -137,8 +137,8 @@ def is_inside(file: Path, folder: Path) -> bool:
 
 def content_checksum(table: dict[str, Any]) -> str:
     """Return the SHA-256 of a table as JSON with sorted keys and no spaces, without its ``checksum``."""
-    rest = {key: value for key, value in table.items() if key != "checksum"}
-    return hashlib.sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    content = {key: value for key, value in table.items() if key != "checksum"}
+    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 def dataset_digest(data: xr.Dataset) -> str:
@@ -149,8 +149,8 @@ def dataset_digest(data: xr.Dataset) -> str:
     import numpy as np
 
     def plain(attributes: dict[Any, Any]) -> list[Any]:
-        rest = {str(key): value for key, value in attributes.items() if key != DIGEST}
-        return [[key, np.atleast_1d(rest[key]).tolist()] for key in sorted(rest)]
+        entries = {str(key): value for key, value in attributes.items() if key != DIGEST}
+        return [[key, np.atleast_1d(entries[key]).tolist()] for key in sorted(entries)]
 
     digest = hashlib.sha256(json.dumps(plain(data.attrs), default=str).encode())
     for name in sorted(map(str, data.variables)):

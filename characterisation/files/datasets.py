@@ -157,11 +157,11 @@ def _check_bytes(path: Path, schema: Schema) -> None:
         done = subprocess.run(
             [sys.executable, "-c", _PROBE, str(path.resolve())], capture_output=True, timeout=PATIENCE_S, check=False
         )
-        found = "" if done.returncode == 0 else done.stderr.decode("utf-8", "replace").strip()[-200:] or "it crashes"
+        failure = "" if done.returncode == 0 else done.stderr.decode("utf-8", "replace").strip()[-200:] or "it crashes"
     except subprocess.TimeoutExpired:
-        found = f"its reader did not finish within {PATIENCE_S:g} s"
-    if found:
-        raise _unreadable(path, schema, f"({' '.join(found.split())})")
+        failure = f"its reader did not finish within {PATIENCE_S:g} s"
+    if failure:
+        raise _unreadable(path, schema, f"({' '.join(failure.split())})")
 
 
 def _unreadable(path: Path, schema: Schema, cause: str) -> InputError:
@@ -171,7 +171,7 @@ def _unreadable(path: Path, schema: Schema, cause: str) -> InputError:
 
 def _check_form(path: Path, data: xr.Dataset, schema: Schema) -> None:
     """Check the header of a file before any value is unpacked."""
-    missing = [name for name, one in schema.variables.items() if one.needed and name not in data.variables]
+    missing = [name for name, expected in schema.variables.items() if expected.needed and name not in data.variables]
     if missing:
         raise InputError(path, missing[0], "nothing", f"a variable of this name, as in {schema.made_by}", schema.hint)
     if data.nbytes > LARGEST_DATASET:
@@ -182,17 +182,17 @@ def _check_form(path: Path, data: xr.Dataset, schema: Schema) -> None:
     for name, value in data.attrs.items():
         if isinstance(value, str) and len(value) > LONGEST_TEXT:
             raise InputError(path, str(name)[:80], f"{len(value):,} characters", f"up to {LONGEST_TEXT:,}")
-    for name, one in schema.variables.items():
+    for name, expected in schema.variables.items():
         if name not in data.variables:
             continue
         variable = data.variables[name]
-        if variable.dims != one.dims:
+        if variable.dims != expected.dims:
             found = f"dimensions ({', '.join(map(str, variable.dims))})"
-            raise InputError(path, name, found, f"({', '.join(one.dims)})", schema.hint)
+            raise InputError(path, name, found, f"({', '.join(expected.dims)})", schema.hint)
         if packed := {"scale_factor", "add_offset"} & variable.encoding.keys():
             raise InputError(path, name, f"packed numbers ({', '.join(sorted(packed))})", "numbers as they are")
-        if variable.dtype.kind not in {"number": "fiu", "whole": "iu", "truth": "biu", "text": "OUS"}[one.kind]:
-            raise InputError(path, name, str(variable.dtype), _IN_WORDS[one.kind], schema.hint)
+        if variable.dtype.kind not in {"number": "fiu", "whole": "iu", "truth": "biu", "text": "OUS"}[expected.kind]:
+            raise InputError(path, name, str(variable.dtype), _IN_WORDS[expected.kind], schema.hint)
 
 
 def _check_values(path: Path, name: str, values: NDArray[Any], variable: Variable) -> None:

@@ -62,7 +62,9 @@ def checked_name(name: str) -> str:
         If the name is not allowed; pydantic turns it into an :class:`InputError`.
     """
     # marks belong to the letter before them, as in Thai and Hindi; none is a letter of its own
-    letters = name[:1] + "".join(one for one in name[1:] if not unicodedata.category(one).startswith("M"))
+    letters = name[:1] + "".join(
+        character for character in name[1:] if not unicodedata.category(character).startswith("M")
+    )
     if len(name.encode("utf-8", "replace")) > LONGEST_NAME or not re.fullmatch(_NAME, letters):
         raise ValueError(
             f"a name of at most {LONGEST_NAME} bytes that begins with a letter, digit or underscore, of these, spaces "
@@ -133,12 +135,12 @@ def _check_numbers(path: Path, table: Any, field: str = "") -> None:
     """Reject integers outside 64 bits."""
     entries = table.items() if isinstance(table, dict) else enumerate(table) if isinstance(table, list) else ()
     for key, value in entries:
-        place = f"{field}.{key}" if field else str(key)
+        location = f"{field}.{key}" if field else str(key)
         if isinstance(value, int) and not -(2**63) <= value < 2**63:
             digits = value.bit_length() * 3 // 10
-            raise InputError(path, place, f"a whole number of {digits} digits", "-2^63 to 2^63 - 1")
+            raise InputError(path, location, f"a whole number of {digits} digits", "-2^63 to 2^63 - 1")
         if isinstance(value, (dict, list)):
-            _check_numbers(path, value, place)
+            _check_numbers(path, value, location)
 
 
 def validate(where: str | Path, table: dict[str, Any], model: type[Model], context: Any = None) -> Model:
@@ -236,7 +238,7 @@ def _explain(
     faults = error.errors()
     # a misspelt key usually makes the correct key "missing" too: report the misspelling first, as the cause
     order = {"extra_forbidden": 0, "unexpected_keyword_argument": 0, "missing": 2, "union_tag_not_found": 2}
-    fault = min(faults, key=lambda each: order.get(each["type"], 1))
+    fault = min(faults, key=lambda candidate: order.get(candidate["type"], 1))
     location = _location(table, fault["loc"])
     field = ".".join(str(part) for part in location)
     context = fault.get("ctx", {})
@@ -244,22 +246,22 @@ def _explain(
     match fault["type"]:
         case "extra_forbidden" | "unexpected_keyword_argument":
             key = str(location[-1])
-            known = _keys_at(model, fault["loc"][:-1])
-            meant = nearest(key, known)
-            others = [each for each in missing if f"{each.rpartition('.')[2]!r}" not in meant]
-            also = f"Also missing: {', '.join(others)}" if others else ""
-            return InputError(where, field, "an unknown key", ", ".join(known) or "no keys", _joined(meant, also))
+            names = _keys_at(model, fault["loc"][:-1])
+            meant = nearest(key, names)
+            other_keys = [missing_key for missing_key in missing if f"{missing_key.rpartition('.')[2]!r}" not in meant]
+            also = f"Also missing: {', '.join(other_keys)}" if other_keys else ""
+            return InputError(where, field, "an unknown key", ", ".join(names) or "no keys", _joined(meant, also))
         case "missing" | "union_tag_not_found":
             return missing_error(where, missing or [field])
         case "union_tag_invalid":
             key = f"{field}.{context['discriminator'].strip(chr(39))}".strip(".")
-            known = [each.strip("' ") for each in context["expected_tags"].split(",")]
+            names = [tag.strip("' ") for tag in context["expected_tags"].split(",")]
             return InputError(
                 where,
                 key,
                 shown(context["tag"], where),
-                ", ".join(map(repr, known)),
-                _joined(nearest(str(context["tag"]), known), also),
+                ", ".join(map(repr, names)),
+                _joined(nearest(str(context["tag"]), names), also),
             )
         case "value_error":
             allowed = str(context.get("error", fault["msg"]))
@@ -299,18 +301,23 @@ def _keys_at(model: type[Document], location: tuple[Any, ...]) -> list[str]:
     """Return the keys of the table at a pydantic location, which also names validators and table variants."""
     here: list[Any] = [model]
     for part in location:
-        here = [each for option in here for each in _options(option)]
-        models = [each for each in here if _is_table(each)]
-        variants = [each for each in models if part in _tags(each)]
-        inside = [fields_of(each)[part].annotation for each in models if part in fields_of(each)]
-        values = [get_args(each)[-1] for each in here if get_origin(each) is dict]
-        items = [part_of for each in here if get_origin(each) in (list, tuple, set) for part_of in get_args(each)]
+        here = [member for option in here for member in _options(option)]
+        models = [annotation for annotation in here if _is_table(annotation)]
+        variants = [table for table in models if part in _tags(table)]
+        inside = [fields_of(table)[part].annotation for table in models if part in fields_of(table)]
+        values = [get_args(annotation)[-1] for annotation in here if get_origin(annotation) is dict]
+        items = [
+            part_of
+            for annotation in here
+            if get_origin(annotation) in (list, tuple, set)
+            for part_of in get_args(annotation)
+        ]
         if isinstance(part, int):
             here = items
         elif part != "[key]" and not str(part).startswith("function-"):
             here = variants or inside or values or here
-    here = [each for option in here for each in _options(option)]
-    return list(dict.fromkeys(name for each in here if _is_table(each) for name in fields_of(each)))
+    here = [member for option in here for member in _options(option)]
+    return list(dict.fromkeys(name for table in here if _is_table(table) for name in fields_of(table)))
 
 
 def _is_table(annotation: Any) -> bool:
@@ -324,8 +331,8 @@ def fields_of(model: type) -> Mapping[str, FieldInfo]:
     assert dataclasses.is_dataclass(model)
     hints = get_type_hints(model, include_extras=True)
     infos = {
-        each.name: FieldInfo.from_annotated_attribute(hints[each.name], each.default)
-        for each in dataclasses.fields(model)
+        field.name: FieldInfo.from_annotated_attribute(hints[field.name], field.default)
+        for field in dataclasses.fields(model)
     }
     return {info.alias or name: info for name, info in infos.items()}
 
@@ -335,14 +342,14 @@ def _options(annotation: Any) -> list[Any]:
     if get_origin(annotation) is Annotated:
         return _options(get_args(annotation)[0])
     if get_origin(annotation) in (Union, UnionType):
-        return [each for member in get_args(annotation) for each in _options(member)]
+        return [option for member in get_args(annotation) for option in _options(member)]
     return [annotation]
 
 
 def _tags(model: type) -> set[str]:
     """Return the values and the name by which pydantic tells a table variant from others."""
     literals = [field.annotation for field in fields_of(model).values() if get_origin(field.annotation) is Literal]
-    return {model.__name__, *(value for each in literals for value in get_args(each))}
+    return {model.__name__, *(value for literal in literals for value in get_args(literal))}
 
 
 def shown(value: Any, where: str | Path = "") -> str:
@@ -359,7 +366,7 @@ def shown(value: Any, where: str | Path = "") -> str:
 
 def _in_toml(value: Any) -> str:
     if isinstance(value, dict):
-        return "{ " + ", ".join(f"{key} = {_in_toml(each)}" for key, each in value.items()) + " }" if value else "{}"
+        return "{ " + ", ".join(f"{key} = {_in_toml(item)}" for key, item in value.items()) + " }" if value else "{}"
     if isinstance(value, (list, tuple)):
         return "[" + ", ".join(map(_in_toml, value)) + "]"
     if isinstance(value, bool):

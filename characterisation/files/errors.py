@@ -34,8 +34,8 @@ class InputError(ValueError):
 
     def __init__(self, where: str | Path, field: str, found: Any, allowed: str, hint: str = "") -> None:
         self.where, self.field, self.found, self.allowed, self.hint = str(where), field, found, allowed, hint
-        place = f"{_shortened(where)}: {_shortened(field)}" if field else _shortened(where)
-        super().__init__(f"{place}: found {_shortened(found)}; allowed: {allowed}" + (f". {hint}" if hint else ""))
+        location = f"{_shortened(where)}: {_shortened(field)}" if field else _shortened(where)
+        super().__init__(f"{location}: found {_shortened(found)}; allowed: {allowed}" + (f". {hint}" if hint else ""))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle all fields, so that the error can pass between processes."""
@@ -52,12 +52,12 @@ def _shortened(value: Any) -> str:
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"
 
 
-def nearest(name: str, known: list[str]) -> str:
-    """Return ``did you mean 'x'?`` for the known name nearest to a misspelt one, or an empty string.
+def nearest(name: str, names: list[str]) -> str:
+    """Return ``did you mean 'x'?`` for the name nearest to a misspelt one, or an empty string.
 
     Names are compared without capitals, and with spaces and underscores as hyphens.
     """
-    by_spelling = {_spelling(one): one for one in known}
+    by_spelling = {_spelling(candidate): candidate for candidate in names}
     close = get_close_matches(_spelling(name), list(by_spelling), n=1, cutoff=0.6)
     return f"did you mean {by_spelling[close[0]]!r}?" if close else ""
 

@@ -57,9 +57,9 @@ def in_threads(work: Callable[[Piece], Result], pieces: Iterable[Piece], most: i
 
     The first exception of a piece is raised.
     """
-    given = list(pieces)
-    count = min(thread_count(), most, len(given))
+    items = list(pieces)
+    count = min(thread_count(), most, len(items))
     if count < 2:
-        return [work(piece) for piece in given]
+        return [work(piece) for piece in items]
     with ThreadPoolExecutor(count) as threads:
-        return list(threads.map(work, given))
+        return list(threads.map(work, items))

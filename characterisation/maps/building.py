@@ -101,9 +101,9 @@ def build_map(
         lights[i] = table.light
         for name, values in pooled.items():
             fields[name][i, j] = values
-    for place, variants in ends.items():
+    for index, variants in ends.items():
         for name, spread in _SPREADS.items():
-            fields[spread][place] = _spread({variant: pooled[name] for variant, pooled in variants.items()})
+            fields[spread][index] = _spread({variant: pooled[name] for variant, pooled in variants.items()})
     dims = ("sample", "distance", "b", "a")
     data = xr.Dataset(
         {
@@ -138,22 +138,22 @@ def _at_nodes(table: SampleTable, axis: Floats, reach: float) -> dict[str, Float
     """Return the fields (b, a) of one sample at one distance."""
     b, a = np.meshgrid(axis, axis, indexing="ij")
     within = np.hypot(a, b) <= reach * (1 + 1e-9)
-    places = np.column_stack([a[within], b[within]])
-    pooled = pool(table.patches, table.distance, places)
-    offsets = pool_offsets(table.patches, places)
-    known = np.isfinite(pooled.sigma)
-    found = {
+    positions = np.column_stack([a[within], b[within]])
+    pooled = pool(table.patches, table.distance, positions)
+    offsets = pool_offsets(table.patches, positions)
+    finite = np.isfinite(pooled.sigma)
+    node_fields = {
         "recovered_fraction": pooled.fraction,
         "ray_noise_std": pooled.sigma,
         "recovered_fraction_error": pooled.fraction_error,
         "ray_noise_std_error": pooled.sigma_error,
         "false_fraction": pooled.false_fraction,
         "patches": pooled.patches,
-        "noise_area": np.where(known, offsets.area, np.nan),
-        "persistent_share": np.where(known, offsets.persistent, np.nan),
-        "bias_share": np.where(known, offsets.bias, np.nan),
+        "noise_area": np.where(finite, offsets.area, np.nan),
+        "persistent_share": np.where(finite, offsets.persistent, np.nan),
+        "bias_share": np.where(finite, offsets.bias, np.nan),
     }
-    out = {name: np.full(a.shape, np.nan) for name in found}
-    for name, values in found.items():
+    out = {name: np.full(a.shape, np.nan) for name in node_fields}
+    for name, values in node_fields.items():
         out[name][within] = values
     return out

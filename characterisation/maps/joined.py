@@ -22,11 +22,11 @@ _NODES = ("sample", "distance", "b", "a")
 _SAME_DISTANCE = 1e-6
 
 
-def with_samples(performance_map: PerformanceMap, others: Sequence[PerformanceMap]) -> PerformanceMap:
+def with_samples(performance_map: PerformanceMap, other_maps: Sequence[PerformanceMap]) -> PerformanceMap:
     """Return a map with the samples of other maps appended.
 
-    ``others`` are maps of the same sensor, at some of the distances of the first map. A sample that occurs in several
-    of them, each time at another distance, is joined to one. Attributes are those of the first map.
+    ``other_maps`` are of the same sensor, at some of the distances of the first map. A sample that occurs in several of
+    them, each time at another distance, is joined to one. Attributes are those of the first map.
 
     Raises
     ------
@@ -36,30 +36,32 @@ def with_samples(performance_map: PerformanceMap, others: Sequence[PerformanceMa
     data = performance_map.data
     distances, axis = data["distance"].values.astype(float), data["a"].values.astype(float)
     kinds = {str(name): values for name, values in data.data_vars.items() if values.dims == _NODES}
-    with_lay = next((one.data for one in (performance_map, *others) if "lay" in one.data.dims), None)
+    with_lay = next(
+        (candidate.data for candidate in (performance_map, *other_maps) if "lay" in candidate.data.dims), None
+    )
     if with_lay is not None:
         kinds |= {name: with_lay[name] for name in LAY_FIELDS.values()}
     samples, lights = list(performance_map.samples), list(performance_map.lights)
-    place: dict[str, int] = {}
+    index_of: dict[str, int] = {}
     missing = {
         name: np.full((*kind.shape[1:-3], len(distances), len(axis), len(axis)), np.nan, kind.dtype)
         for name, kind in kinds.items()
     }
     fields = {name: [*data[name].values] if name in data else [empty] * len(samples) for name, empty in missing.items()}
-    for other in others:
+    for other in other_maps:
         on_nodes = _on_axis(other.data, axis)
-        at = [_number_of(distances, float(one)) for one in other.data["distance"].values]
+        at = [_number_of(distances, float(distance)) for distance in other.data["distance"].values]
         for number, sample in enumerate(other.samples):
             key = f"{sample} {other.lights[number]}"
-            if key not in place:
-                place[key] = len(samples)
+            if key not in index_of:
+                index_of[key] = len(samples)
                 samples.append(sample)
                 lights.append(other.lights[number])
                 for name, empty in missing.items():
                     fields[name].append(empty.copy())
             for name in kinds:
                 if name in on_nodes:
-                    fields[name][place[key]][..., at, :, :] = on_nodes[name].values[number]
+                    fields[name][index_of[key]][..., at, :, :] = on_nodes[name].values[number]
     joined = xr.Dataset(
         {name: (kind.dims, np.stack(fields[name]).astype(kind.dtype), kind.attrs) for name, kind in kinds.items()},
         coords={
@@ -91,14 +93,14 @@ def mean_over(maps: Sequence[PerformanceMap]) -> PerformanceMap:
         mean = np.sqrt((share * np.nan_to_num(sigma) ** 2).sum(axis=0))
         spread = np.sqrt((share * (np.nan_to_num(sigma) - mean) ** 2).sum(axis=0))
         error = np.sqrt(((share * np.nan_to_num(sigma) * np.nan_to_num(sigma_error)) ** 2).sum(axis=0)) / mean
-        known = weight.sum(axis=0) > 0
+        weighted = weight.sum(axis=0) > 0
     fields = {
         "recovered_fraction": fraction.mean(axis=0),
-        "ray_noise_std": np.where(known, mean, np.nan),
+        "ray_noise_std": np.where(weighted, mean, np.nan),
         "recovered_fraction_error": np.sqrt((fraction_error**2).sum(axis=0)) / count,
-        "ray_noise_std_error": np.where(known, error, np.nan),
+        "ray_noise_std_error": np.where(weighted, error, np.nan),
         "recovered_fraction_spread": fraction.std(axis=0),
-        "ray_noise_std_spread": np.where(known, spread, np.nan),
+        "ray_noise_std_spread": np.where(weighted, spread, np.nan),
     }
     for name in ("false_fraction", "noise_area", "persistent_share", "bias_share", "patches"):
         if name not in data:
@@ -145,17 +147,17 @@ def with_directions(
 def _number_of(distances: np.ndarray, distance: float) -> int:
     number = int(np.abs(np.log(distances / distance)).argmin())
     if abs(distances[number] / distance - 1) > _SAME_DISTANCE:
-        known = ", ".join(f"{one:g}" for one in distances)
+        allowed = ", ".join(f"{value:g}" for value in distances)
         raise InputError(
-            "maps to be joined", "distance", f"{distance:g} mm", f"a distance of the first map: {known} mm"
+            "maps to be joined", "distance", f"{distance:g} mm", f"a distance of the first map: {allowed} mm"
         )
     return number
 
 
 def _on_axis(data: xr.Dataset, axis: np.ndarray) -> xr.Dataset:
     """Return the fields of a map at the nodes of another, bilinear where the nodes differ."""
-    own = data["a"].values.astype(float)
-    if len(own) == len(axis) and np.allclose(own, axis, atol=1e-9):
+    map_axis = data["a"].values.astype(float)
+    if len(map_axis) == len(axis) and np.allclose(map_axis, axis, atol=1e-9):
         return data
     return data[[name for name, values in data.data_vars.items() if values.dims in (_NODES, LAY_NODES)]].interp(
         a=axis, b=axis

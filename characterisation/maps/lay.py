@@ -79,8 +79,8 @@ def _rotated_with(vectors: NDArray[np.floating], start: NDArray[np.floating], en
     )
 
 
-def _dot(one: NDArray[np.floating], other: NDArray[np.floating]) -> Floats:
-    return np.asarray(np.sum(one * other, axis=-1, keepdims=True), float)
+def _dot(first: NDArray[np.floating], second: NDArray[np.floating]) -> Floats:
+    return np.asarray(np.sum(first * second, axis=-1, keepdims=True), float)
 
 
 def directions_of(data: xr.Dataset, sample: int) -> list[dict[str, Floats]]:
@@ -113,23 +113,23 @@ def between_directions(
     mean = surface.look_up(distance, normals)
     count, mirror = len(surface.directions), mirror_direction(distance, surface.mirror_mm)
     lay_deg = lay_angle_deg(normals, tangents, mirror)
-    place = np.where(np.isfinite(lay_deg), lay_deg, 0.0) % 180.0 * (count / 180.0)
-    before = np.minimum(place.astype(int), count - 1)
-    t = place - before
+    position = np.where(np.isfinite(lay_deg), lay_deg, 0.0) % 180.0 * (count / 180.0)
+    before = np.minimum(position.astype(int), count - 1)
+    t = position - before
     near = _in_directions(surface, before, distance, turned(normals, -t * 180.0 / count, mirror))
     far = _in_directions(surface, (before + 1) % count, distance, turned(normals, (1 - t) * 180.0 / count, mirror))
     near = [np.where(t > 1 - AT_KNOT, b, a) for a, b in zip(near, far, strict=True)]
     far = [np.where(t < AT_KNOT, a, b) for a, b in zip(near, far, strict=True)]
     with np.errstate(invalid="ignore", divide="ignore"):
         fraction, fraction_error = (1 - t) * near[0] + t * far[0], np.hypot((1 - t) * near[2], t * far[2])
-        one, other = (np.where(np.isnan(a[1]), b[1], a[1]) for a, b in ((near, far), (far, near)))
-        sigma = np.exp((1 - t) * np.log(one) + t * np.log(other))
+        near_sigma, far_sigma = (np.where(np.isnan(a[1]), b[1], a[1]) for a, b in ((near, far), (far, near)))
+        sigma = np.exp((1 - t) * np.log(near_sigma) + t * np.log(far_sigma))
         shares = [np.where(np.isnan(end[1]), np.nan, end[3] / end[1]) for end in (near, far)]
         sigma_error = sigma * np.hypot((1 - t) * shares[0], t * shares[1])
-    known = np.isfinite(lay_deg) & np.isfinite(fraction)
+    determined = np.isfinite(lay_deg) & np.isfinite(fraction)
     nothing = np.full(len(distance), np.nan)
-    found = [fraction, sigma, fraction_error, sigma_error, nothing, nothing]
-    return [np.where(known, own, whole) for own, whole in zip(found, mean, strict=True)]
+    answers = [fraction, sigma, fraction_error, sigma_error, nothing, nothing]
+    return [np.where(determined, answer, whole) for answer, whole in zip(answers, mean, strict=True)]
 
 
 def _in_directions(surface: Surface, number: NDArray[np.int64], distance: Floats, normals: Floats) -> list[Floats]:
@@ -138,6 +138,6 @@ def _in_directions(surface: Surface, number: NDArray[np.int64], distance: Floats
     for k, direction in enumerate(surface.directions):
         chosen = np.flatnonzero(number == k)
         if len(chosen):
-            for values, found in zip(out, direction.look_up(distance[chosen], normals[chosen]), strict=False):
-                values[chosen] = found
+            for values, answer in zip(out, direction.look_up(distance[chosen], normals[chosen]), strict=False):
+                values[chosen] = answer
     return out

@@ -124,7 +124,7 @@ def local_fit(
     radii: Floats,
     slopes: Slopes,
     link: Literal["identity", "log"] = "identity",
-    own: NDArray[np.int64] | None = None,
+    clusters: NDArray[np.int64] | None = None,
     keep: Literal["own", "others"] = "others",
 ) -> LocalFit:
     """Fit a line about every place, with each of its radii.
@@ -139,9 +139,9 @@ def local_fit(
         Prior of the slopes and bends.
     link
         Whether the line is that of the value or of its logarithm.
-    own, keep
-        (q,) a cluster for every place, and whether only this cluster (``own``) or only the others are used. Without
-        ``own``, all clusters are used.
+    clusters, keep
+        (q,) a cluster for every place, and whether only this cluster (``"own"``) or only the others are used. Without
+        ``clusters``, all are used.
     """
     estimate = np.full((*radii.shape, data.value.shape[1]), np.nan)
     sums = {name: np.full(radii.shape, np.nan) for name in ("independent", "clustered", "scatter", "rows", "weight")}
@@ -153,21 +153,21 @@ def local_fit(
             continue
         coarse, radius = data.joined(cell), radii[which, rung]
         by_abscissa = np.argsort(coarse.place[:, 0], kind="stable")
-        tiles, found = _tiles(at[which, :2], TILE * radius.min()), []
+        tiles, fits = _tiles(at[which, :2], TILE * radius.min()), []
         for chosen in tiles:
-            place = at[which[chosen]]
-            part = _Tile(coarse, by_abscissa, place, radius[chosen], slopes, link)
-            found.append(part.fit(radius[chosen], None if own is None else own[which[chosen]], keep))
+            positions = at[which[chosen]]
+            part = _Tile(coarse, by_abscissa, positions, radius[chosen], slopes, link)
+            fits.append(part.fit(radius[chosen], None if clusters is None else clusters[which[chosen]], keep))
         order = np.concatenate(tiles)
-        estimate[which[order], rung[order]] = np.concatenate([fit.estimate for fit in found])
+        estimate[which[order], rung[order]] = np.concatenate([fit.estimate for fit in fits])
         for name, values in sums.items():
-            values[which[order], rung[order]] = np.concatenate([getattr(fit, name) for fit in found])
+            values[which[order], rung[order]] = np.concatenate([getattr(fit, name) for fit in fits])
     return LocalFit(estimate, **sums)
 
 
-def _tiles(places: Floats, side: float) -> list[NDArray[np.int64]]:
-    """Return the indices of the places in each square of the plane; the places of a square share their data."""
-    tile = np.unique(np.floor(places / side), axis=0, return_inverse=True)[1].ravel()
+def _tiles(positions: Floats, side: float) -> list[NDArray[np.int64]]:
+    """Return the indices of the positions in each square of the plane; those of a square share their data."""
+    tile = np.unique(np.floor(positions / side), axis=0, return_inverse=True)[1].ravel()
     order = np.argsort(tile, kind="stable")
     return np.split(order, np.flatnonzero(np.diff(tile[order])) + 1)
 
@@ -177,11 +177,11 @@ def _exp(values: Floats) -> Floats:
     return np.asarray(np.exp(np.clip(values, -300.0, 300.0)))
 
 
-def _polynomial(place: Floats) -> Floats:
+def _polynomial(positions: Floats) -> Floats:
     """Return the regressors (n, 7) of displacements (n, 3): 1, a, b, x, a^2, a b, b^2."""
-    out = np.empty((len(place), 7))
-    a, b = place[:, 0], place[:, 1]
-    out[:, 0], out[:, 1:4] = 1.0, place
+    out = np.empty((len(positions), 7))
+    a, b = positions[:, 0], positions[:, 1]
+    out[:, 0], out[:, 1:4] = 1.0, positions
     out[:, 4], out[:, 5], out[:, 6] = a * a, a * b, b * b
     return out
 
@@ -212,15 +212,15 @@ class _Tile:
         self.cluster, self.within = data.cluster[near], data.within[near]
         self.starts = np.flatnonzero(np.concatenate([[True], self.cluster[1:] != self.cluster[:-1]]))
 
-    def fit(self, radius: Floats, own: NDArray[np.int64] | None, keep: str) -> LocalFit:
+    def fit(self, radius: Floats, clusters: NDArray[np.int64] | None, keep: str) -> LocalFit:
         """Fit every place of the tile, see :func:`local_fit`."""
         here, x = self.offset, self.design
         if not len(x):
             return LocalFit(np.full((len(here), self.value.shape[1]), np.nan), *np.full((5, len(here)), np.nan))
         apart = (here[:, None, 1] - x[:, 1]) ** 2 + (here[:, None, 2] - x[:, 2]) ** 2
         weight: Floats = np.maximum(1.0 - apart / (radius**2)[:, None], 0.0) ** 2 * self.base
-        if own is not None:
-            weight[(self.cluster == own[:, None]) == (keep == "others")] = 0.0
+        if clusters is not None:
+            weight[(self.cluster == clusters[:, None]) == (keep == "others")] = 0.0
         total: Floats = weight.sum(1)
         unknown = np.flatnonzero(~(total > 0))
         products = (x[:, :, None] * x[:, None, :]).reshape(len(x), -1)

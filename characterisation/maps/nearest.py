@@ -5,7 +5,7 @@ of the brightness at wide angles and of the width of the lobe -> nearest sample 
 surface's own name, with the expected errors of F and sigma.
 
 This serves screening alone, where virtual measurements of the surface itself follow. The expected errors come from the
-maps that come with mitsim: each of their samples, predicted by the nearest other one.
+maps that come with mitsim: each of their samples, predicted by the nearest other sample.
 """
 
 from __future__ import annotations
@@ -60,10 +60,14 @@ def place_of(light: Light) -> NDArray[np.float64]:
 
 def nearest_sample(performance_map: PerformanceMap, light: Light) -> Nearest | None:
     """Return the sample of a map that is optically nearest to a surface; None if no sample has optical properties."""
-    places = {number: place_of(one) for number, one in enumerate(performance_map.lights) if one is not None}
-    if not places:
+    positions = {
+        number: place_of(sample_light)
+        for number, sample_light in enumerate(performance_map.lights)
+        if sample_light is not None
+    }
+    if not positions:
         return None
-    distances = {number: float(np.linalg.norm(one - place_of(light))) for number, one in places.items()}
+    distances = {number: float(np.linalg.norm(position - place_of(light))) for number, position in positions.items()}
     best = min(distances, key=distances.__getitem__)
     return Nearest(best, distances[best])
 

@@ -54,11 +54,13 @@ def noise_structure(
     normals = np.asarray(normals, float)
     distance = np.broadcast_to(np.asarray(distance, float), normals.shape[:-1])
     axis = data["a"].values
-    place = np.rint((lambert_projection(normals) - axis[0]) / (axis[1] - axis[0])).astype(int)
-    column, row = np.moveaxis(np.clip(place, 0, len(axis) - 1), -1, 0)
+    node = np.rint((lambert_projection(normals) - axis[0]) / (axis[1] - axis[0])).astype(int)
+    column, row = np.moveaxis(np.clip(node, 0, len(axis) - 1), -1, 0)
     near, way = _between(np.log(data["distance"].values.astype(float)), np.log(distance))
-    known = data["roughness"].values[members].astype(float)
-    low, part = (np.array(0), np.array(0.0)) if np.isnan(rough) else _between(np.log(known), np.log(np.array(rough)))
+    roughnesses = data["roughness"].values[members].astype(float)
+    low, part = (
+        (np.array(0), np.array(0.0)) if np.isnan(rough) else _between(np.log(roughnesses), np.log(np.array(rough)))
+    )
     knots = [
         (
             i,

@@ -249,8 +249,8 @@ class PerformanceMap:
         answer = self.query(name, rough, distance, normals)
         fraction, sigma = np.full((2, *a.shape), np.nan)
         fraction[inside], sigma[inside] = answer.fraction, answer.sigma
-        known = np.isfinite(self.data["recovered_fraction"].values).any(axis=(0, 1))[inside]
-        largest = float(np.arccos(np.clip(normals[known, 2], -1, 1)).max()) if known.any() else math.radians(75)
+        mapped = np.isfinite(self.data["recovered_fraction"].values).any(axis=(0, 1))[inside]
+        largest = float(np.arccos(np.clip(normals[mapped, 2], -1, 1)).max()) if mapped.any() else math.radians(75)
         with axes_for(ax, (1, 2), (7.0, 4.4)) as grid:
             pair = grid.ravel()
             limits = noise_limits(self.data["ray_noise_std"].values)
@@ -277,7 +277,7 @@ class PerformanceMap:
 
     def _make_surface(self, numbers: tuple[int, ...], roughness: float | str) -> Surface:
         members = list(numbers)
-        known = self.known.roughness[members]
+        roughnesses = self.known.roughness[members]
         unknown = np.full(self.data["recovered_fraction"].shape[1:], np.nan)
         stacks = {
             field: np.stack(
@@ -285,14 +285,16 @@ class PerformanceMap:
             )
             for field in FIELDS
         }
-        fields = between_samples(stacks, known, float(roughness) if roughness != "" else math.nan)
+        fields = between_samples(stacks, roughnesses, float(roughness) if roughness != "" else math.nan)
         directions = [
             Surface(
-                between_samples({field: one.get(field, unknown)[None] for field in FIELDS}, known, math.nan),
+                between_samples(
+                    {field: direction_fields.get(field, unknown)[None] for field in FIELDS}, roughnesses, math.nan
+                ),
                 self._distances,
                 self._axis,
             )
-            for one in (directions_of(self.data, members[0]) if len(members) == 1 else ())
+            for direction_fields in (directions_of(self.data, members[0]) if len(members) == 1 else ())
         ]
         x, y = (float(self.data[name]) if directions else 0.0 for name in ("lay_mirror_x", "lay_mirror_y"))
         return Surface(fields, self._distances, self._axis, directions, (x, y))

@@ -37,14 +37,14 @@ class PooledOffsets:
     bias: Floats
 
 
-def pool_offsets(patches: xr.Dataset, places: Floats) -> PooledOffsets:
-    """Estimate A, p / sigma and beta / sigma at places (q, 2) of the equal-area plane, from the offsets of patches.
+def pool_offsets(patches: xr.Dataset, positions: Floats) -> PooledOffsets:
+    """Estimate A, p / sigma and beta / sigma at positions (q, 2) of the equal-area plane, from the offsets of patches.
 
     Every capture gives K_0, K_1, K_2 in units of the mean square of its own patches' sigma. Those within
     ``POOLING_RADIUS`` are averaged with their numbers of patches and the biweight as weights. The result is NaN where
     there is no capture.
     """
-    nothing = PooledOffsets(*np.full((3, len(places)), np.nan))
+    nothing = PooledOffsets(*np.full((3, len(positions)), np.nan))
     if "ray_offset" not in patches:  # tables made before offsets were measured
         return nothing
     columns = [patches[name].values.astype(float) for name in ("offset_product_touching", "offset_product_apart")]
@@ -61,7 +61,7 @@ def pool_offsets(patches: xr.Dataset, places: Floats) -> PooledOffsets:
     centre = np.stack([np.bincount(capture, axis) / number for axis in lambert_projection(normal[use]).T], axis=-1)
     usable = square > 0
     centre, number, square = centre[usable], number[usable], square[usable]
-    apart = ((places[:, None] - centre) ** 2).sum(-1)
+    apart = ((positions[:, None] - centre) ** 2).sum(-1)
     weight = np.maximum(1 - apart / POOLING_RADIUS**2, 0.0) ** 2 * number
     with np.errstate(invalid="ignore", divide="ignore"):
         k = [weight @ (product[usable] / square) / weight.sum(1) for product in products]
@@ -80,5 +80,5 @@ def _common(weight: Floats, offset: Floats) -> Floats:
     total, squares = weight @ offset, weight**2 @ offset**2
     with np.errstate(invalid="ignore", divide="ignore"):
         product = (total**2 - squares) / (weight.sum(1) ** 2 - (weight**2).sum(1))
-    known = np.nan_to_num(product, nan=0.0, posinf=0.0, neginf=0.0)
-    return np.asarray(np.sign(total) * np.sqrt(np.maximum(known, 0.0)))
+    finite = np.nan_to_num(product, nan=0.0, posinf=0.0, neginf=0.0)
+    return np.asarray(np.sign(total) * np.sqrt(np.maximum(finite, 0.0)))

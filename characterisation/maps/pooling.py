@@ -93,8 +93,8 @@ class Pooled:
     patches: Floats
 
 
-def pool(patches: xr.Dataset, nominal: float, places: Floats) -> Pooled:
-    """Estimate F and sigma at places of the equal-area plane, from the patches of one sample at one nominal distance.
+def pool(patches: xr.Dataset, nominal: float, positions: Floats) -> Pooled:
+    """Estimate F and sigma at positions of the equal-area plane, from the patches of a sample at one nominal distance.
 
     Parameters
     ----------
@@ -104,19 +104,19 @@ def pool(patches: xr.Dataset, nominal: float, places: Floats) -> Pooled:
         nominal one.
     nominal
         |V| [mm] of the coupon's centre.
-    places
+    positions
         (q, 2) in the plane.
     """
     with threadpool_limits(1, user_api="blas"):  # threads slow down thousands of small fits
-        return _pool(patches, nominal, places)
+        return _pool(patches, nominal, positions)
 
 
-def _pool(patches: xr.Dataset, nominal: float, places: Floats) -> Pooled:
+def _pool(patches: xr.Dataset, nominal: float, positions: Floats) -> Pooled:
     rows = _rows(patches, nominal)
-    inside, corner = _triangles(rows.place[:, :2], places)
+    inside, corner = _triangles(rows.place[:, :2], positions)
     if not inside.any():
-        return Pooled(*np.full((6, len(places)), np.nan))
-    at = np.column_stack([places, np.zeros(len(places))])[inside]
+        return Pooled(*np.full((6, len(positions)), np.nan))
+    at = np.column_stack([positions, np.zeros(len(positions))])[inside]
     ladder = _ladder(rows, at[:, :2], corner[inside])
     gap = cKDTree(rows.place[:, :2]).query(at[:, :2])[0]
 
@@ -158,7 +158,7 @@ def _pool(patches: xr.Dataset, nominal: float, places: Floats) -> Pooled:
             fraction > 1e-6, np.exp(log_variance / 2) / inverse_lambert_projection(at[:, :2])[:, 2], np.nan
         )
         sigma_error = sigma * error / 2
-    out = np.full((6, len(places)), np.nan)
+    out = np.full((6, len(positions)), np.nan)
     out[:, inside] = fraction, sigma, fraction_error, sigma_error, false, effective
     return Pooled(*out)
 
@@ -193,24 +193,24 @@ def _rows(patches: xr.Dataset, nominal: float) -> Observations:
     used = np.flatnonzero((possible > 0) & np.isfinite(normals[:, 0]) & np.isfinite(ratio))
     used = used[np.argsort(capture[used], kind="stable")]
     number = np.unique(capture[used], return_inverse=True)[1].astype(np.int64)
-    place = np.column_stack([lambert_projection(normals), ratio])
+    positions = np.column_stack([lambert_projection(normals), ratio])
     return Observations(
-        place[used], np.column_stack(columns)[used], possible[used], share[used], number, np.zeros(len(used))
+        positions[used], np.column_stack(columns)[used], possible[used], share[used], number, np.zeros(len(used))
     )
 
 
-def _triangles(known: Floats, places: Floats) -> tuple[NDArray[np.bool_], Floats]:
-    """Return which places lie in the hull of the known ones, and their distance from the corners of their triangle."""
-    nothing = np.zeros(len(places), bool), np.full(len(places), np.nan)
-    if len(known) < 3:
+def _triangles(vertices: Floats, positions: Floats) -> tuple[NDArray[np.bool_], Floats]:
+    """Return which positions lie in the hull of the vertices, and their distance from the corners of their triangle."""
+    nothing = np.zeros(len(positions), bool), np.full(len(positions), np.nan)
+    if len(vertices) < 3:
         return nothing
     try:
-        mesh = Delaunay(known)
+        mesh = Delaunay(vertices)
     except QhullError:  # all on a line: the hull has no interior
         return nothing
-    found = mesh.find_simplex(places, tol=1e-9)
-    corners = known[mesh.simplices[np.maximum(found, 0)]]
-    return found >= 0, np.linalg.norm(corners - places[:, None], axis=-1).max(1)
+    triangle = mesh.find_simplex(positions, tol=1e-9)
+    corners = vertices[mesh.simplices[np.maximum(triangle, 0)]]
+    return triangle >= 0, np.linalg.norm(corners - positions[:, None], axis=-1).max(1)
 
 
 def _centres(rows: Observations) -> Floats:
@@ -258,12 +258,12 @@ def _predicted(data: Observations, slopes: Slopes, link: Literal["identity", "lo
     if len(inner) < LEAST_CAPTURES:
         return _Predicted(np.empty((0, 2)), *(np.empty(0) for _ in range(4)))
     radii = 1.5 * cKDTree(centres[:, :2]).query(centres[inner, :2], k=[CAPTURES])[0]
-    others = local_fit(data, centres[inner], radii, slopes, link, inner, "others")
+    other_fit = local_fit(data, centres[inner], radii, slopes, link, inner, "others")
     itself = local_fit(data, centres[inner], radii, slopes, link, inner, "own")
     gap = np.array([_gap(data, centres[c], c) for c in inner])
-    squared = (others.estimate[:, 0, 0] - itself.estimate[:, 0, 0]) ** 2
-    chance = (others.scatter * others.independent + itself.scatter * itself.independent)[:, 0]
-    clustered = (others.clustered + itself.clustered)[:, 0]
+    squared = (other_fit.estimate[:, 0, 0] - itself.estimate[:, 0, 0]) ** 2
+    chance = (other_fit.scatter * other_fit.independent + itself.scatter * itself.independent)[:, 0]
+    clustered = (other_fit.clustered + itself.clustered)[:, 0]
     use = np.isfinite(squared) & np.isfinite(chance)
     return _Predicted(centres[inner[use], :2], squared[use], chance[use], clustered[use], gap[use])
 
@@ -294,20 +294,20 @@ def _common(predicted: _Predicted, at: Floats) -> tuple[Floats, Floats]:
     middle = np.median(gap, axis=1, keepdims=True)
     small, large = gap <= middle, gap > 1.2 * middle
     common = np.maximum((small * excess).sum(1) / (small * clustered).sum(1), 0.0)
-    rest = np.where(large, excess - common[:, None] * clustered, 0.0).sum(1) / np.maximum(
+    bend_excess = np.where(large, excess - common[:, None] * clustered, 0.0).sum(1) / np.maximum(
         (large * gap**2).sum(1), 1e-12
     )
     either = excess.sum(1) / np.maximum((gap**2).sum(1), 1e-12) / 2
-    bend = np.where(large.sum(1) >= LEAST_CAPTURES, rest, either)
+    bend = np.where(large.sum(1) >= LEAST_CAPTURES, bend_excess, either)
     return common, np.maximum(bend, 0.0)
 
 
-def _rim(places: Floats) -> NDArray[np.int64]:
+def _rim(positions: Floats) -> NDArray[np.int64]:
     """Return the captures on the convex hull, which the others can only extrapolate."""
     try:
-        return np.asarray(ConvexHull(places).vertices, np.int64)
+        return np.asarray(ConvexHull(positions).vertices, np.int64)
     except QhullError:
-        return np.arange(len(places))
+        return np.arange(len(positions))
 
 
 def _averaged(

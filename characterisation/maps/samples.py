@@ -38,7 +38,7 @@ class Samples:
         """Describe the samples in words: finishes with the range of their Ra."""
         out = []
         for name in self.finishes:
-            rough = self.roughness[[i for i, one in enumerate(self.names) if one == name]]
+            rough = self.roughness[[i for i, finish_name in enumerate(self.names) if finish_name == name]]
             ends = f"{rough.min():g}" + (f" to {rough.max():g}" if len(rough) > 1 else "")
             out.append(name if np.isnan(rough).any() else f"{name} Ra {ends} um")
         return ", ".join(out)
@@ -59,8 +59,8 @@ class Samples:
         if light is None:
             members = self.members(finish)
         else:
-            for number, known in enumerate(self.lights):
-                if known is not None and same_light(known, light):
+            for number, sample_light in enumerate(self.lights):
+                if sample_light is not None and same_light(sample_light, light):
                     return [number], math.nan
             members = self._family(finish, roughness, light)
         rough = self.roughness[members]
@@ -99,9 +99,9 @@ class Samples:
                 alike.append(number)
         if not alike:
             asked = finish if math.isnan(roughness) else f"{finish} Ra {roughness:g} um"
-            known = "; ".join(str(self.lights[i] or "of unknown optical properties") for i in self.members(finish))
+            lights = "; ".join(str(self.lights[i] or "of unknown optical properties") for i in self.members(finish))
             hint = "a map holds only characterised finishes: characterise this finish"
-            raise InputError(self.where, "finish", f"{asked} ({light})", f"samples of {finish}: {known}", hint)
+            raise InputError(self.where, "finish", f"{asked} ({light})", f"samples of {finish}: {lights}", hint)
         return alike
 
     def _check_between(self, finish: str, roughness: float, light: Light, members: list[int]) -> None:

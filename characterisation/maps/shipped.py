@@ -29,8 +29,8 @@ def map_path(name: str | Path, folder: str | Path = ".") -> Path:
     path = Path(folder) / name
     if is_file(path):
         return path
-    known = shipped_maps()
-    if str(name) in known:
-        return known[str(name)]
-    allowed = f"a performance map (map.nc) made by mitsim map make, or one of {', '.join(known) or 'none'}"
-    raise InputError(path, "", "no such file", allowed, nearest(str(name), list(known)))
+    maps = shipped_maps()
+    if str(name) in maps:
+        return maps[str(name)]
+    allowed = f"a performance map (map.nc) made by mitsim map make, or one of {', '.join(maps) or 'none'}"
+    raise InputError(path, "", "no such file", allowed, nearest(str(name), list(maps)))

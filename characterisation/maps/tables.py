@@ -60,8 +60,8 @@ RUN = 16384
 AT_KNOT = 1e-7
 
 
-def between_samples(stacks: Mapping[str, Floats], known: Floats, roughness: float) -> list[Floats]:
-    """Return the six fields of a surface of one roughness [um], from samples of Ra ``known`` (s,).
+def between_samples(stacks: Mapping[str, Floats], roughnesses: Floats, roughness: float) -> list[Floats]:
+    """Return the six fields of a surface of one roughness [um], from samples of Ra ``roughnesses`` (s,).
 
     The fields are the probit of F, ln sigma, and the errors and spreads of these two. ``stacks`` are (s, ...). If
     ``roughness`` is NaN, the first sample is returned.
@@ -77,9 +77,9 @@ def between_samples(stacks: Mapping[str, Floats], known: Floats, roughness: floa
             stacks[FIELDS[4]] * per_fraction,
             stacks[FIELDS[5]] / sigma,
         ]
-    if np.isnan(roughness) or len(known) == 1:
+    if np.isnan(roughness) or len(roughnesses) == 1:
         return [value[0] for value in values]
-    x, at = np.log(known), np.log(roughness)
+    x, at = np.log(roughnesses), np.log(roughness)
     j = int(np.clip(np.searchsorted(x, at) - 1, 0, len(x) - 2))
     t = float(np.clip((at - x[j]) / (x[j + 1] - x[j]), 0.0, 1.0))
     if t < AT_KNOT or t > 1 - AT_KNOT:
@@ -109,7 +109,7 @@ def _per_probit(z: NDArray[np.floating]) -> NDArray[np.floating]:
 
 def _interpolation_error(knots: Floats, values: Floats, errors: Floats, interval: int) -> Floats:
     """Return D of an interval between knots (k,), for values and errors (k, ...); NaN without a third knot."""
-    found = np.full(values.shape[1:], np.nan)
+    error = np.full(values.shape[1:], np.nan)
     width = knots[interval + 1] - knots[interval]
     for first in (interval - 1, interval):
         if not 0 <= first <= len(knots) - 3:
@@ -118,8 +118,8 @@ def _interpolation_error(knots: Floats, values: Floats, errors: Floats, interval
         share = np.array([1 / ((x[i] - x[i - 1]) * (x[i] - x[i - 2])) for i in range(3)]) * width**2
         bend = np.tensordot(share, values[first : first + 3], 1)
         chance = np.tensordot(share**2, errors[first : first + 3] ** 2, 1)
-        found = np.fmax(found, np.sqrt(np.maximum(bend**2 - chance, 0.0)))
-    return found
+        error = np.fmax(error, np.sqrt(np.maximum(bend**2 - chance, 0.0)))
+    return error
 
 
 def _mixed(near: list[Floats], far: list[Floats], t: Floats, bends: list[Floats]) -> list[Floats]:
@@ -180,9 +180,9 @@ class Surface:
     def _plain(self) -> NDArray[np.bool_]:
         """Return the cells (interval, node at their low corner) with F and sigma at all corners and both distances."""
         n = self.count
-        known = (np.isfinite(self.fields[0]) & np.isfinite(self.fields[1])).reshape(-1, n, n)
-        cell = np.zeros_like(known)
-        cell[:, :-1, :-1] = known[:, :-1, :-1] & known[:, :-1, 1:] & known[:, 1:, :-1] & known[:, 1:, 1:]
+        finite = (np.isfinite(self.fields[0]) & np.isfinite(self.fields[1])).reshape(-1, n, n)
+        cell = np.zeros_like(finite)
+        cell[:, :-1, :-1] = finite[:, :-1, :-1] & finite[:, :-1, 1:] & finite[:, 1:, :-1] & finite[:, 1:, 1:]
         return (cell[:-1] & cell[1:]) if len(cell) > 1 else cell
 
     def look_up(self, distance: Floats, normals: NDArray[np.floating]) -> list[Floats]:
@@ -211,8 +211,8 @@ class Surface:
             within &= (
                 (np.minimum(column, row) >= -1e-4) & (np.maximum(column, row) <= last + np.float32(1e-4)) & (z > 0)
             )
-        column, row = (np.clip(np.where(within, place, 0), 0, last) for place in (column, row))
-        left, low = (np.minimum(place.astype(np.int32), self.count - 2) for place in (column, row))
+        column, row = (np.clip(np.where(within, coordinate, 0), 0, last) for coordinate in (column, row))
+        left, low = (np.minimum(coordinate.astype(np.int32), self.count - 2) for coordinate in (column, row))
         column -= left
         row -= low
         cell = (interval * self.count + low) * self.count + left
@@ -220,15 +220,15 @@ class Surface:
         if self.spread:
             plain = np.zeros_like(plain)
         chosen: slice | NDArray[np.int64] = slice(None) if plain.all() else np.flatnonzero(plain)
-        for values, found in zip(
+        for values, answer in zip(
             out, self._with_all_corners(cell[chosen], t[chosen], column[chosen], row[chosen]), strict=False
         ):
-            values[chosen] = found
-        rest = np.flatnonzero(within & ~plain)
-        if len(rest):
-            careful = self._with_missing_corners(cell[rest], t[rest], column[rest], row[rest])
-            for values, known in zip(out, careful, strict=True):
-                values[rest] = known
+            values[chosen] = answer
+        incomplete = np.flatnonzero(within & ~plain)
+        if len(incomplete):
+            careful = self._with_missing_corners(cell[incomplete], t[incomplete], column[incomplete], row[incomplete])
+            for values, fallback in zip(out, careful, strict=True):
+                values[incomplete] = fallback
 
     def _along(self, log_distance: Floats) -> tuple[NDArray[np.int64], Singles, NDArray[np.bool_]]:
         """Return the interval, the way between its knots, and whether the distance lies in an interval."""
@@ -280,10 +280,10 @@ class Surface:
         fields = _mixed(near, far, t[:, None].astype(float), bends)
         out = []
         for field in fields:
-            known = np.isfinite(field) & (share > 0)
-            weight = np.where(known, share, 0.0).sum(1)
+            usable = np.isfinite(field) & (share > 0)
+            weight = np.where(usable, share, 0.0).sum(1)
             with np.errstate(invalid="ignore", divide="ignore"):
-                out.append(np.where(weight > 0, np.where(known, share * field, 0.0).sum(1) / weight, np.nan))
+                out.append(np.where(weight > 0, np.where(usable, share * field, 0.0).sum(1) / weight, np.nan))
         answered = np.where(np.isfinite(fields[0]), share, 0.0).sum(1) >= 0.5
         sigma = np.exp(out[1])
         fraction, per_probit = from_probit(out[0])

@@ -90,20 +90,22 @@ def within_limits(table: xr.Dataset) -> NDArray[np.bool_]:
 
 
 def _row(pairs: Sequence[Pair]) -> dict[str, float]:
-    known = [pair for pair in pairs if math.isfinite(pair.predicted.fraction) and math.isfinite(pair.measured.fraction)]
-    fraction = np.array([pair.predicted.fraction - pair.measured.fraction for pair in known])
+    valued_pairs = [
+        pair for pair in pairs if math.isfinite(pair.predicted.fraction) and math.isfinite(pair.measured.fraction)
+    ]
+    fraction = np.array([pair.predicted.fraction - pair.measured.fraction for pair in valued_pairs])
     fraction_error = np.array(
-        [math.hypot(pair.measured.fraction_error, pair.predicted.fraction_error) for pair in known]
+        [math.hypot(pair.measured.fraction_error, pair.predicted.fraction_error) for pair in valued_pairs]
     )
-    both = [p for p in known if math.isfinite(p.predicted.sigma) and math.isfinite(p.measured.sigma)]
+    both = [p for p in valued_pairs if math.isfinite(p.predicted.sigma) and math.isfinite(p.measured.sigma)]
     sigma = np.array([p.predicted.sigma / p.measured.sigma - 1 for p in both])
     sigma_error = np.array(
         [math.hypot(*(overall.sigma_error / overall.sigma for overall in (p.measured, p.predicted))) for p in both]
     )
     points = np.array([p.measured.fraction for p in both])
-    one_sided = [p for p in known if math.isfinite(p.predicted.sigma) != math.isfinite(p.measured.sigma)]
+    one_sided = [p for p in valued_pairs if math.isfinite(p.predicted.sigma) != math.isfinite(p.measured.sigma)]
     return {
-        "captures": len(known),
+        "captures": len(valued_pairs),
         "fraction_residual": _mean(np.abs(fraction)),
         "fraction_bias": _mean(fraction),
         "fraction_floor": _mean(_MEAN_ABSOLUTE * fraction_error),
@@ -114,7 +116,7 @@ def _row(pairs: Sequence[Pair]) -> dict[str, float]:
         "sigma_residual_captures": _mean(np.abs(sigma)),
         "one_sided": len(one_sided),
         "wasserstein": _wasserstein(both),
-        "unknown": len(pairs) - len(known),
+        "unknown": len(pairs) - len(valued_pairs),
     }
 
 

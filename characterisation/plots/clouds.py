@@ -44,17 +44,17 @@ _RESIDUAL_SIGMAS = 3.0
 
 def depth_limits(values: NDArray[np.floating], beyond: float = _BEYOND_PREDICTED) -> tuple[float, float]:
     """Return the ends of a colour scale of depths or distances [mm]; ``beyond`` per cent lie outside each end."""
-    known = values[np.isfinite(values)]
-    if not len(known):
+    finite = values[np.isfinite(values)]
+    if not len(finite):
         return 0.0, 1.0
-    near, far = (float(np.percentile(known, p)) for p in (beyond, 100 - beyond))
+    near, far = (float(np.percentile(finite, p)) for p in (beyond, 100 - beyond))
     return (near, far) if far > near else (near - 0.5, far + 0.5)
 
 
 def residual_limit(values: NDArray[np.floating]) -> float:
     """Return the end of a symmetric colour scale of residuals [mm]."""
-    known = np.abs(values[np.isfinite(values)])
-    limit = _RESIDUAL_SIGMAS * 1.4826 * float(np.median(known)) if len(known) else 0.0
+    sizes = np.abs(values[np.isfinite(values)])
+    limit = _RESIDUAL_SIGMAS * 1.4826 * float(np.median(sizes)) if len(sizes) else 0.0
     return limit if limit > 0 else 1.0
 
 

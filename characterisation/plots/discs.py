@@ -26,10 +26,10 @@ NOISE_PERCENTILES = (2, 95)
 
 def noise_limits(sigma: NDArray[np.floating]) -> tuple[float, float]:
     """Return the ends of the colour scale of sigma [mm], at :data:`NOISE_PERCENTILES` of all positive values."""
-    known = sigma[np.isfinite(sigma) & (sigma > 0)]
-    if not len(known):
+    positive = sigma[np.isfinite(sigma) & (sigma > 0)]
+    if not len(positive):
         return 0.1, 1.0
-    low, high = (float(np.percentile(known, p)) for p in NOISE_PERCENTILES)
+    low, high = (float(np.percentile(positive, p)) for p in NOISE_PERCENTILES)
     return (low, high) if high > 1.05 * low else (low / 1.05, high * 1.05)
 
 
@@ -88,8 +88,10 @@ def disc_view(axes: Axes, largest: float, labelled: bool = True) -> None:
         axes.plot(radius * np.cos(angle), radius * np.sin(angle), color=INK, lw=0.4, alpha=0.45, zorder=2)
         if not labelled:
             continue
-        place = radius * np.array([math.cos(math.radians(62)), math.sin(math.radians(62))])
-        text = axes.text(float(place[0]), float(place[1]), f"{ring}°", fontsize=6, ha="center", va="center", zorder=4)
+        position = radius * np.array([math.cos(math.radians(62)), math.sin(math.radians(62))])
+        text = axes.text(
+            float(position[0]), float(position[1]), f"{ring}°", fontsize=6, ha="center", va="center", zorder=4
+        )
         text.set_bbox({"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.6})
         text.set_color("#1c1c1c")  # the label's box is white in every page theme
     if not labelled:

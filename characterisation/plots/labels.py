@@ -21,15 +21,15 @@ _ROOM = 0.34
 
 
 def label_columns(
-    axes: Axes, places: Mapping[str, Floats], low: Floats, high: Floats, most: int = 9, longest: int = 16
+    axes: Axes, positions: Mapping[str, Floats], low: Floats, high: Floats, most: int = 9, longest: int = 16
 ) -> None:
-    """Draw names in columns left and right of a picture, with lines to their places that do not cross.
+    """Draw names in columns left and right of a picture, with lines to their positions that do not cross.
 
     Parameters
     ----------
     axes
         To draw into. Its limits are set to hold the picture and the names.
-    places
+    positions
         Place (2,) of each name, the most important names first.
     low, high
         Corners (2,) of the picture.
@@ -45,22 +45,22 @@ def label_columns(
     span = high - low
     step = float(max(span[1], 0.62 * span[0])) / _ROWS
     aside = _ASIDE * float(span.max())
-    from_left = sorted(places, key=lambda name: places[name][0])
+    from_left = sorted(positions, key=lambda name: positions[name][0])
     middle = float(low[0] + high[0]) / 2
-    first = sum(bool(places[name][0] < middle) for name in from_left)
+    first = sum(bool(positions[name][0] < middle) for name in from_left)
     if max(first, len(from_left) - first) > most:
         first = len(from_left) // 2
     left, right = from_left[:first], from_left[first:]
     every = [float(low[1]), float(high[1])]
     for names, x, side, way in ((left, low[0] - aside, "right", -1), (right, high[0] + aside, "left", 1)):
-        kept = [name for name in places if name in names][:most]
-        chosen = sorted(kept, key=lambda name: places[name][1])
-        heights = spread([float(places[name][1]) for name in chosen], step)
+        kept = [name for name in positions if name in names][:most]
+        chosen = sorted(kept, key=lambda name: positions[name][1])
+        heights = spread([float(positions[name][1]) for name in chosen], step)
         every += heights
         for name, y in zip(chosen, heights, strict=True):
-            place = places[name]
-            axes.plot([x, place[0]], [y, place[1]], color=MUTED, lw=0.7, zorder=4)
-            axes.plot(*place, "o", ms=2.5, color=INK, zorder=5)
+            position = positions[name]
+            axes.plot([x, position[0]], [y, position[1]], color=MUTED, lw=0.7, zorder=4)
+            axes.plot(*position, "o", ms=2.5, color=INK, zorder=5)
             axes.text(
                 x + way * 0.01 * float(span.max()), y, cut(name, longest), ha=side, va="center", fontsize=8, zorder=8
             )
@@ -81,20 +81,25 @@ def spread(heights: Sequence[float], step: float) -> list[float]:
     for height in heights:
         groups.append([height, 1.0])
         while len(groups) > 1 and groups[-1][0] < groups[-2][0] + groups[-2][1] * step:
-            (first, one), (second, two) = groups[-2], groups[-1]
+            (first, first_count), (second, second_count) = groups[-2], groups[-1]
             # least squares: the mean of the shifts of its labels is 0
-            groups[-2:] = [[(first * one + (second - one * step) * two) / (one + two), one + two]]
+            groups[-2:] = [
+                [
+                    (first * first_count + (second - first_count * step) * second_count) / (first_count + second_count),
+                    first_count + second_count,
+                ]
+            ]
     return [first + k * step for first, number in groups for k in range(int(number))]
 
 
-def scale_bar(axes: Axes, place: tuple[float, float], length: float, label: str, rise: float) -> None:
+def scale_bar(axes: Axes, left_end: tuple[float, float], length: float, label: str, rise: float) -> None:
     """Draw a bar from a place to the right, with its label above it.
 
     Parameters
     ----------
     axes
         Axes to draw into.
-    place
+    left_end
         Left end (x, y) of the bar, in the axes' data units.
     length
         Length of the bar, in data units.
@@ -107,7 +112,7 @@ def scale_bar(axes: Axes, place: tuple[float, float], length: float, label: str,
     --------
     round_length : a length for it
     """
-    x, y = place
+    x, y = left_end
     axes.plot([x, x + length], [y, y], color=INK, lw=2.2, solid_capstyle="butt", zorder=6)
     text = axes.text(x, y + rise, label, fontsize=8, va="bottom", zorder=6)
     text.set_bbox({"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.8})

@@ -110,7 +110,8 @@ def budget_legend(axes: Axes, rows: Sequence[ErrorRow]) -> None:
     """Add the legend of the groups that occur in the budgets of all rows, below the axes."""
     order = _groups(rows)
     handles = [
-        Patch(facecolor=GROUPS.get(one, (_OTHER_GROUP, one))[0], label=GROUPS.get(one, ("", one))[1]) for one in order
+        Patch(facecolor=GROUPS.get(group, (_OTHER_GROUP, group))[0], label=GROUPS.get(group, ("", group))[1])
+        for group in order
     ]
     figure_of(axes).legend(handles=handles, loc="outside lower right", ncols=min(len(handles), 4), handlelength=1.1)
 

@@ -120,11 +120,11 @@ def axes_for(
             figure.set_facecolor("white")  # a notebook with a dark page would hide dark text
             yield np.asarray(grid)
             return
-        given = np.atleast_1d(np.asarray(ax, object)).ravel()
-        if len(given) != shape[0] * shape[1] or not all(isinstance(one, Axes) for one in given):
-            found = f"{len(given)} axes" if all(isinstance(one, Axes) for one in given) else type(ax).__name__
+        array = np.atleast_1d(np.asarray(ax, object)).ravel()
+        if len(array) != shape[0] * shape[1] or not all(isinstance(item, Axes) for item in array):
+            found = f"{len(array)} axes" if all(isinstance(item, Axes) for item in array) else type(ax).__name__
             raise InputError("plot", "ax", found, f"{shape[0] * shape[1]} of matplotlib's Axes, or None")
-        yield given.reshape(shape)
+        yield array.reshape(shape)
 
 
 def figure_of(axes: Axes) -> Figure:

@@ -42,8 +42,8 @@ def coverage_interval(z: Floats, confidence: float = 0.95) -> tuple[float, float
     coverage, low, high
         NaN without any z.
     """
-    known = np.isfinite(z)
-    trials, inside = known.sum(axis=1), (known & (np.abs(z) <= COVERAGE_FACTOR)).sum(axis=1)
+    finite = np.isfinite(z)
+    trials, inside = finite.sum(axis=1), (finite & (np.abs(z) <= COVERAGE_FACTOR)).sum(axis=1)
     total, views = int(trials.sum()), int((trials > 0).sum())
     if not total:
         return math.nan, math.nan, math.nan

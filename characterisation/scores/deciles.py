@@ -37,7 +37,7 @@ IMPOSSIBLE = 0
 #: confidence of the intervals of means
 CONFIDENCE = 0.95
 
-#: what is known of a bin
+#: quantities of a bin
 _QUANTITIES = {"error": "mean absolute error", "deviation": "standard deviation of the error"}
 
 
@@ -103,13 +103,13 @@ def deciles(score: ArrayLike, error: ArrayLike) -> xr.Dataset:
         allowed = f"({bins.size},) or ({bins.size}, trials), one row for each view"
         raise InputError("deciles", "error", f"the shape {errors.shape} for scores of {bins.shape}", allowed)
     errors = errors.reshape(len(bins), -1)
-    known = np.isfinite(errors)
-    count = known.sum(axis=1)
-    filled = np.where(known, errors, 0.0)
+    finite = np.isfinite(errors)
+    count = finite.sum(axis=1)
+    filled = np.where(finite, errors, 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
         size = np.where(count > 0, np.abs(filled).sum(axis=1) / count, np.nan)
         mean = filled.sum(axis=1) / count
-        square = (np.where(known, errors - mean[:, None], 0.0) ** 2).sum(axis=1)
+        square = (np.where(finite, errors - mean[:, None], 0.0) ** 2).sum(axis=1)
         spread = np.where(count > 1, np.sqrt(square / (count - 1)), np.nan)
     scores = np.asarray(score, float)
     rows: list[dict[str, float]] = []
@@ -118,7 +118,7 @@ def deciles(score: ArrayLike, error: ArrayLike) -> xr.Dataset:
         row: dict[str, float] = {
             "views": here.sum(),
             "measured": (count[here] > 0).sum(),
-            "share": float(known[here].mean()) if here.any() else math.nan,
+            "share": float(finite[here].mean()) if here.any() else math.nan,
             "score_low": float(scores[here].min()) if here.any() and number else math.nan,
             "score_high": float(scores[here].max()) if here.any() and number else math.nan,
         }
@@ -205,12 +205,12 @@ def mean_interval(values: Floats, least: float = 0.0) -> tuple[float, float, flo
 
     NaN values are skipped. The mean is NaN without a value, the interval with fewer than two.
     """
-    known = np.asarray(values, float)
-    known = known[np.isfinite(known)]
-    if not len(known):
+    finite = np.asarray(values, float)
+    finite = finite[np.isfinite(finite)]
+    if not len(finite):
         return math.nan, math.nan, math.nan
-    mean = float(known.mean())
-    if len(known) < 2:
+    mean = float(finite.mean())
+    if len(finite) < 2:
         return mean, math.nan, math.nan
-    half = float(stats.t.ppf(0.5 + CONFIDENCE / 2, len(known) - 1) * known.std(ddof=1) / math.sqrt(len(known)))
+    half = float(stats.t.ppf(0.5 + CONFIDENCE / 2, len(finite) - 1) * finite.std(ddof=1) / math.sqrt(len(finite)))
     return mean, max(mean - half, least), mean + half

@@ -91,43 +91,43 @@ def rigid_derivatives(estimate: Any, about: Floats) -> Floats:
         return np.vstack([estimate.direction @ carried, [*-estimate.normal, 0.0, 0.0, 0.0]])
     rng = np.random.default_rng(0)
     middle = estimate.centre if hasattr(estimate, "centre") else estimate.point
-    places = np.asarray(middle) + rng.normal(0.0, float(getattr(estimate, "radius", 10.0)), (_PLACES, 3))
-    at = estimate.meet(places, None)
+    points = np.asarray(middle) + rng.normal(0.0, float(getattr(estimate, "radius", 10.0)), (_PLACES, 3))
+    at = estimate.meet(points, None)
     zero = np.zeros(estimate.parameter_count)
     by_parameters = estimate.linearised(zero, at.foot, None)[1]
     by_motion = -np.hstack([np.cross(at.foot - about, at.normal), at.normal])
     return np.asarray(np.linalg.lstsq(by_parameters, by_motion, rcond=None)[0])
 
 
-def _carried(place: Floats, ray: Floats, normal: Floats, about: Floats) -> Floats:
-    """Return the motion (3, 6) of a place within its plane, less its slide along the ray as the plane moves."""
-    x, y, z = place - about
+def _carried(point: Floats, ray: Floats, normal: Floats, about: Floats) -> Floats:
+    """Return the motion (3, 6) of a point within its plane, less its slide along the ray as the plane moves."""
+    x, y, z = point - about
     moved = np.hstack([np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]]), np.eye(3)])
     return np.asarray(moved - np.outer(ray, normal @ moved) / (ray @ normal))
 
 
-def joint_information(view: JoinedView, rigid: Sequence[Floats], known: Floats) -> Floats:
+def joint_information(view: JoinedView, rigid: Sequence[Floats], motion_covariance: Floats) -> Floats:
     """Return the information (P, P) of one view on the parameters of all features together; 0 for unseen features.
 
-    ``rigid`` is J (p, 6) of each feature; ``known`` is K (6, 6). Errors that views have in common are not included.
-    With them, no joining of the views is better than the sum of these.
+    ``rigid`` is J (p, 6) of each feature; ``motion_covariance`` is K (6, 6). Errors that views have in common are not
+    included. With them, no joining of the views is better than the sum of these.
     """
-    sizes = [len(one) for one in rigid]
+    sizes = [len(jacobian) for jacobian in rigid]
     ends = np.cumsum(sizes)
     out = np.zeros((ends[-1], ends[-1]))
-    seen = [f for f, one in enumerate(view.covariance) if one is not None]
+    seen = [f for f, block in enumerate(view.covariance) if block is not None]
     if not seen:
         return out
     rows = np.concatenate([np.arange(ends[f] - sizes[f], ends[f]) for f in seen])
     motion = np.concatenate([rigid[f] for f in seen])
-    covariance = block_diag(*[view.covariance[f] for f in seen]) + motion @ known @ motion.T
+    covariance = block_diag(*[view.covariance[f] for f in seen]) + motion @ motion_covariance @ motion.T
     scale = np.sqrt(np.diag(covariance))
     out[np.ix_(rows, rows)] = np.linalg.inv(covariance / np.outer(scale, scale)) / np.outer(scale, scale)
     return out
 
 
 def joined_covariance(
-    views: Sequence[JoinedView], rigid: Sequence[Floats], known: Floats, best_fit: bool = False
+    views: Sequence[JoinedView], rigid: Sequence[Floats], motion_covariance: Floats, best_fit: bool = False
 ) -> Floats:
     """Return the covariance (P, P) of all features fitted to the joined points of views; very large for unseen ones.
 
@@ -137,19 +137,19 @@ def joined_covariance(
         What each view contributes to the features.
     rigid
         J (p, 6) of each feature.
-    known
+    motion_covariance
         K (6, 6) of each pose, before the fit if there is one; then not singular.
     best_fit
         Whether the poses are estimated together with the features; otherwise the points are merged as they are.
     """
-    ends = np.cumsum([len(one) for one in rigid])
+    ends = np.cumsum([len(jacobian) for jacobian in rigid])
     out = np.eye(ends[-1]) / NOTHING
-    places = [np.arange(end - len(one), end) for end, one in zip(ends, rigid, strict=True)]
+    indices = [np.arange(end - len(jacobian), end) for end, jacobian in zip(ends, rigid, strict=True)]
     seen = [f for f in range(len(rigid)) if any(view.covariance[f] is not None for view in views)]
     if not seen:
         return out
-    rows = np.concatenate([places[f] for f in seen])
-    at = {f: np.searchsorted(rows, places[f]) for f in seen}
+    rows = np.concatenate([indices[f] for f in seen])
+    at = {f: np.searchsorted(rows, indices[f]) for f in seen}
     count = len(rows)
     weights, noises = np.zeros((2, len(views), count, count))
     motions = np.zeros((len(views), count, 6))
@@ -162,18 +162,18 @@ def joined_covariance(
     mean = np.linalg.inv(weights.sum(axis=0))
     taken = mean @ weights
     if best_fit:
-        taken = taken - _by_estimated_poses(weights, motions, known, mean)
+        taken = taken - _by_estimated_poses(weights, motions, motion_covariance, mean)
     common = np.zeros((count, 1))
     total = np.zeros((count, count))
     for v, view in enumerate(views):
-        total += taken[v] @ (noises[v] + motions[v] @ known @ motions[v].T) @ taken[v].T
+        total += taken[v] @ (noises[v] + motions[v] @ motion_covariance @ motions[v].T) @ taken[v].T
         if view.shared is not None:
             common = common + taken[v] @ np.concatenate([view.shared[f] for f in seen])
     out[np.ix_(rows, rows)] = total + common @ common.T
     return out
 
 
-def _by_estimated_poses(weights: Floats, motions: Floats, known: Floats, mean: Floats) -> Floats:
+def _by_estimated_poses(weights: Floats, motions: Floats, motion_covariance: Floats, mean: Floats) -> Floats:
     """Return the change (views, P, P) of the features by the poses that a best fit estimates from each view."""
     views, count, _ = motions.shape
     designs = np.zeros((views, count, count + 6 * views))
@@ -182,7 +182,7 @@ def _by_estimated_poses(weights: Floats, motions: Floats, known: Floats, mean: F
         designs[v, :, count + 6 * v : count + 6 * v + 6] = motion
     gains = designs.swapaxes(1, 2) @ weights
     normal = (gains @ designs).sum(axis=0)
-    normal[count:, count:] += block_diag(*[np.linalg.inv(known)] * views)
+    normal[count:, count:] += block_diag(*[np.linalg.inv(motion_covariance)] * views)
     scale = np.sqrt(np.diag(normal))
     inverse = np.linalg.inv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
     carried = np.hstack(list(mean @ weights @ motions))

@@ -33,11 +33,11 @@ from characterisation.tasks.task_file import Task
 class SetJoining:
     """Uncertainty of the poses of joined views.
 
-    ``known`` is the covariance (6, 6) of each view's pose, of a motion [w (rad), t (mm)] about the point ``about``
+    ``pose_covariance`` (6, 6) is that of each view's pose, of a motion [w (rad), t (mm)] about the point ``about``
     (3,). With ``best_fit`` it is only the prior, before the views are fitted to one another.
     """
 
-    known: Floats
+    pose_covariance: Floats
     about: Floats
     best_fit: bool = False
 
@@ -84,7 +84,7 @@ def choose_set(
             found = allowed = hint = ""
             if quantity.kind == "form":
                 found, allowed, hint = "a form", "a measurement of features or of the pose", "choose one view for it"
-            elif quantity.kind == "pose" and joining.known.any():
+            elif quantity.kind == "pose" and joining.pose_covariance.any():
                 found, allowed = "a pose, from joined views", "a measurement of features"
                 hint = 'choose one view for it, or set.joining = "exact"'
             elif quantity not in best:
@@ -93,13 +93,13 @@ def choose_set(
             if found:
                 raise InputError("limits", name, found, allowed, hint)
     whole = _JoinedSet(task, needed_inputs, best, joining)
-    views = [whole.view(one, least_chance) for one in inputs]
-    information = np.array([joint_information(view, whole.rigid, joining.known) for view in views])
+    views = [whole.view(view_inputs, least_chance) for view_inputs in inputs]
+    information = np.array([joint_information(view, whole.rigid, joining.pose_covariance) for view in views])
     features = [FeatureInformation(information, whole.quadratic)]
 
     def joined(chosen: Floats) -> Floats:
-        some = [view for view, taken in zip(views, chosen, strict=True) if taken]
-        covariance = joined_covariance(some, whole.rigid, joining.known, joining.best_fit)
+        chosen_views = [view for view, taken in zip(views, chosen, strict=True) if taken]
+        covariance = joined_covariance(chosen_views, whole.rigid, joining.pose_covariance, joining.best_fit)
         return np.asarray(np.sqrt(squares(whole.quadratic, covariance)))
 
     return fewest_views(features, np.array(list(limits.values())), seconds, joined)
@@ -128,19 +128,21 @@ class _JoinedSet:
         ]
         self.quadratic = np.zeros((len(needed_inputs), sum(sizes), sum(sizes)))
         for m, (name, quantities) in enumerate(needed_inputs.items()):
-            places = [
+            indices = [
                 np.arange(ends[quantity] - len(best[quantity].fit.covariance), ends[quantity])
                 for quantity in quantities
             ]
             motion = np.concatenate([self.rigid[self.quantities.index(quantity)] for quantity in quantities])
             variances = np.concatenate([np.diag(best[quantity].fit.covariance) for quantity in quantities])
             form = invariant(joint_quadratic_form(task, name, best), motion, variances)
-            self.quadratic[m][np.ix_(np.concatenate(places), np.concatenate(places))] = form
+            self.quadratic[m][np.ix_(np.concatenate(indices), np.concatenate(indices))] = form
 
-    def view(self, known: dict[InputQuantity, Any], least_chance: float) -> JoinedView:
+    def view(self, inputs: dict[InputQuantity, Any], least_chance: float) -> JoinedView:
         """Return the expected fits of these quantities in one view."""
         fits = [
-            one.fit if isinstance(one := known[quantity], ExpectedInput) and one.fit.chance >= least_chance else None
+            expected.fit
+            if isinstance(expected := inputs[quantity], ExpectedInput) and expected.fit.chance >= least_chance
+            else None
             for quantity in self.quantities
         ]
         causes = max((fit.shared.shape[1] for fit in fits if fit is not None), default=1)
@@ -156,10 +158,10 @@ class _JoinedSet:
 def _best_known(inputs: Sequence[dict[InputQuantity, Any]]) -> dict[InputQuantity, ExpectedInput]:
     """Return the expected fit of each quantity in the view with most points, where quadratic forms are evaluated."""
     best: dict[InputQuantity, ExpectedInput] = {}
-    for one in inputs:
-        for quantity, known in one.items():
-            if isinstance(known, ExpectedInput) and (
-                quantity not in best or known.fit.count > best[quantity].fit.count
+    for view_inputs in inputs:
+        for quantity, expected in view_inputs.items():
+            if isinstance(expected, ExpectedInput) and (
+                quantity not in best or expected.fit.count > best[quantity].fit.count
             ):
-                best[quantity] = known
+                best[quantity] = expected
     return best

@@ -113,7 +113,7 @@ def _grown(uncertainty_of: Joined, count: int, limits: Floats, wanted: NDArray[n
             more = chosen.copy()
             more[view] = 1
             tried.append(uncertainty_of(more))
-        after = [_excess(one, limits, wanted) for one in tried]
+        after = [_excess(uncertainties, limits, wanted) for uncertainties in tried]
         best = int(np.argmin(after))
         if after[best] > (1 - LEAST_GAIN) * excess:
             break
@@ -155,16 +155,16 @@ def fewest_views(
     _cut(features, np.zeros(count), limits, greedy.feasible, rows, bounds)
     while (left := seconds - (time.monotonic() - began)) > 0:
         planes = LinearConstraint(np.array(rows), ub=np.array(bounds))
-        found = milp(
+        solution = milp(
             np.ones(count),
             integrality=np.ones(count),
             bounds=Bounds(0, 1),
             constraints=planes,
             options={"time_limit": left},
         )
-        if found.x is None or found.status != 0:
+        if solution.x is None or solution.status != 0:
             break
-        chosen = np.round(found.x)
+        chosen = np.round(solution.x)
         if chosen.sum() >= size:
             return _answer(uncertainty_of, best, greedy.feasible, exact=True)
         if ((uncertainty_of(chosen) <= limits) | ~greedy.feasible).all():
@@ -224,7 +224,7 @@ def _covariance(feature: FeatureInformation, chosen: Floats) -> Floats:
 
 def _total(features: Sequence[FeatureInformation], covariances: Sequence[Floats]) -> Floats:
     """Return u_m^2 (measurements,)."""
-    parts = [squares(feature.quadratic, one) for feature, one in zip(features, covariances, strict=True)]
+    parts = [squares(feature.quadratic, covariance) for feature, covariance in zip(features, covariances, strict=True)]
     return np.asarray(np.sum(parts, axis=0))
 
 

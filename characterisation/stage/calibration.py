@@ -161,10 +161,10 @@ def _pose_derivatives(axes: TurningAxes, zero: Floats, angles: Floats) -> Floats
     return np.stack(columns, axis=-1)
 
 
-def _differences(poses: Floats, others: Floats) -> Floats:
-    """Return poses minus others (n, 6): rotation vectors [rad] about the sensor's axes, positions [mm]."""
-    rotation = Rotation.from_matrix(poses[:, :3, :3] @ others[:, :3, :3].swapaxes(1, 2)).as_rotvec()
-    return np.concatenate([rotation, poses[:, :3, 3] - others[:, :3, 3]], axis=1)
+def _differences(poses: Floats, other_poses: Floats) -> Floats:
+    """Return poses minus other poses (n, 6): rotation vectors [rad] about the sensor's axes, positions [mm]."""
+    rotation = Rotation.from_matrix(poses[:, :3, :3] @ other_poses[:, :3, :3].swapaxes(1, 2)).as_rotvec()
+    return np.concatenate([rotation, poses[:, :3, 3] - other_poses[:, :3, 3]], axis=1)
 
 
 def _usable(angles: Floats, poses: Floats) -> tuple[Floats, Floats]:

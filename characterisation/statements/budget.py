@@ -106,8 +106,8 @@ def largest_line(lines: Sequence[_Line]) -> _Line | None:
     if not lines:
         return None
     largest = lines[0]
-    others = max((line.high for line in lines[1:]), default=0.0)
-    told = largest.settled and (largest.low >= others or largest.share >= 0.5)
+    next_high = max((line.high for line in lines[1:]), default=0.0)
+    told = largest.settled and (largest.low >= next_high or largest.share >= 0.5)
     return largest if told else None
 
 
@@ -151,50 +151,50 @@ def budget(
     degrees of freedom of Satterthwaite (1946).
     """
     every = stated_errors(errors) if isinstance(errors, OneSidedErrors) else np.asarray(errors, float)
-    known = np.isfinite(every)
-    if known.sum() < LEAST_TRIALS or not np.ptp(every[known]) > 0:
+    finite = np.isfinite(every)
+    if finite.sum() < LEAST_TRIALS or not np.ptp(every[finite]) > 0:
         return ()
-    drawn = float(every[known].var(ddof=1))
-    found = components(
-        every[known],
-        {name: np.asarray(number, float)[known] for name, number in numbers.items()},
-        {name: np.asarray(seed)[known] for name, seed in seeds.items()},
-        errors.part(known).gradients if isinstance(errors, OneSidedErrors) else None,
+    drawn = float(every[finite].var(ddof=1))
+    estimate = components(
+        every[finite],
+        {name: np.asarray(number, float)[finite] for name, number in numbers.items()},
+        {name: np.asarray(seed)[finite] for name, seed in seeds.items()},
+        errors.part(finite).gradients if isinstance(errors, OneSidedErrors) else None,
     )
-    low, high = _intervals(found)
-    whole = drawn + sum(one.variance for one in undrawn)
+    low, high = _intervals(estimate)
+    whole = drawn + sum(influence.variance for influence in undrawn)
     lines = [
         BudgetLine(
             NOISE if name == RESIDUAL else name,
-            drawn * float(found.shares[i]),
+            drawn * float(estimate.shares[i]),
             drawn * float(low[i]),
             drawn * float(high[i]),
-            drawn / whole * float(found.shares[i]),
+            drawn / whole * float(estimate.shares[i]),
             (drawn / whole * float(low[i]), drawn / whole * float(high[i])),
             bool(high[i] - low[i] < _TOO_WIDE),
         )
-        for i, name in enumerate(found.names)
+        for i, name in enumerate(estimate.names)
     ]
     lines += [
         BudgetLine(
-            one.group,
-            one.variance,
-            one.variance,
-            one.variance,
-            one.variance / whole,
-            (one.variance / whole, one.variance / whole),
-            source=one.source,
+            influence.group,
+            influence.variance,
+            influence.variance,
+            influence.variance,
+            influence.variance / whole,
+            (influence.variance / whole, influence.variance / whole),
+            source=influence.source,
         )
-        for one in undrawn
+        for influence in undrawn
     ]
     return tuple(sorted(lines, key=lambda line: -line.variance))
 
 
-def _intervals(found: Components) -> tuple[Floats, Floats]:
+def _intervals(estimate: Components) -> tuple[Floats, Floats]:
     """Return the ends (m,) of the 95 % intervals of shares."""
-    low = np.clip(found.shares - _HALF * found.errors, 0.0, 1.0)
-    high = np.clip(found.shares + _HALF * found.errors, 0.0, 1.0)
-    share, error = float(found.shares[-1]), float(found.errors[-1])
+    low = np.clip(estimate.shares - _HALF * estimate.errors, 0.0, 1.0)
+    high = np.clip(estimate.shares + _HALF * estimate.errors, 0.0, 1.0)
+    share, error = float(estimate.shares[-1]), float(estimate.errors[-1])
     if error > 0:
         degrees = max(2 * (share / error) ** 2, 1.0)
         ends = degrees * share / np.array([chi2.ppf(tail, degrees) for tail in (0.975, 0.025)])

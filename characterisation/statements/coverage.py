@@ -40,8 +40,8 @@ class Share:
 
 def share(inside: ArrayLike) -> Share:
     """Return the share of true among independent trials (n,), with its exact interval (Clopper and Pearson 1934)."""
-    each = np.asarray(inside, bool)
-    k, n = int(each.sum()), len(each)
+    covered = np.asarray(inside, bool)
+    k, n = int(covered.sum()), len(covered)
     low = float(beta.ppf(0.025, k, n - k + 1)) if k else 0.0
     high = float(beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0
     return Share(k, n, low, high if n else 1.0)
@@ -133,10 +133,10 @@ def standard_errors(
     Every tenth trial belongs to one block, so the order of the trials has no effect (Efron & Tibshirani 1993, 11.5,
     grouped). Trials with the same number in ``related`` (n,) are not independent, and are left out together.
     """
-    place = np.arange(len(errors)) if related is None else np.unique(related, return_inverse=True)[1]
-    several = int(place.max(initial=-1)) + 1
+    group = np.arange(len(errors)) if related is None else np.unique(related, return_inverse=True)[1]
+    several = int(group.max(initial=-1)) + 1
     blocks = min(BLOCKS, several)
-    index = place % max(blocks, 1)
+    index = group % max(blocks, 1)
     if several < 3:
         return np.full(len(numbers(errors)), np.inf)
     left = np.array([numbers(errors[index != block]) for block in range(blocks)])

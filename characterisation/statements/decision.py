@@ -166,7 +166,7 @@ def decide(
     if _limited_below(taken, tolerance):
         edges = [tolerance.lower]
     through = [share(_within(edge + _errors_at(taken, edge), limits)) for edge in edges]
-    worst = max(through, key=lambda one: one.value)
+    worst = max(through, key=lambda probability: probability.value)
     risks = None if rule.rule != "jcgm_106" else global_risks(taken, tolerance, limits)
     return Decided(
         rule.in_words,
@@ -178,7 +178,7 @@ def decide(
         needed(errors, tolerance),
         worst.value,
         (worst.low, worst.high),
-        1 - min(one.value for one in through),
+        1 - min(probability.value for probability in through),
         1 - float(_within(tolerance.middle + _errors_at(taken, tolerance.middle), limits).mean()),
         *(risks or (None, None)),
     )

@@ -56,8 +56,12 @@ class LostFeature:
     def in_words(self) -> str:
         """Return the feature, its measurements and the most frequent reason as one line."""
         head = f"{self.count} of {self.trials}: {self.feature}" if self.feature else f"{self.count} of {self.trials}"
-        first, others = self.reasons[0], len(self.reasons) - 1
-        times = f" ({first.count} times; {others} other {'reason' if others == 1 else 'reasons'})" if others else ""
+        first, other_count = self.reasons[0], len(self.reasons) - 1
+        times = (
+            f" ({first.count} times; {other_count} other {'reason' if other_count == 1 else 'reasons'})"
+            if other_count
+            else ""
+        )
         return f"{head} ({', '.join(self.measurements)}): {first.reason}{times}"
 
 
@@ -88,10 +92,10 @@ def lost_features(measurements: Iterable[tuple[str, int, Iterable[Loss]]]) -> tu
         for by_reason in by_name.values():
             for reason, count in by_reason.items():
                 most[reason] = max(most.get(reason, 0), count)
-        reasons = sorted((Loss(reason, count) for reason, count in most.items()), key=lambda one: -one.count)
+        reasons = sorted((Loss(reason, count) for reason, count in most.items()), key=lambda entry: -entry.count)
         largest = max(sum(by_reason.values()) for by_reason in by_name.values())
         features.append(LostFeature(feature, tuple(by_name), largest, trials, tuple(reasons)))
-    return tuple(sorted(features, key=lambda one: -one.count))
+    return tuple(sorted(features, key=lambda entry: -entry.count))
 
 
 def _spanned(parts: Sequence[str], texts: Sequence[str]) -> str:

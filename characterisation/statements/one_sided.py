@@ -109,10 +109,10 @@ class OneSidedErrors:
         step = 1e-4 * self.deviation
         part = self.deviation * self._units
         out = np.zeros((len(part), part[0].size if len(part) else 0))
-        for place in range(out.shape[1]):
+        for index in range(out.shape[1]):
             move = np.zeros(part.shape[1:])
-            move.flat[place] = step
-            out[:, place] = (self.size(part + move) - self.size(part - move)) / (2 * step)
+            move.flat[index] = step
+            out[:, index] = (self.size(part + move) - self.size(part - move)) / (2 * step)
         return np.nan_to_num(out if self.fold == 0 else -out)
 
     @cached_property
@@ -124,8 +124,8 @@ class OneSidedErrors:
         largest = self.deviation + abs(self.correction) + self.size(self.vectors)
         sizes = 2 * largest[:, None] * np.linspace(0, 1, _STEPS)
         values = [
-            self.size(sizes[some, :, None, None] * self._units[some, None] + self.vectors[some, None])
-            for some in (slice(first, first + _AT_ONCE) for first in range(0, len(sizes), _AT_ONCE))
+            self.size(sizes[block, :, None, None] * self._units[block, None] + self.vectors[block, None])
+            for block in (slice(first, first + _AT_ONCE) for first in range(0, len(sizes), _AT_ONCE))
         ]
         return sizes, np.concatenate(values) - (self.correction if self.fold == 0 else -self.correction)
 
@@ -146,8 +146,8 @@ class OneSidedErrors:
 
         low = np.where(first > 0, crossing(first, np.maximum(first - 1, 0)), 0.0)
         high = np.where(last < _STEPS - 1, crossing(last, np.minimum(last + 1, _STEPS - 1)), sizes[:, -1])
-        some = below.any(axis=1)
-        return np.where(some, low, 0.0), np.where(some, high, 0.0)
+        accepting = below.any(axis=1)
+        return np.where(accepting, low, 0.0), np.where(accepting, high, 0.0)
 
     @cached_property
     def _units(self) -> Floats:

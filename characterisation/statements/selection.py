@@ -138,7 +138,7 @@ def joint_samples(
     --------
     posterior : of one measurement
     """
-    every, risk, chance = (np.asarray(one, float) for one in (errors, prior_risk, prior_chance))
+    every, risk, chance = (np.asarray(values, float) for values in (errors, prior_risk, prior_chance))
     independent = deviates(*every.shape[:2])
     standard = np.tensordot(np.linalg.cholesky(_between_measurements(every)), independent, 1)
     return np.stack(
@@ -173,17 +173,17 @@ def posterior(
     prior_mean = u + np.zeros(len(every))
     prior = np.eye(len(every)) * prior_own**2 + PRIOR_COMMON**2
     counts = valued.sum(axis=1)
-    some = np.flatnonzero(counts)
-    if not len(some):
+    counted = np.flatnonzero(counts)
+    if not len(counted):
         return prior_mean + loss, prior + np.diag(loss_variance)
-    square = np.where(valued, np.where(valued, every, 0.0) ** 2, np.nan)[some]
+    square = np.where(valued, np.where(valued, every, 0.0) ** 2, np.nan)[counted]
     moment = np.maximum(np.nanmean(square, axis=1), 1e-300)
-    low, spread = log_of_mean(counts[some], _excess(square / moment[:, None], counts[some]))
+    low, spread = log_of_mean(counts[counted], _excess(square / moment[:, None], counts[counted]))
     data = np.outer(spread, spread) * _correlation(square / moment[:, None])
     observed = 0.5 * np.log(moment) - low
-    gain = prior[:, some] @ np.linalg.inv(prior[np.ix_(some, some)] + data)
-    mean = prior_mean + gain @ (observed - prior_mean[some])
-    covariance = prior - gain @ prior[some]
+    gain = prior[:, counted] @ np.linalg.inv(prior[np.ix_(counted, counted)] + data)
+    mean = prior_mean + gain @ (observed - prior_mean[counted])
+    covariance = prior - gain @ prior[counted]
     return mean + loss, (covariance + covariance.T) / 2 + np.diag(loss_variance)
 
 
@@ -230,12 +230,12 @@ def _correlation(relative: Floats) -> Floats:
     The correlation of a pair from few worlds is mostly chance, which would make the leader appear too certain. It is
     therefore shrunk toward the mean over all pairs.
     """
-    known = np.isfinite(relative)
-    off = np.where(known, relative - np.nanmean(relative, axis=1, keepdims=True), 0.0)
-    square = (off**2) @ known.T  # for the first of a pair, over their common worlds
+    finite = np.isfinite(relative)
+    off = np.where(finite, relative - np.nanmean(relative, axis=1, keepdims=True), 0.0)
+    square = (off**2) @ finite.T  # for the first of a pair, over their common worlds
     size = np.sqrt(square * square.T)
     raw = np.divide(off @ off.T, size, out=np.zeros_like(size), where=size > 0)
-    common = known.astype(float) @ known.T
+    common = finite.astype(float) @ finite.T
     pairs = ~np.eye(len(raw), dtype=bool)
     mean = float((raw * common)[pairs].sum() / max(common[pairs].sum(), 1.0)) if len(raw) > 1 else 0.0
     raw = (common * raw + _SHRINKAGE * max(mean, 0.0)) / (common + _SHRINKAGE)
@@ -250,13 +250,13 @@ def _between_measurements(errors: Floats) -> Floats:
 
     That of a pair is shrunk toward :data:`_USUAL_CORRELATION`. A view with one trial tells nothing.
     """
-    known = np.isfinite(errors)
-    count = known.sum(axis=2, keepdims=True)
-    known &= count > 1
-    square = np.where(known, errors, 0.0) ** 2
+    finite = np.isfinite(errors)
+    count = finite.sum(axis=2, keepdims=True)
+    finite &= count > 1
+    square = np.where(finite, errors, 0.0) ** 2
     mean = square.sum(axis=2, keepdims=True) / np.maximum(count, 1)
-    off = np.divide(square, mean, out=np.ones_like(square), where=known & (mean > 0)) - 1
-    off, both = off.reshape(len(errors), -1), known.reshape(len(errors), -1).astype(float)
+    off = np.divide(square, mean, out=np.ones_like(square), where=finite & (mean > 0)) - 1
+    off, both = off.reshape(len(errors), -1), finite.reshape(len(errors), -1).astype(float)
     size = np.sqrt((off**2 @ both.T) * (off**2 @ both.T).T)
     raw = np.divide(off @ off.T, size, out=np.zeros_like(size), where=size > 0)
     common = both @ both.T

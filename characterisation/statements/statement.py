@@ -210,14 +210,20 @@ class Statements(list[Statement]):
         if not self:
             raise InputError("plot", "statements", "none", "at least one")
         rows: dict[str, list[ErrorRow]] = {}
-        for one in self:
-            shares = {line.group: line.share for line in one.budget}
-            unsettled = frozenset(line.group for line in one.budget if not line.settled)
+        for entry in self:
+            shares = {line.group: line.share for line in entry.budget}
+            unsettled = frozenset(line.group for line in entry.budget if not line.settled)
             row = ErrorRow(
-                one.measurement, one.bias, one.standard_uncertainty, one.interval, shares, one.verdict, unsettled
+                entry.measurement,
+                entry.bias,
+                entry.standard_uncertainty,
+                entry.interval,
+                shares,
+                entry.verdict,
+                unsettled,
             )
-            rows.setdefault(one.unit, []).append(row)
-        columns = 2 if ax is None and any(one.budget for one in self) else 1
+            rows.setdefault(entry.unit, []).append(row)
+        columns = 2 if ax is None and any(entry.budget for entry in self) else 1
         heights = [ROW_IN * len(of_unit) + MARGIN_IN for of_unit in rows.values()]
         size = (10.0 if columns == 2 else 6.4, sum(heights) + 0.5 * (columns - 1))
         with axes_for(ax, (len(rows), columns), size, height_ratios=heights) as grid:
@@ -264,28 +270,28 @@ def statement(
     else:
         every = np.asarray(errors, float)
     finite = np.isfinite(every)
-    known = every[finite]
-    count = len(known)
+    values = every[finite]
+    count = len(values)
     day = np.arange(count) if days is None else np.asarray(days)[finite]
     common = day if related is None else np.asarray(related)[finite]
-    repeatability = _within(known, day)
+    repeatability = _within(values, day)
     decided = None
     if tolerance is not None:
-        used = errors.part(errors.known) if isinstance(errors, OneSidedErrors) else known
+        used = errors.part(errors.known) if isinstance(errors, OneSidedErrors) else values
         decided = decide(used, tolerance, len(every) - count, common)
     nan = math.nan
     bias = spread = bias_uncertainty = delta = low = high = nan
     moved, share, shares = np.full(4, nan), None, None
     if count >= 2:
-        bias, spread = float(known.mean()), float(known.std(ddof=1))
-        bias_uncertainty, delta = _error_of_mean(known, common), numerical_tolerance(spread)
-        low, high = coverage_interval(known)
+        bias, spread = float(values.mean()), float(values.std(ddof=1))
+        bias_uncertainty, delta = _error_of_mean(values, common), numerical_tolerance(spread)
+        low, high = coverage_interval(values)
         moved = standard_errors(
-            known, lambda part: np.array([part.mean(), part.std(ddof=1), *coverage_interval(part)]), common
+            values, lambda part: np.array([part.mean(), part.std(ddof=1), *coverage_interval(part)]), common
         )
-        moved[2:] = np.maximum(moved[2:], errors_of_ends(known))
+        moved[2:] = np.maximum(moved[2:], errors_of_ends(values))
         if tolerance is not None:
-            taken = known - bias if tolerance.rule.subtract_bias else known
+            taken = values - bias if tolerance.rule.subtract_bias else values
             share = expanded_uncertainty(taken) / tolerance.size
             least, most = expanded_interval(taken, common)
             shares = (least / tolerance.size, most / tolerance.size)
@@ -315,12 +321,12 @@ def statement(
 
 def _within(errors: Floats, day: NDArray[np.int64]) -> float:
     """Return the standard deviation of errors (n,) within days (n,); NaN if no day has two."""
-    _, place, several = np.unique(day, return_inverse=True, return_counts=True)
+    _, group, several = np.unique(day, return_inverse=True, return_counts=True)
     degrees = len(errors) - len(several)
     if not degrees:
         return math.nan
-    mean = np.bincount(place, errors) / several
-    return math.sqrt(float(((errors - mean[place]) ** 2).sum()) / degrees)
+    mean = np.bincount(group, errors) / several
+    return math.sqrt(float(((errors - mean[group]) ** 2).sum()) / degrees)
 
 
 def _error_of_mean(errors: Floats, related: NDArray[np.int64]) -> float:

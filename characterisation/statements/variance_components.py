@@ -94,24 +94,24 @@ def components(
     scale = float(values.std()) or 1.0
     along = None if directions is None else np.asarray(directions, float)
     by_group = {name: _standard(np.asarray(number, float)) for name, number in numbers.items()}
-    by_group = {name: one for name, one in by_group.items() if one.shape[1]}
+    by_group = {name: columns for name, columns in by_group.items() if columns.shape[1]}
     levels = _distinct({name: np.asarray(seed) for name, seed in seeds.items()}, parts)
     names = (*by_group, *levels, RESIDUAL)
     drawn = np.array([name in by_group for name in names])
-    found = np.zeros(len(names))
+    mean_variances = np.zeros(len(names))
     covariance = np.zeros((len(names), len(names)))
     for part in parts:
-        kernels = [one[part] @ one[part].T / one.shape[1] for one in by_group.values()]
+        kernels = [columns[part] @ columns[part].T / columns.shape[1] for columns in by_group.values()]
         kernels += [(level[part][:, None] == level[part]).astype(float) for level in levels.values()]
         stack = np.array([*kernels, np.eye(len(part))])
         if along is not None:
             stack *= along[part] @ along[part].T
         stack /= np.einsum("kii->k", stack)[:, None, None] / len(part)
         variances, spread = _restricted_likelihood((values[part] - values.mean()) / scale, stack, drawn)
-        found += len(part) / count * variances
+        mean_variances += len(part) / count * variances
         covariance += (len(part) / count) ** 2 * spread
-    shares = found / found.sum()
-    change = (np.eye(len(names)) - shares[:, None]) / found.sum()
+    shares = mean_variances / mean_variances.sum()
+    change = (np.eye(len(names)) - shares[:, None]) / mean_variances.sum()
     return Components(names, shares, np.sqrt(np.maximum(np.diag(change @ covariance @ change.T), 0.0)), drawn)
 
 
@@ -125,12 +125,12 @@ def _standard(values: Floats) -> Floats:
 def _distinct(seeds: Mapping[str, NDArray[np.int64]], parts: list[NDArray[np.intp]]) -> dict[str, NDArray[np.int64]]:
     """Return the groups whose shared seeds every part of the trials can tell from those of others."""
     out: dict[str, NDArray[np.int64]] = {}
-    known: list[tuple[bytes, ...]] = [tuple(np.eye(len(part), dtype=bool).tobytes() for part in parts)]
+    distinct: list[tuple[bytes, ...]] = [tuple(np.eye(len(part), dtype=bool).tobytes() for part in parts)]
     for name, seed in seeds.items():
         same = tuple((seed[part][:, None] == seed[part]).tobytes() for part in parts)
-        if not any(a == b for other in known for a, b in zip(same, other, strict=True)):
+        if not any(a == b for other in distinct for a, b in zip(same, other, strict=True)):
             out[name] = seed
-            known.append(same)
+            distinct.append(same)
     return out
 
 
@@ -166,23 +166,23 @@ def _restricted_likelihood(errors: Floats, kernels: Floats, drawn: NDArray[np.bo
     traces = products.reshape(size, -1) @ products.transpose(0, 2, 1).reshape(size, -1).T
     forms = np.tensordot(np.linalg.pinv(traces, hermitian=True), products @ inverse, axes=1)
     of_numbers = np.tensordot(np.where(drawn, variances, 0.0), kernels, axes=1)
-    rest = total - of_numbers
-    one, other = forms @ total, forms @ of_numbers
+    remainder = total - of_numbers
+    by_total, by_numbers = forms @ total, forms @ of_numbers
     covariance = 2 * sum(
-        sign * (some.reshape(size, -1) @ some.transpose(0, 2, 1).reshape(size, -1).T)
-        for sign, some in ((1.0, one), (-1.0, other))
+        sign * (product.reshape(size, -1) @ product.transpose(0, 2, 1).reshape(size, -1).T)
+        for sign, product in ((1.0, by_total), (-1.0, by_numbers))
     )
-    return variances, covariance + _beyond_normal(forms, rest, rest @ moved, rest @ inverse @ rest)
+    return variances, covariance + _beyond_normal(forms, remainder, remainder @ moved, remainder @ inverse @ remainder)
 
 
-def _beyond_normal(forms: Floats, rest: Floats, residuals: Floats, spread: Floats) -> Floats:
-    """Return what errors that are not normal add to the covariance (m, m) of quadratic forms (m, n, n).
+def _beyond_normal(forms: Floats, remainder: Floats, residuals: Floats, spread: Floats) -> Floats:
+    """Return the part of the covariance (m, m) of quadratic forms (m, n, n) that comes from errors that are not normal.
 
     Parameters
     ----------
     forms
         Matrices M_g of the quadratic forms.
-    rest
+    remainder
         Covariance S (n, n) of the part of the errors that is not drawn numbers. Trials without a covariance are
         independent.
     residuals, spread
@@ -193,16 +193,16 @@ def _beyond_normal(forms: Floats, rest: Floats, residuals: Floats, spread: Float
     Of independent groups c of trials, the products between groups have a variance that depends on second moments
     alone. Those within a group have another than normal errors: that of e_c^T M_cc e_c over the groups.
     """
-    of_trial = connected_components(coo_array(rest))[1]
+    of_trial = connected_components(coo_array(remainder))[1]
     groups = int(of_trial.max()) + 1
-    ratio = np.bincount(of_trial, np.diag(rest)) / np.maximum(np.bincount(of_trial, np.diag(spread)), 1e-300)
+    ratio = np.bincount(of_trial, np.diag(remainder)) / np.maximum(np.bincount(of_trial, np.diag(spread)), 1e-300)
     scaled = residuals * np.sqrt(ratio)[of_trial]
     normal = np.zeros((len(forms), len(forms)))
     excess = np.zeros((len(forms), groups))
     for group in range(groups):
         here = np.flatnonzero(of_trial == group)
         inside = forms[:, here[:, None], here]
-        products = inside @ rest[np.ix_(here, here)]
+        products = inside @ remainder[np.ix_(here, here)]
         normal += 2 * np.einsum("kij,lji->kl", products, products)
         excess[:, group] = scaled[here] @ inside @ scaled[here] - np.einsum("kii->k", products)
     return np.asarray(excess @ excess.T - normal)

@@ -68,19 +68,27 @@ def result_reasons(judged: Sequence[Judged]) -> list[Reason]:
 
     Without tolerances: that there are none, and the measurement that most often had no value.
     """
-    asked = [one for one in judged if one.verdict != "no tolerance"]
+    asked = [measurement for measurement in judged if measurement.verdict != "no tolerance"]
     if not asked:
         text = f"Uncertainty given for {len(judged)} measurement{'' if len(judged) == 1 else 's'}. "
         text += "The task has no tolerances: nothing to accept or reject"
         return [Reason(". ".join([text, *filter(None, [losses_in_words(judged)])]))]
-    fitting = [one for one in asked if one.verdict == "fits"]
-    rest = sorted((one for one in asked if one.verdict not in ("fits", "not decided")), key=_ratio, reverse=True)
-    unsure = [one for one in asked if one.verdict == "not decided"]
+    fitting = [measurement for measurement in asked if measurement.verdict == "fits"]
+    failing = sorted(
+        (measurement for measurement in asked if measurement.verdict not in ("fits", "not decided")),
+        key=_ratio,
+        reverse=True,
+    )
+    unsure = [measurement for measurement in asked if measurement.verdict == "not decided"]
     undecided = f", {len(unsure)} not decided" if unsure else ""
-    reasons = [Reason(f"fits {len(fitting)} of {len(asked)} tolerances{undecided}"), *_reasons(rest)]
-    valued = [one.name for one in unsure if math.isfinite(one.uncertainty)]
-    single = [one.name for one in unsure if not math.isfinite(one.uncertainty) and one.without_value < 1]
-    none = [one.name for one in unsure if one.without_value == 1]
+    reasons = [Reason(f"fits {len(fitting)} of {len(asked)} tolerances{undecided}"), *_reasons(failing)]
+    valued = [measurement.name for measurement in unsure if math.isfinite(measurement.uncertainty)]
+    single = [
+        measurement.name
+        for measurement in unsure
+        if not math.isfinite(measurement.uncertainty) and measurement.without_value < 1
+    ]
+    none = [measurement.name for measurement in unsure if measurement.without_value == 1]
     for names, why in (
         (valued, "more virtual measurements are needed"),
         (single, "a single virtual measurement gave a value"),
@@ -88,9 +96,12 @@ def result_reasons(judged: Sequence[Judged]) -> list[Reason]:
     ):
         reasons += [Reason(f": not decided, {why}", tuple(names))] if names else []
     reasons += [
-        Reason(f" fits, but has no value in {_percent(one.without_value)} of the virtual measurements", (one.name,))
-        for one in fitting
-        if one.without_value >= OFTEN
+        Reason(
+            f" fits, but has no value in {_percent(measurement.without_value)} of the virtual measurements",
+            (measurement.name,),
+        )
+        for measurement in fitting
+        if measurement.without_value >= OFTEN
     ]
     return reasons
 
@@ -103,8 +114,8 @@ def in_words(reasons: Sequence[Reason], kept: int | None = None) -> str:
     shown, left = divided(reasons, kept)
     told = {name for reason in shown for name in reason.names}
     more = {name for reason in left for name in reason.names} - told
-    rest = f"and {len(more)} more, see the table" if told else "see the table"
-    return "; ".join([reason.words for reason in shown] + [rest] * bool(more))
+    ending = f"and {len(more)} more, see the table" if told else "see the table"
+    return "; ".join([reason.words for reason in shown] + [ending] * bool(more))
 
 
 def divided(reasons: Sequence[Reason], kept: int | None) -> tuple[list[Reason], list[Reason]]:
@@ -124,19 +135,19 @@ def losses_in_words(judged: Sequence[Judged]) -> str:
 
     Empty if each virtual measurement gave one.
     """
-    worst = max(judged, key=lambda one: one.without_value)
+    worst = max(judged, key=lambda measurement: measurement.without_value)
     if worst.without_value == 0:
         return ""
     share = f"{_percent(worst.without_value)} of the virtual measurements"
-    others = sum(one.without_value >= OFTEN for one in judged if one is not worst)
-    if not others:
+    other_count = sum(measurement.without_value >= OFTEN for measurement in judged if measurement is not worst)
+    if not other_count:
         return f"{worst.name} has no value in {share}"
-    return f"{worst.name} and {others} other{'s' if others > 1 else ''} have no value in up to {share}"
+    return f"{worst.name} and {other_count} other{'s' if other_count > 1 else ''} have no value in up to {share}"
 
 
 def fits_all(judged: Sequence[Judged]) -> bool:
     """Return whether no tolerance is known not to fit."""
-    return not any(one.verdict in ("does not fit", "undecidable") for one in judged)
+    return not any(measurement.verdict in ("does not fit", "undecidable") for measurement in judged)
 
 
 def _ratio(judged: Judged) -> float:
@@ -144,20 +155,24 @@ def _ratio(judged: Judged) -> float:
     return math.inf if math.isnan(ratio) else ratio
 
 
-def _reasons(rest: Sequence[Judged]) -> list[Reason]:
+def _reasons(failing: Sequence[Judged]) -> list[Reason]:
     """Return why measurements do not fit, in their order; those without a value for the same reason in one line."""
     lost: dict[tuple[str, str], list[str]] = {}
-    for one in rest:
-        if not math.isfinite(one.uncertainty):
-            by = "by screening, no view can make" if one.trials == 0 else "no virtual measurement gave a value"
-            lost.setdefault((one.verdict, by), []).append(one.name)
+    for measurement in failing:
+        if not math.isfinite(measurement.uncertainty):
+            by = "by screening, no view can make" if measurement.trials == 0 else "no virtual measurement gave a value"
+            lost.setdefault((measurement.verdict, by), []).append(measurement.name)
     reasons = list[Reason]()
     for (verdict, by), names in lost.items():
         verb = "is" if len(names) == 1 else "are"
         words = f"{verb} undecidable" if verdict == "undecidable" else f"do{'es' * (len(names) == 1)} not fit"
         them = (" it" if len(names) == 1 else " them") if by.endswith("make") else ""
         reasons.append(Reason(f" {words}: {by}{them}", tuple(names)))
-    return reasons + [Reason(_why(one), (one.name,)) for one in rest if math.isfinite(one.uncertainty)]
+    return reasons + [
+        Reason(_why(measurement), (measurement.name,))
+        for measurement in failing
+        if math.isfinite(measurement.uncertainty)
+    ]
 
 
 def _why(judged: Judged) -> str:

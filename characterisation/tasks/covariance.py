@@ -182,14 +182,14 @@ def _credible_chance(surface: Surface, expected: ExpectedPoints, used: ExpectedP
     error, of the largest variance over these places, is within the limit.
     """
     at = surface.meet(expected.point, expected.ray)
-    places = at.foot[np.abs(at.cosine) > GRAZING_COSINE]
-    jacobian = surface.linearised(np.zeros(surface.parameter_count), places, None)[1]
+    points = at.foot[np.abs(at.cosine) > GRAZING_COSINE]
+    jacobian = surface.linearised(np.zeros(surface.parameter_count), points, None)[1]
     weight = used.fraction
     noise = float(np.sqrt(np.average(used.sigma**2 + used.persistent**2, weights=weight)))
     limit = max(GATE * noise, LEAST_GATE_MM) + float(np.average(np.abs(used.displaced), weights=weight))
     spread, total = (
-        math.sqrt(max(float(np.einsum("ij,jk,ik->i", jacobian, one, jacobian).max()), 0.0))
-        for one in (fit.noise_covariance, fit.covariance)
+        math.sqrt(max(float(np.einsum("ij,jk,ik->i", jacobian, matrix, jacobian).max()), 0.0))
+        for matrix in (fit.noise_covariance, fit.covariance)
     )
     if spread > most_uncertain(surface, limit):
         return 0.0
@@ -278,16 +278,16 @@ def _averaging(
     if reach < SHORTEST_REACH:
         return np.asarray(alone)
     step = math.sqrt(thinning)
-    place = np.rint((pixel - pixel.min(axis=0)) / step).astype(int)
-    shape = place.max(axis=0) + 1
+    cell = np.rint((pixel - pixel.min(axis=0)) / step).astype(int)
+    shape = cell.max(axis=0) + 1
     # with weights w = F thinning: w^2 s^2 rho summed over the neighbours is w F sigma^2 A on a uniform surface
     scaled = g * np.sqrt(weight * variance)[:, None]
     total = np.empty_like(alone)
     images = np.zeros((g.shape[1], *shape))
-    images[:, place[:, 0], place[:, 1]] = scaled.T
+    images[:, cell[:, 0], cell[:, 1]] = scaled.T
     for row, image in enumerate(images):
         about = gaussian_filter(image, reach, mode="constant", truncate=4.0)
-        total[row] = about[place[:, 0], place[:, 1]] @ scaled
+        total[row] = about[cell[:, 0], cell[:, 1]] @ scaled
     return (total + total.T) / 2
 
 
@@ -301,9 +301,9 @@ def _persistent(scaled: Floats, pixel: NDArray[np.int64], normal: Floats) -> Flo
     def summed(columns: Floats) -> Floats:
         return np.stack([np.bincount(number, column, len(cells)) for column in columns.T], axis=1)
 
-    place = summed(pixel.astype(float)) / share[:, None]
+    centre = summed(pixel.astype(float)) / share[:, None]
     turned = summed(normal) / share[:, None]
-    apart = _squares(place) / (2 * PERSISTENT_REACH_PX**2) + _squares(turned) / (2 * PERSISTENT_TURN**2)
+    apart = _squares(centre) / (2 * PERSISTENT_REACH_PX**2) + _squares(turned) / (2 * PERSISTENT_TURN**2)
     total = summed(scaled)
     return np.asarray(total.T @ np.exp(-apart) @ total)
 
@@ -314,17 +314,17 @@ def _cells(pixel: NDArray[np.int64], size: int) -> tuple[NDArray[np.int64], NDAr
     return np.unique(row * (column.max() + 1) + column, return_inverse=True)
 
 
-def _squares(places: Floats) -> Floats:
-    square = (places**2).sum(1)
-    return np.asarray(np.maximum(square[:, None] + square - 2 * places @ places.T, 0.0))
+def _squares(positions: Floats) -> Floats:
+    square = (positions**2).sum(1)
+    return np.asarray(np.maximum(square[:, None] + square - 2 * positions @ positions.T, 0.0))
 
 
 def _chance(expected: ExpectedPoints, minimum: float) -> float:
     """Return the probability that at least ``minimum`` points are recovered, with a normal number of points."""
-    fraction, each = expected.fraction, expected.thinning
-    count = float(fraction.sum() * each)
-    losses = float((fraction * (1 - fraction) * np.maximum(expected.area, 1.0)).sum() * each)
-    spread = math.sqrt(losses + float(np.nan_to_num(expected.fraction_error).sum() * each) ** 2)
+    fraction, thinning = expected.fraction, expected.thinning
+    count = float(fraction.sum() * thinning)
+    losses = float((fraction * (1 - fraction) * np.maximum(expected.area, 1.0)).sum() * thinning)
+    spread = math.sqrt(losses + float(np.nan_to_num(expected.fraction_error).sum() * thinning) ** 2)
     if spread == 0:
         return float(count >= minimum)
     return float(ndtr((count - minimum) / spread))

@@ -74,9 +74,9 @@ class Decision(Document):
     @model_validator(mode="after")
     def _of_the_rule(self) -> Decision:
         for rule, keys in _OWN.items():
-            given = [key for key in keys if rule != self.rule and getattr(self, key) is not None]
-            if given:
-                raise ValueError(f"{given[0]} is a key of the rule {rule}; the rule here is {self.rule}")
+            stray_keys = [key for key in keys if rule != self.rule and getattr(self, key) is not None]
+            if stray_keys:
+                raise ValueError(f"{stray_keys[0]} is a key of the rule {rule}; the rule here is {self.rule}")
         if self.rule == "jcgm_106":
             lacking = [key for key in ("consumer_risk", "producer_risk") if getattr(self, key) is None]
             if lacking:

@@ -69,7 +69,7 @@ def plane_distance(first: Plane, second: Plane, *, nominal: Sequence[Geometry]) 
     Planes that are not parallel have no single distance. The nominal points define a place that is the same from every
     view.
     """
-    near, far = (one.point for one in nominal if isinstance(one, Plane))
+    near, far = (plane.point for plane in nominal if isinstance(plane, Plane))
     return abs(between_planes(first, second, (near + far) / 2)[0])
 
 

@@ -115,10 +115,10 @@ def deviations(asked: Measurement, outline: Array, nominal: Sequence[Any], point
         return Deviations(lambda fits, ideal: _offsets(kind, fits, ideal, outline), twice_largest)
     if kind == "angularity":
         along, across, sine = _angled(*nominal[:2])
-        places = feet_on(nominal[0], outline)
+        points = feet_on(nominal[0], outline)
         return Deviations(
             lambda fits, ideal: _angular_heights(fits, ideal, outline),
-            least_range(sine * places @ np.cross(along, across)),
+            least_range(sine * points @ np.cross(along, across)),
         )
     feature, datum = nominal[:2]
     by_height = isinstance(datum, Plane) == (kind == "parallelism")
@@ -153,13 +153,13 @@ def least_range(sideways: Array) -> Size:
     """
     first, second = np.triu_indices(len(sideways), 1)
     apart = sideways[second] - sideways[first]
-    known = np.abs(apart) > 1e-9
+    distinct = np.abs(apart) > 1e-9
 
     def size(rows: Array) -> Array:
         heights = rows[..., 0]
-        turns = -(heights[..., second] - heights[..., first])[..., known] / apart[known]
+        turns = -(heights[..., second] - heights[..., first])[..., distinct] / apart[distinct]
         turned = heights[..., None, :] + turns[..., None] * sideways
-        return np.asarray(np.ptp(turned, axis=-1).min(axis=-1) if known.any() else np.ptp(heights, axis=-1))
+        return np.asarray(np.ptp(turned, axis=-1).min(axis=-1) if distinct.any() else np.ptp(heights, axis=-1))
 
     return size
 
@@ -186,11 +186,13 @@ def form_basis(kind: str) -> Array:
     return np.concatenate([modes, np.zeros((1, modes.shape[1]))]).T[:, :, None]
 
 
-def _alike(one: Any, ideal: Any) -> Any:
-    """Return a plane or axis in the sense of its nominal one."""
-    if not isinstance(one, Plane | Cylinder | Cone) or direction(one) @ direction(ideal) >= 0:
-        return one
-    return replace(one, normal=-one.normal) if isinstance(one, Plane) else replace(one, axis=-one.axis)
+def _alike(feature: Any, ideal: Any) -> Any:
+    """Return a plane or axis in the sense of its nominal."""
+    if not isinstance(feature, Plane | Cylinder | Cone) or direction(feature) @ direction(ideal) >= 0:
+        return feature
+    return (
+        replace(feature, normal=-feature.normal) if isinstance(feature, Plane) else replace(feature, axis=-feature.axis)
+    )
 
 
 def _across(vector: Array, along: Array) -> Array:
@@ -234,8 +236,8 @@ def _heights(fits: Sequence[Any], ideal: Sequence[Any], outline: Array) -> Array
 
 
 def _offsets_across(fits: Sequence[Any], ideal: Sequence[Any], outline: Array) -> Array:
-    places, along = feet_on(fits[0], outline), direction(fits[1])
-    across = places - np.outer(places @ along, along)
+    points, along = feet_on(fits[0], outline), direction(fits[1])
+    across = points - np.outer(points @ along, along)
     return np.asarray(across - across.mean(axis=0))
 
 

@@ -41,14 +41,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class _Selected:
-    """Points (n, 3) [mm] of a shape that can lie on it, of ``given`` points with its label; or why they are too few.
+    """Points (n, 3) [mm] of a shape that can lie on it, of ``point_count`` with its label; or why they are too few.
 
-    ``places`` (k, 3) [mm] on the nominal surface are those that its pixels show, with or without a point.
+    ``positions`` (k, 3) [mm] on the nominal surface are those that its pixels show, with or without a point.
     """
 
     points: Array | FitError
-    given: int
-    places: Array
+    point_count: int
+    positions: Array
 
 
 def _fits(
@@ -59,10 +59,10 @@ def _fits(
     A feature that cannot be fitted has a :class:`FitError` in place of a fit. Derived features have none.
     """
     fits: dict[str, Fit | FitError] = {}
-    for name, one in selected.items():
+    for name, selection in selected.items():
         try:
             surface = task.features[name].nominal(sensor_from_part)
-            fits[name] = _credible_fit(_points(one), surface, one.places, cloud.grid.origin)
+            fits[name] = _credible_fit(_points(selection), surface, selection.positions, cloud.grid.origin)
         except FitError as error:
             fits[name] = error
     for name, feature in task.features.items():
@@ -82,10 +82,10 @@ def _fits(
     return {name: fits[name] for name in task.features if name in fits}
 
 
-def _credible_fit(points: Array, nominal: Surface, places: Array, viewpoint: Array | None = None) -> Fit:
+def _credible_fit(points: Array, nominal: Surface, positions: Array, viewpoint: Array | None = None) -> Fit:
     """Return the fit of a surface, or raise the error that says why there is none."""
     fit = fit_surface(points, nominal, viewpoint)
-    check_surface(fit, nominal, points, places, viewpoint)
+    check_surface(fit, nominal, points, positions, viewpoint)
     return fit
 
 
@@ -94,21 +94,21 @@ def _selected(cloud: PointCloud, task: Task, sensor_from_part: ArrayLike, minimu
     selected = {}
     for name in task.shapes:
         if name not in cloud.feature_names:
-            known = list(cloud.feature_names)
-            labels = f"labels of the cloud: {', '.join(known) or 'there are none'}"
-            raise InputError("task", f"features.{name}", repr(name), labels, nearest(name, known))
+            names = list(cloud.feature_names)
+            labels = f"labels of the cloud: {', '.join(names) or 'there are none'}"
+            raise InputError("task", f"features.{name}", repr(name), labels, nearest(name, names))
         points, nominal = cloud.of_feature(name), task.features[name].nominal(sensor_from_part)
         near = points[belonging(points, nominal, cloud.grid.origin)]
-        places = places_seen(nominal, cloud.rays_of_feature(name, PLACES), cloud.grid.origin)
-        selected[name] = _Selected(near, len(points), places)
+        positions = places_seen(nominal, cloud.rays_of_feature(name, PLACES), cloud.grid.origin)
+        selected[name] = _Selected(near, len(points), positions)
         if len(near) < minimum_points:
             few = FitError(f"{len(near)} points, at least {minimum_points} are required")
-            selected[name] = _Selected(few, len(points), places)
+            selected[name] = _Selected(few, len(points), positions)
         elif len(near) < LEAST_BELONGING * len(points):
             share = f"{100 * len(near) / len(points):.0f} % of {len(points)} points"
             least = f"at least {100 * LEAST_BELONGING:.0f} % are required"
             few = FitError(f"only {share} lie near the nominal surface, {least}")
-            selected[name] = _Selected(few, len(points), places)
+            selected[name] = _Selected(few, len(points), positions)
     return selected
 
 
@@ -155,17 +155,17 @@ def measure(
     task, motion = task.with_measured_features(), np.asarray(sensor_from_part, float)
     selected = _selected(cloud, task, motion, minimum_points)
     fits = _fits(cloud, task, motion, selected)
-    known: dict[InputQuantity, Estimate | FitError] = {
+    estimate_of: dict[InputQuantity, Estimate | FitError] = {
         InputQuantity("feature", (name,)): fit for name, fit in fits.items()
     }
     results = {}
     for name in task.measurements:
         model = measurement_model(task, name, motion)
         for quantity in model.inputs:
-            if quantity not in known:
-                known[quantity] = _estimate(quantity, cloud, task, fits, selected, motion)
-        given = sum(selected[shape].given for shape in task.shapes_for(name))
-        results[name] = _result(task, name, model, known, fits, given, propagated)
+            if quantity not in estimate_of:
+                estimate_of[quantity] = _estimate(quantity, cloud, task, fits, selected, motion)
+        point_count = sum(selected[shape].point_count for shape in task.shapes_for(name))
+        results[name] = _result(task, name, model, estimate_of, fits, point_count, propagated)
     return results
 
 
@@ -194,26 +194,26 @@ def measure_points(
     """
     fits: dict[str, Fit | FitError] = {}
     task = task.with_measured_features()
-    given = {name: np.asarray(points.get(name, np.empty((0, 3))), float) for name in task.shapes}
-    for name, some in given.items():
+    arrays = {name: np.asarray(points.get(name, np.empty((0, 3))), float) for name in task.shapes}
+    for name, array in arrays.items():
         try:
-            if len(some) < minimum_points:
-                raise FitError(f"{len(some)} points, at least {minimum_points} are required")
+            if len(array) < minimum_points:
+                raise FitError(f"{len(array)} points, at least {minimum_points} are required")
             nominal = task.features[name].nominal()
-            finite = some[np.isfinite(some).all(axis=1)]
+            finite = array[np.isfinite(array).all(axis=1)]
             fits[name] = _credible_fit(finite, nominal, nominal.meet(finite, None).foot)
         except FitError as error:
             fits[name] = error
-    known: dict[InputQuantity, Estimate | FitError] = {
+    estimate_of: dict[InputQuantity, Estimate | FitError] = {
         InputQuantity("feature", (name,)): fit for name, fit in fits.items()
     }
     results = {}
     for name in task.measurements:
         model = measurement_model(task, name)
         for quantity in model.inputs:
-            known.setdefault(quantity, FitError("it requires one cloud, not the joined points of several views"))
-        count = sum(len(given[shape]) for shape in task.shapes_for(name))
-        results[name] = _result(task, name, model, known, fits, count, propagated)
+            estimate_of.setdefault(quantity, FitError("it requires one cloud, not the joined points of several views"))
+        count = sum(len(arrays[shape]) for shape in task.shapes_for(name))
+        results[name] = _result(task, name, model, estimate_of, fits, count, propagated)
     return results
 
 
@@ -246,23 +246,23 @@ def _result(
     task: Task,
     name: str,
     model: MeasurementModel,
-    known: Mapping[InputQuantity, Estimate | FitError],
+    estimate_of: Mapping[InputQuantity, Estimate | FitError],
     fits: Mapping[str, Fit | FitError],
-    given: int,
+    point_count: int,
     propagated: bool,
 ) -> Result:
     """Evaluate one measurement from its input quantities."""
     measurement, estimates = task.measurements[name], list[Estimate]()
     for quantity in model.inputs:
-        estimate = known[quantity]
+        estimate = estimate_of[quantity]
         if isinstance(estimate, FitError):
             prefix = f"{quantity.features[0]}: " if quantity.kind == "feature" else ""
-            return failed(name, measurement.unit, f"{prefix}{estimate}", points_given=given)
+            return failed(name, measurement.unit, f"{prefix}{estimate}", points_given=point_count)
         estimates.append(estimate)
     value, uncertainty = evaluate(model.value, estimates) if propagated else (model.value(*estimates), math.nan)
     if not np.isfinite([value, uncertainty] if propagated else value).all():
         why = "an axis lies in a plane, or planes or axes that must intersect are parallel"
-        return failed(name, measurement.unit, f"{measurement.kind} has no value: {why}", points_given=given)
+        return failed(name, measurement.unit, f"{measurement.kind} has no value: {why}", points_given=point_count)
     scale = np.rad2deg(1.0) if measurement.unit == "deg" else 1.0
     rows = None if model.deviations is None else scale * model.deviations(*estimates)
     used = [fit.count for feature in task.fitted_for(name) if not isinstance(fit := fits.get(feature), FitError | None)]
@@ -273,7 +273,7 @@ def _result(
         uncertainty * scale,
         "fit" if propagated else "none",
         sum(used),
-        given,
+        point_count,
         measurement.nominal,
         deviations=rows,
     )

@@ -115,8 +115,8 @@ class FoldedValue:
 
 def folded_values(task: Task) -> dict[str, FoldedValue]:
     """Return the measurements of a task whose values fold, by name."""
-    found = {name: folded_value(task, name) for name in task.measurements}
-    return {name: value for name, value in found.items() if value is not None}
+    folded = {name: folded_value(task, name) for name in task.measurements}
+    return {name: value for name, value in folded.items() if value is not None}
 
 
 def folded_value(task: Task, measurement: str) -> FoldedValue | None:
@@ -129,12 +129,12 @@ def folded_value(task: Task, measurement: str) -> FoldedValue | None:
     limit = None if asked.tolerance is None else asked.limits[1] if fold == 0 else fold - asked.limits[0]
     if definition.of == "form":
         basis = form_basis(task.features[asked.features[0]].kind)
-        found = deviations(asked, np.empty((0, 3)), [None], np.zeros(3))
-        return FoldedValue(measurement, fold, found.size, basis, np.zeros(basis.shape[1:]), limit)
+        zone = deviations(asked, np.empty((0, 3)), [None], np.zeros(3))
+        return FoldedValue(measurement, fold, zone.size, basis, np.zeros(basis.shape[1:]), limit)
     model = measurement_model(task, measurement)
     assert model.deviations is not None
-    places = [np.array(task.features[name].point_mm or (0.0, 0.0, 0.0)) for name in asked.features]
-    point = np.mean(places, axis=0) if asked.point_mm is None else np.array(asked.point_mm)
+    points = [np.array(task.features[name].point_mm or (0.0, 0.0, 0.0)) for name in asked.features]
+    point = np.mean(points, axis=0) if asked.point_mm is None else np.array(asked.point_mm)
     if definition.of == "pose":
         inputs: list[Any] = [Pose(np.eye(4), point)]
         nominal: list[Any] = [Pose(np.eye(4), point)]
@@ -142,16 +142,16 @@ def folded_value(task: Task, measurement: str) -> FoldedValue | None:
         inputs = [task.nominal(name) for name in task.fitted_for(measurement)]
         nominal = [task.nominal(name) for name in asked.features]
     outline = np.array(task.features[asked.features[0]].outline_mm or (), float).reshape(-1, 3)
-    found = deviations(asked, outline, nominal, point)
+    zone = deviations(asked, outline, nominal, point)
     changes = []
-    for i, one in enumerate(inputs):
-        for step in STEP * np.eye(one.parameter_count):
-            ends = [model.deviations(*inputs[:i], one.moved(sign * step), *inputs[i + 1 :]) for sign in (1.0, -1.0)]
+    for i, quantity in enumerate(inputs):
+        for step in STEP * np.eye(quantity.parameter_count):
+            ends = [
+                model.deviations(*inputs[:i], quantity.moved(sign * step), *inputs[i + 1 :]) for sign in (1.0, -1.0)
+            ]
             changes.append((ends[0] - ends[1]).ravel() / (2 * STEP))
     lengths = np.linalg.norm(changes, axis=1)
     columns = np.array(changes)[lengths > LEAST_CHANGE * lengths.max()]
     _, values, basis = np.linalg.svd(columns / np.linalg.norm(columns, axis=1, keepdims=True), full_matrices=False)
     basis = basis[values > LEAST_VALUE * values[0]].reshape(-1, *ends[0].shape)
-    return FoldedValue(
-        measurement, fold, found.size, basis, scale * np.asarray(found.of(nominal, nominal), float), limit
-    )
+    return FoldedValue(measurement, fold, zone.size, basis, scale * np.asarray(zone.of(nominal, nominal), float), limit)

@@ -78,8 +78,8 @@ def measurement_model(task: Task, measurement: str, sensor_from_part: ArrayLike 
     asked = task.measurements[measurement]
     definition = DEFINITIONS[asked.kind]
     motion = np.eye(4) if sensor_from_part is None else np.asarray(sensor_from_part, float)
-    places = [np.array(task.features[name].point_mm or (0.0, 0.0, 0.0)) for name in asked.features]
-    point = np.mean(places, axis=0) if asked.point_mm is None else np.array(asked.point_mm)
+    points = [np.array(task.features[name].point_mm or (0.0, 0.0, 0.0)) for name in asked.features]
+    point = np.mean(points, axis=0) if asked.point_mm is None else np.array(asked.point_mm)
     if definition.of == "form":
         form_of = _deviations(asked, motion, [None])
         return MeasurementModel((InputQuantity("form", asked.features),), definition.value, form_of)
@@ -142,10 +142,10 @@ def _deviations(
         return None
 
     def from_nominal(*measured: Any) -> Array:
-        found = deviations(asked, outline, nominal, point).of
-        rows = found(measured, nominal)
+        deviations_of = deviations(asked, outline, nominal, point).of
+        rows = deviations_of(measured, nominal)
         if nominal[0] is not None:
-            rows = rows - found(nominal, nominal)
+            rows = rows - deviations_of(nominal, nominal)
         return rows @ motion[:3, :3] if rows.shape[1] == 3 else rows
 
     return from_nominal

@@ -120,8 +120,8 @@ def _figure(name: str, task: Task, expected: Mapping[str, ExpectedPoints]) -> Ex
     around = usable(task.features[plane].nominal(), expected[plane])
     figure = task.nominal(name)
     assert isinstance(figure, Circle | EdgePoint)
-    place = figure.centre if isinstance(figure, Circle) else figure.point
-    near = int(np.argmin(np.linalg.norm(around.point - place, axis=1)))
+    position = figure.centre if isinstance(figure, Circle) else figure.point
+    near = int(np.argmin(np.linalg.norm(around.point - position, axis=1)))
     viewpoint = _viewpoint(around)
     figure = figure.seen_from(viewpoint)
     cosine = abs(float(around.ray[near] @ figure.normal))
@@ -132,7 +132,7 @@ def _figure(name: str, task: Task, expected: Mapping[str, ExpectedPoints]) -> Ex
     count, fraction = crossings(length, pitch), float(around.fraction[near])
     covariance = edge_covariance(figure, pitch, count, fraction, reach)
     nothing = np.zeros((len(covariance), 1 + (0 if around.shared is None else around.shared.shape[1])))
-    fit = ExpectedFit(covariance, nothing, count * fraction, 1.0, place, pitch)
+    fit = ExpectedFit(covariance, nothing, count * fraction, 1.0, position, pitch)
     return ExpectedInput(fit, with_covariance(figure, covariance))
 
 
@@ -149,27 +149,31 @@ def expected_measurement(
     """Predict one measurement from its input quantities."""
     model = measurement_model(task, measurement)
     quantities = model.inputs
-    known: list[ExpectedInput] = []
+    predictions: list[ExpectedInput] = []
     for quantity in quantities:
-        one = inputs[quantity]
-        if isinstance(one, FitError):
+        expected = inputs[quantity]
+        if isinstance(expected, FitError):
             missing = (math.nan,) * len(quantities)
-            return ExpectedMeasurement(math.nan, 0.0, f"{', '.join(quantity.features)}: {one}", quantities, missing)
-        known.append(one)
+            return ExpectedMeasurement(
+                math.nan, 0.0, f"{', '.join(quantity.features)}: {expected}", quantities, missing
+            )
+        predictions.append(expected)
     scale = _scale(task, measurement)
     parts = [
         scale * evaluate(value, [expected_input.estimate], expected_input.fit.covariance)[1]
-        for expected_input, value in zip(known, _one_by_one(model.value, known), strict=True)
+        for expected_input, value in zip(predictions, _one_by_one(model.value, predictions), strict=True)
     ]
     chances = {
         name: expected_input.fit.chance
-        for quantity, expected_input in zip(quantities, known, strict=True)
+        for quantity, expected_input in zip(quantities, predictions, strict=True)
         for name in quantity.features
     }
-    together = _at_its_points(model.value, [expected_input.fit.middle for expected_input in known])
-    shared = np.concatenate([expected_input.fit.shared for expected_input in known])
-    covariance = block_diag(*[expected_input.fit.noise_covariance for expected_input in known]) + shared @ shared.T
-    total = scale * evaluate(together, [expected_input.estimate for expected_input in known], covariance)[1]
+    together = _at_its_points(model.value, [expected_input.fit.middle for expected_input in predictions])
+    shared = np.concatenate([expected_input.fit.shared for expected_input in predictions])
+    covariance = (
+        block_diag(*[expected_input.fit.noise_covariance for expected_input in predictions]) + shared @ shared.T
+    )
+    total = scale * evaluate(together, [expected_input.estimate for expected_input in predictions], covariance)[1]
     if not math.isfinite(total):
         return ExpectedMeasurement(math.nan, 0.0, "the measurement has no value here", quantities, tuple(parts))
     return ExpectedMeasurement(total, math.prod(chances.values()), "", quantities, tuple(parts))
@@ -187,12 +191,12 @@ def joint_quadratic_form(task: Task, measurement: str, inputs: Mapping[InputQuan
     squares. G is then their sum over all deviations, scaled so that tr(G C) is right for independent parameters.
     """
     model = measurement_model(task, measurement)
-    known = [inputs[quantity] for quantity in model.inputs]
-    middles = [expected_input.fit.middle for expected_input in known]
+    predictions = [inputs[quantity] for quantity in model.inputs]
+    middles = [expected_input.fit.middle for expected_input in predictions]
     value = _at_its_points(model.value, middles)
-    estimates = [expected_input.estimate for expected_input in known]
+    estimates = [expected_input.estimate for expected_input in predictions]
     best = value(*estimates)
-    steps = STEP * np.concatenate([np.sqrt(np.diag(expected_input.fit.covariance)) for expected_input in known])
+    steps = STEP * np.concatenate([np.sqrt(np.diag(expected_input.fit.covariance)) for expected_input in predictions])
 
     def moment(step: Floats) -> float:
         changes = [value(*_moved(estimates, sign * step)) - best for sign in (1.0, -1.0)]
@@ -214,13 +218,13 @@ def _moved(estimates: Sequence[Any], step: Floats) -> list[Any]:
 
 def _polarised(steps: Floats, moment: Callable[[Floats], float]) -> Floats:
     """Return the form (P, P) over ``steps`` (P,) whose squares are those of ``moment``."""
-    own = [moment(steps * unit) for unit in np.eye(len(steps))]
-    form = np.diag(own)
+    moments = [moment(steps * unit) for unit in np.eye(len(steps))]
+    form = np.diag(moments)
     for i in range(len(steps)):
         for j in range(i):
             both = np.zeros(len(steps))
             both[[i, j]] = steps[[i, j]]
-            form[i, j] = form[j, i] = (moment(both) - own[i] - own[j]) / 2
+            form[i, j] = form[j, i] = (moment(both) - moments[i] - moments[j]) / 2
     return form
 
 
@@ -246,17 +250,17 @@ def _scale(task: Task, measurement: str) -> float:
     return math.degrees(1.0) if task.measurements[measurement].unit == "deg" else 1.0
 
 
-def _one_by_one(value: Callable[..., float], known: Sequence[ExpectedInput]) -> list[Callable[[Any], float]]:
+def _one_by_one(value: Callable[..., float], predictions: Sequence[ExpectedInput]) -> list[Callable[[Any], float]]:
     """Return the measurement as a function of each of its inputs alone, with the others fixed."""
     at_points, estimates = (
-        _at_its_points(value, [expected_input.fit.middle for expected_input in known]),
-        [one.estimate for one in known],
+        _at_its_points(value, [expected_input.fit.middle for expected_input in predictions]),
+        [expected_input.estimate for expected_input in predictions],
     )
 
     def alone(index: int) -> Callable[[Any], float]:
         return lambda moved: at_points(*estimates[:index], moved, *estimates[index + 1 :])
 
-    return [alone(index) for index in range(len(known))]
+    return [alone(index) for index in range(len(predictions))]
 
 
 def _at_its_points(value: Callable[..., Any], middles: Sequence[Floats]) -> Callable[..., Any]:

@@ -115,7 +115,7 @@ def repeatability(clouds: Sequence[Sequence[Result]]) -> list[Repeatability]:
     out = []
     for name, results in by_name.items():
         values = np.array([result.value for result in results if result.possible])
-        known = np.array([result.uncertainty for result in results if math.isfinite(result.uncertainty)])
+        uncertainties = np.array([result.uncertainty for result in results if math.isfinite(result.uncertainty)])
         out.append(
             Repeatability(
                 name,
@@ -124,7 +124,7 @@ def repeatability(clouds: Sequence[Sequence[Result]]) -> list[Repeatability]:
                 len(clouds),
                 float(values.mean()) if len(values) else math.nan,
                 float(values.std(ddof=1)) if len(values) > 1 else math.nan,
-                float(np.sqrt(np.mean(known**2))) if len(known) else math.nan,
+                float(np.sqrt(np.mean(uncertainties**2))) if len(uncertainties) else math.nan,
                 results[0].nominal,
             )
         )

@@ -244,7 +244,7 @@ class Task(Document):
         figure itself and its plane.
         """
         named = self.measurements[measurement].features
-        return tuple(dict.fromkeys(one for name in named for one in self._fitted_for(name)))
+        return tuple(dict.fromkeys(fitted_name for name in named for fitted_name in self._fitted_for(name)))
 
     def shapes_for(self, measurement: str) -> tuple[str, ...]:
         """Return the names of the shapes of the scene that a measurement depends on, each once."""

@@ -95,11 +95,11 @@ def check_features(task: Task, task_path: str | Path, shape_ids: Iterable[str]) 
     InputError
         For the first feature that does not, with the ids of the scene and the most similar of them.
     """
-    known = list(shape_ids)
+    names = list(shape_ids)
     for name in task.shapes:
-        if name not in known:
-            allowed = f"ids of the scene's shapes: {', '.join(known) or 'there are none'}"
-            hint = nearest(name, known)
+        if name not in names:
+            allowed = f"ids of the scene's shapes: {', '.join(names) or 'there are none'}"
+            hint = nearest(name, names)
             raise InputError(task_path, f"features.{name}", repr(name), allowed, hint)
 
 
@@ -143,91 +143,93 @@ def misstated(task: Task, measurement: str) -> tuple[str, str, str] | None:
 
 def _check_feature(path: str | Path, task: Task, name: str) -> None:
     """Check the features from which a feature is derived, and the place of its nominal geometry."""
-    feature, place = task.features[name], f"features.{name}"
+    feature, location = task.features[name], f"features.{name}"
     if feature.of is not None:
-        _check_names(path, f"{place}.of", feature.of, task)
+        _check_names(path, f"{location}.of", feature.of, task)
         kinds = [task.features[parent].kind for parent in feature.of]
         possible, wanted = PARENTS[feature.kind]
         if tuple(sorted("axis" if kind in AXIS else kind for kind in kinds)) not in possible:
-            raise InputError(path, f"{place}.of", _listed(feature.of, kinds), f"{wanted} for {feature.kind}")
+            raise InputError(path, f"{location}.of", _listed(feature.of, kinds), f"{wanted} for {feature.kind}")
     nominal = task.nominal(name)
     if isinstance(nominal, Point) and not np.isfinite(nominal.place).all():
         found = f"{', '.join(feature.of or ())}, which are parallel"
-        raise InputError(path, f"{place}.of", found, "features that meet in one point")
+        raise InputError(path, f"{location}.of", found, "features that meet in one point")
     if isinstance(nominal, Circle | EdgePoint):
         (plane,) = feature.of or ("",)
         on = task.features[plane].nominal()
         assert isinstance(on, Plane)
         off = abs(float((np.array(feature.point_mm) - on.point) @ on.normal))
         if off > MISPLACED_MM:
-            raise InputError(path, f"{place}.point_mm", f"a point {off:.3g} mm off {plane}", f"a point on {plane}")
+            raise InputError(path, f"{location}.point_mm", f"a point {off:.3g} mm off {plane}", f"a point on {plane}")
         if isinstance(nominal, EdgePoint) and abs(float(nominal.direction @ on.normal)) > LEANING:
-            raise InputError(path, f"{place}.direction", list(feature.direction or ()), f"a direction in {plane}")
+            raise InputError(path, f"{location}.direction", list(feature.direction or ()), f"a direction in {plane}")
     if feature.kind == "mid_plane":
-        one, other = (task.features[parent].nominal() for parent in feature.of or ())
-        assert isinstance(one, Plane) and isinstance(other, Plane)
-        if np.linalg.norm(np.cross(one.normal, other.normal)) > ASKEW:
-            raise InputError(path, f"{place}.of", ", ".join(feature.of or ()), "two planes that are nearly parallel")
+        first, second = (task.features[parent].nominal() for parent in feature.of or ())
+        assert isinstance(first, Plane) and isinstance(second, Plane)
+        if np.linalg.norm(np.cross(first.normal, second.normal)) > ASKEW:
+            raise InputError(path, f"{location}.of", ", ".join(feature.of or ()), "two planes that are nearly parallel")
     if feature.outline_mm is not None:
-        _check_outline(path, f"{place}.outline_mm", feature, nominal)
+        _check_outline(path, f"{location}.outline_mm", feature, nominal)
 
 
-def _check_outline(path: str | Path, place: str, feature: Feature, surface: Nominal) -> None:
+def _check_outline(path: str | Path, location: str, feature: Feature, surface: Nominal) -> None:
     outline = np.array(feature.outline_mm).reshape(-1, 3)
-    least, what = (3, "corners of the face") if isinstance(surface, Plane) else (2, "ends of the axis")
+    least, meaning = (3, "corners of the face") if isinstance(surface, Plane) else (2, "ends of the axis")
     if len(outline) < least:
-        raise InputError(path, place, f"{len(outline)} places", f"{least} or more {what}")
+        raise InputError(path, location, f"{len(outline)} places", f"{least} or more {meaning}")
     if isinstance(surface, Plane):
         off = np.abs((outline - surface.point) @ surface.normal)
     elif isinstance(surface, Cylinder | Cone):
         off = np.linalg.norm(np.cross(outline - surface.point, surface.axis), axis=1)
     if off.max() > MISPLACED_MM:
         found = f"{list(outline[off.argmax()])}, {off.max():.3g} mm off"
-        raise InputError(path, place, found, f"{what}, on the feature")
+        raise InputError(path, location, found, f"{meaning}, on the feature")
 
 
 def _check_measurement(path: str | Path, task: Task, name: str) -> None:
-    measurement, place = task.measurements[name], f"measurements.{name}"
+    measurement, location = task.measurements[name], f"measurements.{name}"
     definition = DEFINITIONS[measurement.kind]
-    _check_names(path, f"{place}.features", measurement.features, task)
+    _check_names(path, f"{location}.features", measurement.features, task)
     kinds = [task.features[feature].kind for feature in measurement.features]
     if not _fit(kinds, definition):
         found = _listed(measurement.features, kinds)
-        raise InputError(path, f"{place}.features", found, f"{_wanted(definition)} for {measurement.kind}")
+        raise InputError(path, f"{location}.features", found, f"{_wanted(definition)} for {measurement.kind}")
     if len(set(measurement.features)) < len(measurement.features):
-        raise InputError(path, f"{place}.features", list(measurement.features), "different features")
+        raise InputError(path, f"{location}.features", list(measurement.features), "different features")
     if measurement.kind in ("plane_distance", "axis_distance"):
         angle = askew_deg([task.nominal(feature) for feature in measurement.features])
         if angle > MOST_ASKEW_DEG:
             found = f"{', '.join(measurement.features)}, {angle:.0f} deg apart"
-            raise InputError(path, f"{place}.features", found, "nearly parallel features: others have no one distance")
+            raise InputError(
+                path, f"{location}.features", found, "nearly parallel features: others have no one distance"
+            )
     if measurement.unit != definition.unit:
-        raise InputError(path, f"{place}.unit", repr(measurement.unit), f"'{definition.unit}'")
+        raise InputError(path, f"{location}.unit", repr(measurement.unit), f"'{definition.unit}'")
     if definition.zone and measurement.nominal != 0:
         hint = "its tolerance is the largest allowed value"
-        raise InputError(path, f"{place}.nominal", measurement.nominal, f"0: {measurement.kind} is a zone", hint)
+        raise InputError(path, f"{location}.nominal", measurement.nominal, f"0: {measurement.kind} is a zone", hint)
     if measurement.point_mm is not None and measurement.kind != "pose_position":
         raise InputError(
-            path, f"{place}.point_mm", list(measurement.point_mm), "no such key: only pose_position has point_mm"
+            path, f"{location}.point_mm", list(measurement.point_mm), "no such key: only pose_position has point_mm"
         )
     first = task.features[measurement.features[0]]
     if "outline" in definition.needs and "outline_mm" in KEYS[first.kind][1] and first.outline_mm is None:
         allowed = "corners of the face" if first.kind in FLAT else "ends of the axis"
-        hint = f"{place} is a zone over the extent of the feature"
+        hint = f"{location} is a zone over the extent of the feature"
         raise InputError(path, f"features.{measurement.features[0]}.outline_mm", "nothing", allowed, hint)
     if definition.datums and len(kinds) > len(definition.kinds):
         names = measurement.features[len(definition.kinds) :]
-        datums = [one for one in map(task.nominal, names) if isinstance(one, Plane | Cylinder | Cone)]
+        datums = [datum for datum in map(task.nominal, names) if isinstance(datum, Plane | Cylinder | Cone)]
         if fault := frame_fault(datums):
-            raise InputError(path, f"{place}.features", ", ".join(names), fault)
+            raise InputError(path, f"{location}.features", ", ".join(names), fault)
 
 
-def _check_names(path: str | Path, place: str, names: tuple[str, ...], task: Task) -> None:
-    known = list(task.features)
+def _check_names(path: str | Path, location: str, names: tuple[str, ...], task: Task) -> None:
+    feature_names = list(task.features)
     for name in names:
-        if name not in known:
-            allowed = f"features of this task: {', '.join(known)}"
-            raise InputError(path, place, repr(name), allowed, nearest(name, known))
+        if name not in feature_names:
+            allowed = f"features of this task: {', '.join(feature_names)}"
+            raise InputError(path, location, repr(name), allowed, nearest(name, feature_names))
 
 
 def _fit(kinds: Sequence[str], definition: Definition) -> bool:
@@ -235,7 +237,9 @@ def _fit(kinds: Sequence[str], definition: Definition) -> bool:
     if definition.many:
         return len(kinds) > 0 and all(kind in definition.kinds[0] for kind in kinds)
     wanted = definition.kinds if len(kinds) == len(definition.kinds) else definition.kinds + definition.datums
-    return len(kinds) == len(wanted) and all(kind in one for kind, one in zip(kinds, wanted, strict=True))
+    return len(kinds) == len(wanted) and all(
+        kind in allowed_kinds for kind, allowed_kinds in zip(kinds, wanted, strict=True)
+    )
 
 
 def _wanted(definition: Definition) -> str:

@@ -101,9 +101,9 @@ class WindowPlan:
         for kind, first, second in self.pairs:
             for name in (first, second):
                 if name not in self.features:
-                    known = list(self.features)
-                    allowed = ", ".join(known) or "the name of a --plane, --sphere or --cylinder"
-                    raise InputError(f"--{kind}", "", repr(name), allowed, nearest(name, known))
+                    names = list(self.features)
+                    allowed = ", ".join(names) or "the name of a --plane, --sphere or --cylinder"
+                    raise InputError(f"--{kind}", "", repr(name), allowed, nearest(name, names))
             shapes = self.features[first][0], self.features[second][0]
             if _pair_function(kind, *shapes) is None:
                 raise InputError(
@@ -141,7 +141,7 @@ def measure_windows(cloud: PointCloud, plan: WindowPlan, frame: NDArray[np.float
         counts[name] = len(points)
         fits[name] = fit = _fit_shape(points, shape, cloud.grid.origin)
         if isinstance(fit, FitError):
-            quantities = [*((one, "mm") for one in _QUANTITIES[shape]), *PLACE_QUANTITIES[shape]]
+            quantities = [*((quantity, "mm") for quantity in _QUANTITIES[shape]), *PLACE_QUANTITIES[shape]]
             results += [failed(f"{name} {quantity}", unit, str(fit), 0, len(points)) for quantity, unit in quantities]
         else:
             results += _shape_results(name, fit, points, cloud.grid.origin)
@@ -227,10 +227,10 @@ def _shape_results(
     return [form_result, noise, distance]
 
 
-def _place_results(name: str, fit: ShapeFit, given: int, frame: NDArray[np.float64]) -> list[Result]:
+def _place_results(name: str, fit: ShapeFit, point_count: int, frame: NDArray[np.float64]) -> list[Result]:
     """Return place and direction of one fitted feature in a frame."""
     return [
-        Result(f"{name} {quantity}", unit, *evaluate(function, [fit]), "fit", fit.count, given)
+        Result(f"{name} {quantity}", unit, *evaluate(function, [fit]), "fit", fit.count, point_count)
         for quantity, unit, function in place_functions(fit, frame)
     ]
 
@@ -265,7 +265,7 @@ def _pair_result(
     if not math.isfinite(value):
         return failed(label, unit, "the features are parallel or coincide")
     scale = math.degrees(1.0) if unit == "deg" else 1.0
-    count, total = sum(one.count for one in inputs), sum(counts[name] for name in names)
+    count, total = sum(fitted.count for fitted in inputs), sum(counts[name] for name in names)
     return Result(label, unit, value * scale, uncertainty * scale, "fit", count, total)
 
 

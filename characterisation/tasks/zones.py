@@ -54,10 +54,10 @@ def position(feature: Plane | Axis | PointLike, *datums: Datum, nominal: Sequenc
     --------
     angularity : the zone of a plane at an angle
     """
-    target, *others = nominal
+    target, *nominal_datums = nominal
     motion = np.eye(4)
     if datums:
-        motion = datum_motion(datums, [one for one in others if isinstance(one, Plane | Cylinder | Cone)])
+        motion = datum_motion(datums, [datum for datum in nominal_datums if isinstance(datum, Plane | Cylinder | Cone)])
     turn, shift = motion[:3, :3], motion[:3, 3]
     if isinstance(feature, Plane | Cylinder | Cone):
         assert isinstance(target, Plane | Cylinder | Cone)
@@ -139,13 +139,13 @@ def _along(feature: Plane | Axis, datum: Datum, outline: Array) -> float:
 
 def _across(feature: Plane | Axis, datum: Datum, outline: Array) -> float:
     """Return the extent of a feature across the direction of a datum."""
-    places, along = feet_on(feature, outline), direction(datum)
-    across = places - np.outer(places @ along, along)
+    points, along = feet_on(feature, outline), direction(datum)
+    across = points - np.outer(points @ along, along)
     return least_width(across, along) if isinstance(feature, Plane) else float(largest_distance(across))
 
 
 def frame_fault(datums: Sequence[Datum]) -> str:
-    """Return the allowed datums where three given ones define no frame (:func:`datum_motion`); empty where they do."""
+    """Return the allowed datums where three datums define no frame (:func:`datum_motion`); empty where they do."""
     primary, secondary, tertiary = datums
     if not isinstance(primary, Plane):
         return "a plane as the primary datum"
@@ -185,18 +185,18 @@ def angularity(feature: Plane, datum: Datum, *, nominal: Sequence[Geometry], out
     parallelism : parallel to the datum
     perpendicularity : at right angles to the datum
     """
-    target, nominal_datum = (direction(one) for one in nominal if isinstance(one, Plane | Cylinder | Cone))
+    target, nominal_datum = (direction(surface) for surface in nominal if isinstance(surface, Plane | Cylinder | Cone))
     along = direction(datum) * (1.0 if direction(datum) @ nominal_datum >= 0 else -1.0)
     cosine = float(target @ nominal_datum)
     sine = float(np.linalg.norm(np.cross(target, nominal_datum)))
     normal = feature.normal * (1.0 if feature.normal @ target >= 0 else -1.0)
     away = unit(normal - (normal @ along) * along) if sine > PARALLEL else np.zeros(3)
-    places = feet_on(feature, outline)
-    across, turned = places @ (cosine * along + sine * away), sine * (places @ np.cross(along, away))
-    first, second = np.triu_indices(len(places), 1)
+    points = feet_on(feature, outline)
+    across, turned = points @ (cosine * along + sine * away), sine * (points @ np.cross(along, away))
+    first, second = np.triu_indices(len(points), 1)
     change, by_turn = across[second] - across[first], turned[second] - turned[first]
-    known = np.abs(by_turn) > 1e-9
-    turns = np.append(-change[known] / by_turn[known], 0.0)
+    distinct = np.abs(by_turn) > 1e-9
+    turns = np.append(-change[distinct] / by_turn[distinct], 0.0)
     return float(np.ptp(across[:, None] + turns * turned[:, None], axis=0).min())
 
 
@@ -224,22 +224,22 @@ def feet_on(feature: Plane | Axis, outline: Array) -> Array:
     return feet
 
 
-def least_width(places: Array, normal: Array) -> float:
-    """Return the smallest distance [mm] of two parallel lines with all places (k, 3) between them.
+def least_width(points: Array, normal: Array) -> float:
+    """Return the smallest distance [mm] of two parallel lines with all points (k, 3) between them.
 
-    The places lie in a plane of unit ``normal`` (3,). One of the lines passes through two of the places (Houle and
+    The points lie in a plane of unit ``normal`` (3,). One of the lines passes through two of the points (Houle and
     Toussaint, IEEE Trans. Pattern Anal. Mach. Intell. 10 (1988) 761-765). A face has few corners, so all pairs are
     tried.
     """
-    first, second = np.triu_indices(len(places), 1)
-    edges = places[second] - places[first]
+    first, second = np.triu_indices(len(points), 1)
+    edges = points[second] - points[first]
     across = np.cross(edges, normal)
     length = np.linalg.norm(across, axis=1)
     across = across[length > 1e-9] / length[length > 1e-9, None]
-    return float(np.ptp(places @ across.T, axis=0).min()) if len(across) else 0.0
+    return float(np.ptp(points @ across.T, axis=0).min()) if len(across) else 0.0
 
 
-def largest_distance(places: Array) -> Array:
-    """Return the largest distance (...) [mm] between places (..., k, m), the diameter of their zone."""
-    apart = places[..., :, None, :] - places[..., None, :, :]
+def largest_distance(points: Array) -> Array:
+    """Return the largest distance (...) [mm] between points (..., k, m), the diameter of their zone."""
+    apart = points[..., :, None, :] - points[..., None, :, :]
     return np.asarray(np.sqrt((apart**2).sum(axis=-1)).max(axis=(-2, -1)))
