@@ -67,10 +67,10 @@ LEAST_SHARE = 0.01
 class Form:
     """Deviation of a surface from its least-squares plane or cylinder.
 
-    - ``modes`` (n, k): orthogonal distance [mm] at n places for each coefficient of 1 mm.
+    - ``modes`` (n, k): orthogonal distance [mm] at n positions for each coefficient of 1 mm.
     - ``coefficients`` (k,) [mm] and their ``covariance`` (k, k) [mm^2].
     - ``residual_std`` [mm] along the rays, of ``count`` points.
-    - ``places`` (n, 2): coordinates of the places on the surface, -1 to 1 over the points. ``heights`` (n,) [mm] of the
+    - ``positions`` (n, 2): coordinates on the surface, -1 to 1 over the points. ``heights`` (n,) [mm] of the
       form there before its coefficients are shortened, and ``noise`` [mm], the root mean square of the heights that
       noise alone gives. None and NaN for a predicted form.
     """
@@ -80,7 +80,7 @@ class Form:
     covariance: Array
     residual_std: float
     count: int
-    places: Array | None = None
+    positions: Array | None = None
     heights: Array | None = None
     noise: float = np.nan
 
@@ -107,9 +107,9 @@ def node_heights(form: Form) -> Array:
     The grid has :data:`NODES` nodes in each coordinate. A node takes the height of the nearest point in its cell, and
     is NaN if there is none.
     """
-    assert form.places is not None and form.heights is not None
-    cell = np.clip(np.rint((form.places + 1) * (NODES - 1) / 2), 0, NODES - 1)
-    distance = ((form.places + 1) * (NODES - 1) / 2 - cell) ** 2 @ np.ones(2)
+    assert form.positions is not None and form.heights is not None
+    cell = np.clip(np.rint((form.positions + 1) * (NODES - 1) / 2), 0, NODES - 1)
+    distance = ((form.positions + 1) * (NODES - 1) / 2 - cell) ** 2 @ np.ones(2)
     nearest = np.argsort(distance, kind="stable")
     number = (cell[nearest] @ [NODES, 1]).astype(int)
     number, first = np.unique(number, return_index=True)

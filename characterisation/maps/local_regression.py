@@ -48,7 +48,7 @@ SMALL_STEP = 0.02
 class Observations:
     """Data of the regression, n rows sorted by ``cluster``.
 
-    - ``place`` (n, 3): regressors; the first two determine the distance in the kernel.
+    - ``position`` (n, 3): regressors; the first two determine the distance in the kernel.
     - ``value`` (n, k): the first column is fitted; its weights are applied to the others.
     - ``weight`` (n,): proportional to the inverse of the variance.
     - ``share`` (n,): number of independent rows that a row stands for.
@@ -56,7 +56,7 @@ class Observations:
     - ``within`` (n,): variance of the first column among the rows that were joined to one.
     """
 
-    place: Floats
+    position: Floats
     value: Floats
     weight: Floats
     share: Floats
@@ -70,7 +70,7 @@ class Observations:
         """
         if cell == 0:
             return self
-        cells = np.floor(self.place[:, :2] / cell).astype(np.int64)
+        cells = np.floor(self.position[:, :2] / cell).astype(np.int64)
         cells -= cells.min(axis=0)
         across, along = cells.max(axis=0) + 1
         number, group = np.unique((self.cluster * across + cells[:, 0]) * along + cells[:, 1], return_inverse=True)
@@ -82,7 +82,7 @@ class Observations:
         value = mean(self.value)
         within = mean((self.within + (self.value[:, 0] - value[group, 0]) ** 2)[:, None])[:, 0]
         share = np.asarray(np.bincount(group, self.share), float)
-        return Observations(mean(self.place), value, weight, share, number // (across * along), within)
+        return Observations(mean(self.position), value, weight, share, number // (across * along), within)
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ def local_fit(
         if not len(which):
             continue
         coarse, radius = data.joined(cell), radii[which, rung]
-        by_abscissa = np.argsort(coarse.place[:, 0], kind="stable")
+        by_abscissa = np.argsort(coarse.position[:, 0], kind="stable")
         tiles, fits = _tiles(at[which, :2], TILE * radius.min()), []
         for chosen in tiles:
             positions = at[which[chosen]]
@@ -202,12 +202,12 @@ class _Tile:
         self.away = np.array([0.0, *slopes.mean, 0.0, 0.0, 0.0])
         self.precision = np.array([0.0, *slopes.precision, *[slopes.curvature] * 3])
         low, high = at[:, :2].min(0) - radius.max(), at[:, :2].max(0) + radius.max()
-        a, b = data.place.T[:2]
+        a, b = data.position.T[:2]
         first = np.searchsorted(a, low[0], "right", by_abscissa)
         strip = by_abscissa[first : np.searchsorted(a, high[0], "left", by_abscissa)]
         near = np.sort(strip[(b[strip] > low[1]) & (b[strip] < high[1])])  # sorted by cluster again
         middle = at.mean(axis=0)
-        self.offset, self.design = _polynomial(at - middle), _polynomial(data.place[near] - middle)
+        self.offset, self.design = _polynomial(at - middle), _polynomial(data.position[near] - middle)
         self.value, self.base, self.share = data.value[near], data.weight[near], data.share[near]
         self.cluster, self.within = data.cluster[near], data.within[near]
         self.starts = np.flatnonzero(np.concatenate([[True], self.cluster[1:] != self.cluster[:-1]]))

@@ -113,16 +113,16 @@ def pool(patches: xr.Dataset, nominal: float, positions: Floats) -> Pooled:
 
 def _pool(patches: xr.Dataset, nominal: float, positions: Floats) -> Pooled:
     rows = _rows(patches, nominal)
-    inside, corner = _triangles(rows.place[:, :2], positions)
+    inside, corner = _triangles(rows.position[:, :2], positions)
     if not inside.any():
         return Pooled(*np.full((6, len(positions)), np.nan))
     at = np.column_stack([positions, np.zeros(len(positions))])[inside]
     ladder = _ladder(rows, at[:, :2], corner[inside])
-    gap = cKDTree(rows.place[:, :2]).query(at[:, :2])[0]
+    gap = cKDTree(rows.position[:, :2]).query(at[:, :2])[0]
 
     count, possible = rows.value[:, 0], rows.weight
     fractions = Observations(
-        rows.place,
+        rows.position,
         np.column_stack([count / possible, rows.value[:, 1]]),
         possible * rows.share,
         rows.share,
@@ -141,9 +141,9 @@ def _pool(patches: xr.Dataset, nominal: float, positions: Floats) -> Pooled:
     use = degrees > 0
     sigma, sigma_error = np.full(len(at), np.nan), np.full(len(at), np.nan)
     if use.any():
-        along_normal = rows.value[use, 2:] * inverse_lambert_projection(rows.place[use, :2])[:, 2:]
+        along_normal = rows.value[use, 2:] * inverse_lambert_projection(rows.position[use, :2])[:, 2:]
         variances = Observations(
-            rows.place[use],
+            rows.position[use],
             along_normal**2,
             (degrees * rows.share)[use],
             rows.share[use],
@@ -216,7 +216,7 @@ def _triangles(vertices: Floats, positions: Floats) -> tuple[NDArray[np.bool_], 
 def _centres(rows: Observations) -> Floats:
     """Return the mean places (c, 3) of the captures."""
     number = np.bincount(rows.cluster)
-    return np.column_stack([np.bincount(rows.cluster, axis) / number for axis in rows.place.T])
+    return np.column_stack([np.bincount(rows.cluster, axis) / number for axis in rows.position.T])
 
 
 def _ladder(rows: Observations, at: Floats, corner: Floats) -> Floats:
@@ -239,13 +239,13 @@ def _binomial(fitted: LocalFit, possible: float) -> Floats:
 class _Predicted:
     """Errors of predicting captures from the others, one element per capture that lies among them.
 
-    - ``place`` (c, 2).
+    - ``position`` (c, 2).
     - ``squared`` difference, and ``chance``, its expectation from independent patches.
     - ``clustered``: factor of the variance common to a capture.
     - ``gap`` from the centre of the capture to the nearest other patch.
     """
 
-    place: Floats
+    position: Floats
     squared: Floats
     chance: Floats
     clustered: Floats
@@ -270,7 +270,7 @@ def _predicted(data: Observations, slopes: Slopes, link: Literal["identity", "lo
 
 def _gap(data: Observations, centre: Floats, cluster: int) -> float:
     """Return the distance from a centre (3,) to the nearest patch that is not of its capture."""
-    squared = (data.place[:, 0] - centre[0]) ** 2 + (data.place[:, 1] - centre[1]) ** 2
+    squared = (data.position[:, 0] - centre[0]) ** 2 + (data.position[:, 1] - centre[1]) ** 2
     squared[data.cluster == cluster] = np.inf
     return math.sqrt(squared.min())
 
@@ -285,7 +285,7 @@ def _common(predicted: _Predicted, at: Floats) -> tuple[Floats, Floats]:
     number = min(NEIGHBOURS, len(predicted.gap))
     if number < LEAST_CAPTURES:
         return np.full(len(at), np.nan), np.zeros(len(at))
-    near = cKDTree(predicted.place).query(at, k=number)[1].reshape(len(at), number)
+    near = cKDTree(predicted.position).query(at, k=number)[1].reshape(len(at), number)
     excess, clustered, gap = (
         (predicted.squared - predicted.chance)[near],
         predicted.clustered[near],

@@ -191,7 +191,7 @@ def test_overlapping_discs_count_as_often_as_they_are_independent(radius):
     cluster = np.sort(rng.integers(0, 9, 300))
     once = Observations(place, value, ones, ones, cluster, 0 * ones)
     twice = Observations(*(np.repeat(column, 2, axis=0) for column in vars(once).values()))
-    halved = Observations(twice.place, twice.value, twice.weight / 2, twice.share / 2, twice.cluster, twice.within)
+    halved = Observations(twice.position, twice.value, twice.weight / 2, twice.share / 2, twice.cluster, twice.within)
     slopes = Slopes((0, 0, 0), (0.1, 0.1, 1), 0.1)
     first, second = (local_fit(data, np.zeros((1, 3)), np.array([[radius]]), slopes) for data in (once, halved))
     for name, expected in vars(first).items():
