@@ -41,8 +41,8 @@ def joined_digest(stacks: Iterable[bytes]) -> str:
 
 
 def records_of(fitted_to: Iterable[FittedCapture]) -> dict[str, Any]:
-    """Return what the settings of a simulated capture say of its sensor's fit; nothing without one."""
-    listed = [one.model_dump() for one in fitted_to]
+    """Return the settings of a simulated capture that state the fit of its sensor; empty without a fit."""
+    listed = [capture.model_dump() for capture in fitted_to]
     return {"fitted_to": listed} if listed else {}
 
 
@@ -57,14 +57,14 @@ def recorded_in(settings: Mapping[str, Any], where: str | Path) -> tuple[FittedC
     return validate(where, {key: settings[key] for key in ("fitted_to",) if key in settings}, _Records).fitted_to
 
 
-def shows_the_fit(fitted_to: Iterable[FittedCapture], images: Mapping[str, NDArray[np.generic]], what: str) -> str:
-    """Return a sentence if ``what`` was fitted to these images, else an empty text."""
+def shows_the_fit(fitted_to: Iterable[FittedCapture], images: Mapping[str, NDArray[np.generic]], subject: str) -> str:
+    """Return a sentence if ``subject`` was fitted to these images, else an empty text."""
     fitted = tuple(fitted_to)
     digest = images_digest(images) if fitted else ""
-    name = next((one.name for one in fitted if one.images_sha256 == digest), None)
+    name = next((capture.name for capture in fitted if capture.images_sha256 == digest), None)
     if name is None:
         return ""
     return (
-        f"{what} was fitted to these images ({name}): agreement with them shows the fit, not a prediction; use a "
+        f"{subject} was fitted to these images ({name}): agreement with them shows the fit, not a prediction; use a "
         "capture that had no part in it"
     )

@@ -122,8 +122,8 @@ def write_rig_covariance(path: str | Path, covariance: RigCovariance, rig: Rig) 
     lines += ["", "[nominal]", *_rows(dict(zip(covariance.names, nominal, strict=True)), ".10g")]
     if covariance.details:
         lines += ["", "[details]", *_rows(covariance.details, ".6g")]
-    for one in covariance.fitted_to:
-        lines += ["", "[[fitted_to]]", *_rows(one.model_dump(), "")]
+    for capture in covariance.fitted_to:
+        lines += ["", "[[fitted_to]]", *_rows(capture.model_dump(), "")]
     write_text(path, "\n".join(lines) + "\n")
 
 

@@ -197,8 +197,8 @@ def _apart(edges: NDArray[np.float64], limit: float) -> NDArray[np.bool_]:
     middles, along = edges.mean(axis=1), edges[:, 1] - edges[:, 0]
     length = np.maximum(np.linalg.norm(along, axis=1), limit)
     of_length, apart, every = np.frexp(length / limit)[1], np.ones(len(edges), bool), cKDTree(middles)
-    for one in np.unique(of_length):
-        members = np.flatnonzero(of_length == one)
+    for length_class in np.unique(of_length):
+        members = np.flatnonzero(of_length == length_class)
         reach = float(length[members].max()) / 2 + limit
         pairs = cKDTree(middles[members]).sparse_distance_matrix(every, reach, output_type="coo_matrix")
         member, other = members[pairs.row], pairs.col
