@@ -12,7 +12,7 @@ from characterisation.files.errors import InputError
 from characterisation.statements.decision import acceptance, decide, global_risks, needed
 from characterisation.statements.statement import statement
 from characterisation.statements.tolerance import Tolerance, plus_minus, tolerance_of
-from characterisation.statements.verdict_words import Judged, result_in_words
+from characterisation.statements.verdict_words import Judged, in_words, result_reasons
 from characterisation.tasks.decision_table import Decision
 from characterisation.tasks.task_file import Task
 
@@ -144,7 +144,7 @@ def test_a_few_trials_without_a_value_do_not_show_that_there_is_none():
     for trials, verdict in ((1, "not decided"), (4, "not decided"), (5, "undecidable"), (40, "undecidable")):
         stated = statement("radius", "mm", np.full(trials, np.nan), plus_minus(20.0, 0.15))
         assert stated.verdict == verdict
-        words = result_in_words([Judged("radius", "mm", verdict, np.nan, np.nan, without_value=1.0)])
+        words = in_words(result_reasons([Judged("radius", "mm", verdict, np.nan, np.nan, without_value=1.0)]))
         assert ("no value in the few virtual measurements" in words) == (verdict == "not decided")
         assert "a single virtual measurement" not in words
 
