@@ -79,6 +79,7 @@ class CaptureSettings:
     depth: int
     noise: Noise
     truth: bool
+    smoothing_px: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -118,6 +119,8 @@ class CaptureJob:
             asdict(settings.noise),
             settings.truth,
         ]
+        if settings.smoothing_px:
+            own.append(settings.smoothing_px)
         return hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()
 
 
@@ -213,7 +216,7 @@ def _taken(job: CaptureJob, simulated: SimulatedSensor) -> dict[str, bytes]:
     settings, pose, parameters = job.settings, job.world_from_sensor, dict(sorted(job.settings.parameters.items()))
     seed, samples, deviation = settings.seed, settings.samples, Deviation.parse(settings.deviation)
     scene = _scene(job.scene, job.sensor.wavelength_nm, tuple(parameters.items()), deviation)
-    rendering = Rendering(samples, settings.depth)
+    rendering = Rendering.smoothed(samples, settings.depth, settings.smoothing_px)
     capture = simulated.capture(scene, pose, seed=seed, rendering=rendering, noise=settings.noise)
     capture.settings["deviation"] = asdict(deviation)
     about = {"scene": job.scene, "parameters": parameters, "finish": job.finish, "view": job.view}

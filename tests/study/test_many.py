@@ -2,6 +2,7 @@
 
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -140,6 +141,18 @@ def test_a_worker_gives_the_same_capture(plan, coarse):
     there = take_job(job)
     assert {"capture.json", "settings.json", "images/left_000.png"} <= here.keys()
     assert here == there
+
+
+def test_smoothed_interreflections_are_part_of_the_job_and_of_its_capture(plan, coarse):
+    from mitsim.study.many_captures import take_job
+
+    sensor, deep = load_sensor(coarse), replace(COMMON, depth=2)
+    (plain, *_), (smoothed, *_) = (
+        read_jobs(plan, SCENE, sensor, settings) for settings in (deep, replace(deep, smoothing_px=1.5))
+    )
+    assert plain.digest() != smoothed.digest()
+    settings = [json.loads(take_job(job)["settings.json"]) for job in (plain, smoothed)]
+    assert "indirect_light" not in settings[0] and settings[1]["indirect_light"]["smoothing_px"] == 1.5
 
 
 def test_finishes_have_a_default():

@@ -25,6 +25,7 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.indirect_light import IndirectLight
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.running.numbers import two_digits
 from mitsim.running.progress import say
 from mitsim.scene.load import Scene
 from mitsim.scene.visible_surfaces import sees_nothing
@@ -159,6 +160,20 @@ def checked_rendering(
     unseen = f"no pixel of the {', '.join(blind)} shows the part: check position, target and roll"
     capture.settings["warnings"] = [*capture.settings.get("warnings", []), unseen]
     return residual, unseen
+
+
+def advice(residual: RenderResidual, rendering: Rendering) -> str:
+    """Return what to do about errors above :data:`LIMIT` of a rendering; empty if none are.
+
+    Noise decreases with the square root of the number of samples.
+    """
+    if not residual.worst > LIMIT:
+        return ""
+    if not residual.noise > LIMIT:
+        return f"over {LIMIT}: increase the samples"
+    needed = two_digits(rendering.samples * (residual.noise / LIMIT) ** 2)
+    fewer = ", or fewer with smoothed interreflections" if rendering.indirect is None and rendering.depth > 1 else ""
+    return f"over {LIMIT}: about {needed} samples are needed{fewer}"
 
 
 def warn_above_limit(subject: str, residual: RenderResidual) -> RenderResidual:

@@ -57,6 +57,19 @@ class Rendering:
     indirect: IndirectLight | IndirectImages | None = None
     kept: KeptSettings | None = None
 
+    @classmethod
+    def smoothed(cls, samples: int, depth: int, smoothing_px: float) -> Rendering:
+        """Return settings with as many paths for direct light as for interreflections, which are smoothed.
+
+        Parameters
+        ----------
+        samples, depth
+            As the attributes.
+        smoothing_px
+            Standard deviation of the filter over the interreflections on each shape [px]; 0 for no filter.
+        """
+        return cls(samples, depth, IndirectLight(samples, smoothing_px) if smoothing_px > 0 and depth > 1 else None)
+
     @property
     def prerendered(self) -> IndirectImages | None:
         """Interreflections that were rendered before, or None."""
