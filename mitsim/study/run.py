@@ -57,6 +57,7 @@ from mitsim.study.view_sets.confirmed_set import (
     tried_entries,
     write_set_csv,
 )
+from mitsim.study.virtual.plan import measured_by
 from mitsim.study.virtual.race import ALL, Raced, in_words
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.stated import StatedView
@@ -246,14 +247,14 @@ def lacking(
 
 
 def measures_set(study: Study) -> bool:
-    """Return whether a run measures a set of views virtually: the study asks for one, and for its trials."""
-    return study.file.set is not None and study.file.set.trials >= 2
+    """Return whether a run measures a set of views virtually: the study asks for it, and renders its trials."""
+    return study.file.set is not None and study.file.set.trials >= 2 and measured_by(study) == "render"
 
 
 def _confirm(session: Session, chosen: ViewSet | None, search: Search, limit: TimeLimit) -> list[TriedSet]:
     """Measure sets of views virtually, if there are any, until one keeps its limits; the best set comes last."""
     table = session.study.file.set
-    if table is None or chosen is None or not chosen.views or not measures_set(session.study):
+    if table is None or chosen is None or not chosen.views or table.trials < 2:
         return []
     if session.renderer is None:
         say("the set of views is not confirmed: clouds drawn from a map cannot be joined")
