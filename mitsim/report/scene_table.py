@@ -16,7 +16,7 @@ from mitsim.scene.authoring.finding import SceneFinding
 from mitsim.scene.inspect import SceneFacts, ShapeFacts
 from mitsim.scene.visible_surfaces import VisibleSurfaces
 
-#: number of rows of the table of shapes, unless more are measured
+#: number of rows of the table of shapes, unless more are measured; chosen
 MOST_ROWS = 20
 
 _NONE = "-"

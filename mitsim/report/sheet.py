@@ -24,6 +24,8 @@ from mitsim.report.sheet_layout import ACROSS, FOOT, GAP, HEIGHT, LINE, MARGIN, 
 from mitsim.running.numbers import NONE
 from mitsim.study.scene_geometry import SceneGeometry, read_scene_geometry
 
+# Sizes of this page are chosen, not fitted.
+
 #: largest height of the picture [in]
 _PICTURE = 3.4
 

@@ -26,10 +26,10 @@ HEIGHT = 11.69
 #: margin of a page on each side [in]
 MARGIN = 0.6
 
-#: height of the last line of a page [in]
+#: height of the last line of a page [in]; chosen
 FOOT = 0.22
 
-#: distance between columns [in]
+#: distance between columns [in]; chosen
 GAP = 0.07
 
 #: width between the margins [in]

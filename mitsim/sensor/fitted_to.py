@@ -54,7 +54,7 @@ def recorded_in(settings: Mapping[str, Any], where: str | Path) -> tuple[FittedC
     InputError
         If the settings state them in another form.
     """
-    return validate(where, {key: settings[key] for key in ("fitted_to",) if key in settings}, _Records).fitted_to
+    return validate(where, {"fitted_to": settings.get("fitted_to", [])}, _Records).fitted_to
 
 
 def shows_the_fit(fitted_to: Iterable[FittedCapture], images: Mapping[str, NDArray[np.generic]], subject: str) -> str:

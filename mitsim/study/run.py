@@ -161,10 +161,10 @@ def run_within(
         now = Shortfall(session, stated, scores, raced, search)
         stated, remedies = state_and_mend(session, now, rest, clock)
         twin = session.renderer
-    tried = [] if limit.over() else _confirm(session, chosen, search, plan.set_limit(limit))
+    tried = [] if limit.over() else _confirm(session, chosen, search, plan.last_limit(limit))
     chosen = tried[-1].chosen if tried else chosen
     clock.lap("confirm")
-    pictured = limit.part(1.0, plan.page(limit) if whole is not None else 0.0)
+    pictured = plan.last_limit(limit)
     first = dict.fromkeys([*leaders, *(chosen.views if chosen else ()), *_best(scores)])
     drawn = sorted(draw_clouds(session, performance_map, list(first), pictured))
     shown = leaders[: study.file.check.views] if twin is not None else []
@@ -239,8 +239,8 @@ def lacking(
             out.append(f"statement from {by}: {len(open_ones)} of {len(stated.statements)} not settled")
         if not any(statement.budget for statement in stated.statements):
             out.append("no budget")
-    if study.file.set is not None and tried and tried[-1].stated[0].trials < study.file.set.trials:
-        out.append(f"set of views: {tried[-1].stated[0].trials} of {study.file.set.trials} trials")
+    if study.file.set is not None and tried and tried[-1].trials < study.file.set.trials:
+        out.append(f"set of views: {tried[-1].trials} of {study.file.set.trials} trials")
     if limit.over():
         out.append("pictures" if not stopped_by_user() else "stopped by the user")
     return out
@@ -267,9 +267,8 @@ def _confirm(session: Session, chosen: ViewSet | None, search: Search, limit: Ti
     write_set_csv(session.folder / "view_set.csv", table, best)
     kept = "keeps its limits" if best.excess(table.limits) <= 1 else "the best set found, misses a limit"
     views = ", ".join(map(str, best.chosen.views))
-    made = max(statement.trials for statement in best.stated)
     say(
-        f"{len(best.chosen.views)} views ({views}), {joining_in_words(table)}, measured together {made} times: "
+        f"{len(best.chosen.views)} views ({views}), {joining_in_words(table)}, measured together {best.trials} times: "
         f"{kept} (sets measured: {len(tried)})\n"
         f"{set_table(table, best)}"
     )

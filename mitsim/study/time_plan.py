@@ -93,8 +93,8 @@ class TimePlan:
         """Return the limit of what starts now and may take all time but that of the set, pictures and report."""
         return limit.part(1.0 - (_SET_SHARE if self.sets else 0.0), self._pictures(limit))
 
-    def set_limit(self, limit: TimeLimit) -> TimeLimit:
-        """Return the limit of the virtual measurements of a set of views, which start now."""
+    def last_limit(self, limit: TimeLimit) -> TimeLimit:
+        """Return the limit of what starts now and may take all time but that of clouds and page."""
         return limit.part(1.0, self.page(limit))
 
     def _pictures(self, limit: TimeLimit) -> float:

@@ -66,6 +66,11 @@ class TriedSet:
     searched: dict[str, float]
     stated: tuple[Statement, ...]
 
+    @property
+    def trials(self) -> int:
+        """Return the number of virtual measurements of the set, the same for every measurement."""
+        return self.stated[0].trials
+
     def excess(self, limits: dict[str, float]) -> float:
         """Return the largest ratio of root mean square error to limit, over reachable limits.
 
@@ -100,10 +105,10 @@ def confirmed_set(
     assert table is not None
     chosen, searched, tried = first, dict(table.limits), list[TriedSet]()
     while True:
-        stated = state_set(session, chosen, over)
-        if over() and stated[0].trials < 2:
+        measured = TriedSet(chosen, dict(searched), tuple(state_set(session, chosen, over)))
+        if over() and measured.trials < 2:
             break
-        tried.append(TriedSet(chosen, dict(searched), tuple(stated)))
+        tried.append(measured)
         if tried[-1].excess(table.limits) <= 1 or over():
             break
         say(f"set {len(tried)}, views {', '.join(map(str, chosen.views))}: {_missed(tried[-1], table.limits)}")
