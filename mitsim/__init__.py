@@ -31,30 +31,31 @@ _NAMES = {
     "Transform": "mitsim.sensor.transforms",
     "Truth": "mitsim.capture.simulated.truth",
     "characterise": "mitsim.maps.use",
-    "decode": "mitsim.decoding.captures",
+    "decode": "mitsim.decoding.decode",
     "label": "mitsim.study.task_measurement",
-    "load_scene": "mitsim.decoding.captures",
-    "load_sensor": "mitsim.decoding.captures",
+    "load_scene": "mitsim.capture.simulated.render",
+    "load_sensor": "mitsim.sensor.preset",
     "look_at": "mitsim.sensor.poses",
     "measure": "mitsim.study.task_measurement",
     "open_study": "mitsim.study.reading",
     "performance_map": "mitsim.maps.use",
     "predict": "mitsim.maps.use",
-    "read_capture": "mitsim.decoding.captures",
-    "read_cloud": "mitsim.decoding.captures",
+    "read_capture": "mitsim.capture.folder",
+    "read_cloud": "mitsim.decoding.decode",
     "read_task": "characterisation.tasks.task_reading",
     "read_truth": "mitsim.capture.simulated.truth",
-    "render": "mitsim.decoding.captures",
+    "render": "mitsim.capture.simulated.render",
     "run_study": "mitsim.study.run",
     "score": "mitsim.study.session",
     "statement": "mitsim.study.session",
     "triangulate": "mitsim.decoding.own_code",
     "true_points": "mitsim.scene.ray_casting.true_points",
-    "write_capture": "mitsim.decoding.captures",
-    "write_cloud": "mitsim.decoding.captures",
+    "write_capture": "mitsim.capture.folder",
+    "write_cloud": "characterisation.cloud_files",
 }
 
 if TYPE_CHECKING:
+    from characterisation.cloud_files import write_cloud
     from characterisation.files.errors import InputError, MissingEnvironmentError
     from characterisation.maps.performance_map import PerformanceMap
     from characterisation.point_cloud import PointCloud
@@ -64,23 +65,17 @@ if TYPE_CHECKING:
     from characterisation.tasks.task_file import Task
     from characterisation.tasks.task_reading import read_task
     from mitsim.capture.capture import Capture
+    from mitsim.capture.folder import read_capture, write_capture
+    from mitsim.capture.simulated.render import load_scene, render
     from mitsim.capture.simulated.truth import Truth, read_truth
-    from mitsim.decoding.captures import (
-        decode,
-        load_scene,
-        load_sensor,
-        read_capture,
-        read_cloud,
-        render,
-        write_capture,
-        write_cloud,
-    )
+    from mitsim.decoding.decode import decode, read_cloud
     from mitsim.decoding.own_code import triangulate
     from mitsim.maps.campaign.plan import CampaignFile
     from mitsim.maps.use import characterise, performance_map, predict
     from mitsim.scene.load import Scene
     from mitsim.scene.ray_casting.true_points import true_points
     from mitsim.sensor.poses import look_at
+    from mitsim.sensor.preset import load_sensor
     from mitsim.sensor.sensor import Sensor
     from mitsim.sensor.transforms import Transform
     from mitsim.study import Study, StudyFile

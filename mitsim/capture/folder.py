@@ -47,19 +47,19 @@ LARGEST_CAPTURE = 8 * 1024**3
 
 def write_capture(
     capture: Capture,
-    folder: str | Path,
+    path: str | Path,
     *,
     overwrite: bool = False,
     vendor: Mapping[str, bytes] | None = None,
     truth: Mapping[str, bytes] | None = None,
 ) -> Path:
-    """Write a capture to a folder, completely or not at all.
+    """Write a capture as a folder: images as PNG, calibration, settings and pose as JSON; completely or not at all.
 
     Parameters
     ----------
     capture
-        Capture to write.
-    folder
+        From :func:`mitsim.render` or :func:`read_capture`.
+    path
         New or empty folder. Its files are first written beside it, and moved there in one step.
     overwrite
         Replace an existing capture. Other files are never replaced.
@@ -83,8 +83,14 @@ def write_capture(
     See Also
     --------
     read_capture : the inverse
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> ms.write_capture(ms.read_capture("capture"), "copy").name
+    'copy'
     """
-    return write_packed(packed(capture, folder, vendor=vendor, truth=truth), folder, overwrite=overwrite)
+    return write_packed(packed(capture, path, vendor=vendor, truth=truth), path, overwrite=overwrite)
 
 
 def write_packed(files: Mapping[str, bytes], folder: str | Path, *, overwrite: bool = False) -> Path:
@@ -133,16 +139,28 @@ def is_written(capture: Capture, folder: str | Path, vendor: Mapping[str, bytes]
     return True
 
 
-def read_capture(folder: str | Path) -> Capture:
-    """Read a capture folder, and check each file.
+def read_capture(path: str | Path) -> Capture:
+    """Read a capture folder of ``mitsim render``, ``capture`` or ``import``, or of :func:`write_capture`.
+
+    Returns
+    -------
+    Capture
+        Images, calibration, settings, and the pose if it is known.
 
     Raises
     ------
     InputError
         If a file is missing, damaged, changed since it was written, of the wrong size or of a newer format. The error
         names file and field.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> capture = ms.read_capture("capture")
+    >>> capture.sensor, sorted(capture.images)
+    ('small', ['left', 'right'])
     """
-    folder = Path(folder)
+    folder = Path(path)
     if not folder.is_dir():
         raise InputError(folder, "", "no such folder", "a capture folder")
     document, where = _read_index(folder)

@@ -143,11 +143,13 @@ def predict(
     Example: mitsim map predict scenes/two_pillars/two_pillars.xml --map ensenso-n10 --position 0 -400 300 -o cloud.ply
     """
     options.start(variant)
-    from mitsim.decoding.captures import load_scene, load_sensor, write_cloud
+    from characterisation.cloud_files import write_cloud
+    from mitsim.capture.simulated.render import load_scene
     from mitsim.decoding.cloud import sensor_geometry
     from mitsim.maps import use as maps
     from mitsim.maps.prediction import Predictor
     from mitsim.maps.prediction.faces_in_sight import faces_in_sight, in_words
+    from mitsim.sensor.preset import load_sensor
     from mitsim.study import read_map
 
     chosen = load_sensor(sensor)

@@ -93,14 +93,16 @@ def render(
     assert position is not None
 
     from mitsim.capture.folder import check_free, read_capture, write_capture
+    from mitsim.capture.simulated.render import load_scene, prepared_sensor
+    from mitsim.capture.simulated.render import render as render_capture
     from mitsim.capture.simulated.render_residual import advice, checked_rendering
     from mitsim.capture.simulated.rendering import Rendering
     from mitsim.capture.simulated.truth import encode_exr, true_images
-    from mitsim.decoding import captures as interface
     from mitsim.scene.surface.scatter import Deviation
+    from mitsim.sensor.preset import load_sensor
 
-    chosen, moved = interface.load_sensor(sensor), Deviation.parse(deviation)
-    loaded = interface.load_scene(scene, chosen, defined, deviation=moved)
+    chosen, moved = load_sensor(sensor), Deviation.parse(deviation)
+    loaded = load_scene(scene, chosen, defined, deviation=moved)
     pose = options.pose_of(position, target, roll, chosen)
     origin = origin_of(scene, chosen, defined)
     digest = CaptureJob(chosen, str(scene), "", 0, pose, settings, origin).digest()
@@ -111,10 +113,10 @@ def render(
         return
     check_free(output)
     rendering = Rendering.smoothed(samples, depth, smoothing)
-    capture = interface.render(
+    capture = render_capture(
         loaded, chosen, pose, seed=seed, samples=samples, depth=depth, smoothing_px=smoothing, noise=noise, check=False
     )
-    simulated = interface.prepared_sensor(chosen)
+    simulated = prepared_sensor(chosen)
     residual, unseen = checked_rendering(capture, simulated, loaded, pose, rendering, seed)
     capture.settings["deviation"] = asdict(moved)
     capture.settings["render"] = {"digest": digest}

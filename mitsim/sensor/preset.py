@@ -37,27 +37,43 @@ def presets() -> list[str]:
     return sorted(p.name.removesuffix(".toml") for p in folder.iterdir() if p.name.endswith(".toml"))
 
 
-def load_sensor(name: str | Path, purpose: Purpose = "simulation", size: tuple[int, int] | None = None) -> Sensor:
-    """Load a preset by name, or a sensor TOML file by path.
+def load_sensor(
+    name_or_path: str | Path, purpose: Purpose = "simulation", size: tuple[int, int] | None = None
+) -> Sensor:
+    """Load a sensor: a preset by its name, or a sensor TOML file by its path.
 
     Parameters
     ----------
-    name
-        Of a preset, or path of a file.
+    name_or_path
+        ``"ensenso-n10"`` or another preset of ``docs/reference/sensors.md``, or a path that ends in ``.toml``.
     purpose
-        What the sensor is for. Only for ``simulation`` warnings about the calibration are printed; for others they are
-        in ``notes``.
+        What the sensor is for: ``"simulation"``, or ``"decoding"`` for the file of a rig whose images exist, which may
+        leave out its light and imager. Only for ``"simulation"`` are warnings about the calibration printed; for others
+        they are in ``notes``.
     size
         (width, height) [px] of images, if known. It tells whether they show a part of the calibrated imager, and is
         the size of cameras without one: OpenCV's pair of ``intrinsics.yml`` and ``extrinsics.yml`` has none.
+
+    Returns
+    -------
+    Sensor
+        Cameras, projector, pattern, imager, exposure and decoder. ``missing_for("simulation")`` names the keys that
+        simulation needs and the file lacks.
 
     Raises
     ------
     InputError
         For an unknown name, or a file that does not describe a sensor. The error names all keys that the purpose needs
         and the file lacks.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> sensor = ms.load_sensor("small.toml")
+    >>> sensor.name, sensor.technology, sensor.working_range_mm
+    ('small', 'active_stereo', (400.0, 800.0))
     """
-    path, written = _written_table(name)
+    path, written = _written_table(name_or_path)
     table, notes = with_calibration(path, with_lenses(path, written), size)
     sensor = _sensor_of(path, table, purpose, tuple(notes))
     if purpose == "simulation":

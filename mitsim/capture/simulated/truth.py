@@ -208,7 +208,7 @@ def read_truth(path: str | Path) -> dict[str, Truth]:
 
     See Also
     --------
-    mitsim.decoding.captures.read_capture : the images
+    mitsim.capture.folder.read_capture : the images
 
     Examples
     --------
