@@ -142,6 +142,11 @@ def is_written(capture: Capture, folder: str | Path, vendor: Mapping[str, bytes]
 def read_capture(path: str | Path) -> Capture:
     """Read a capture folder of ``mitsim render``, ``capture`` or ``import``, or of :func:`write_capture`.
 
+    Parameters
+    ----------
+    path
+        The folder.
+
     Returns
     -------
     Capture
