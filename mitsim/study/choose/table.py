@@ -189,8 +189,7 @@ def as_text(choice: ChoiceDocument) -> str:
         for sensor in choice.sensors
         if sensor.status != "excluded" and sensor.impossible
     ]
-    if lacking := [f"{sensor.name} {sensor.lacks.partition(' views')[0]}" for sensor in choice.sensors if sensor.lacks]:
-        lines.append(f"not all views were screened, for lack of time: {', '.join(lacking)}")
+    lines += [f"{sensor.name}: {sensor.lacks}" for sensor in choice.sensors if sensor.lacks]
     lines += [f"{sensor.name} is excluded: {sensor.why}" for sensor in choice.sensors if sensor.status == "excluded"]
     return "\n".join(lines)
 
