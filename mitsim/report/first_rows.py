@@ -145,8 +145,8 @@ def measured_words(kind: str, features: Sequence[str]) -> str:
 def breakable(name: str, after: str = "_") -> Markup:
     """Return a name as safe markup that a browser may break ``after`` some characters; of a path, ``_/``."""
     text = escape(name)
-    for one in after:
-        text = text.replace(one, Markup(f"{one}<wbr>"))
+    for character in after:
+        text = text.replace(character, Markup(f"{character}<wbr>"))
     return Markup(text)
 
 
