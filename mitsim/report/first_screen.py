@@ -151,9 +151,9 @@ def of_run(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
     poses: list[tuple[str, ArrayLike]] = [(f"view {document.view}", view_scores["world_from_sensor"].values)]
     verdicts = face_verdicts(asked)
     result = with_sets(result_reasons(results), fits_all(results), run.about.view_sets)
-    first, *rest = result.reasons
+    first, *reasons = result.reasons
     return FirstScreen(
-        [Reason(first.says[:1].upper() + first.says[1:]), *rest],
+        [Reason(first.says[:1].upper() + first.says[1:]), *reasons],
         tone_of(results) if result.good else "bad",
         [_run_row(run, view_scores, name, measurement) for name, measurement in document.measurements.items()],
         _picture(geometry, poses, verdicts, _caption(run, document.view)),

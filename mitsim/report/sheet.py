@@ -145,9 +145,9 @@ def sheet_figures(declaration: Declaration, geometry: SceneGeometry | None) -> l
             _table(page, _taken(rows, page.room, columns) or [rows.pop(0) for _ in rows[:1]], columns)
         _facts(page, declaration, layout.facts)
         _sign(page)
-        for number, one in enumerate(pages, 1):
-            _foot(one, number, len(pages))
-    return [one.figure for one in pages]
+        for number, sheet_page in enumerate(pages, 1):
+            _foot(sheet_page, number, len(pages))
+    return [sheet_page.figure for sheet_page in pages]
 
 
 def _taken(rows: list[DeclaredRow], room: float, columns: Columns) -> list[DeclaredRow]:
@@ -186,10 +186,10 @@ def _result(first: FirstScreen, lines: int) -> str:
 
 def _cells(row: DeclaredRow) -> list[str]:
     result = row.result
-    known = result.tolerance != NONE
+    toleranced = result.tolerance != NONE
     return [
         result.name,
-        result.tolerance if known else "none",
+        result.tolerance if toleranced else "none",
         row.bias,
         result.uncertainty,
         row.expanded,

@@ -210,11 +210,11 @@ class Columns:
                 max(text_width(line, size, "bold") for line in (*(row[k] for row in rows), *head))
                 for k, head in enumerate(heads)
             ]
-            rest = sum(self.widths[1:]) + GAP * (len(heads) - 1)
-            if min(self.widths[0], first) + rest <= ACROSS:
+            remaining_width = sum(self.widths[1:]) + GAP * (len(heads) - 1)
+            if min(self.widths[0], first) + remaining_width <= ACROSS:
                 break
-        self.widths[0] = max(min(self.widths[0], ACROSS - rest), first / 2)
-        spare = max(0.0, ACROSS - self.widths[0] - rest) / max(len(heads) - 1, 1)
+        self.widths[0] = max(min(self.widths[0], ACROSS - remaining_width), first / 2)
+        spare = max(0.0, ACROSS - self.widths[0] - remaining_width) / max(len(heads) - 1, 1)
         self.lefts = [0.0]
         for width in self.widths[:-1]:
             self.lefts.append(self.lefts[-1] + width + GAP + spare)
