@@ -179,7 +179,7 @@ def targets(
         raise InputError("--robot", "", repr(robot), ", ".join(ROBOT_FORMATS))
     target_format = ROBOT_FORMATS[robot]
     if output.suffix.lower() != target_format.suffix:
-        allowed = f"a name that ends in {target_format.suffix}: {target_format.what}"
+        allowed = f"a name that ends in {target_format.suffix}: {target_format.description}"
         raise InputError("--output", "", output.name, allowed)
     found, tool = read_targets(_run_in(folder), views)
     options.check_file(output)

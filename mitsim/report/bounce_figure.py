@@ -132,7 +132,7 @@ def _sources(main: NDArray[np.integer], share: NDArray[np.floating], colours: di
 
 
 def _line(light: LightFromFaces, names: Sequence[str], shape: int) -> str:
-    """Return what a face gets from others: ``pillar1: 91 % of its light met plane (90 %) or pillar2 (1 %) before``."""
+    """Describe the light of a face: ``pillar1: 91 % of its light met another face before: plane 90 %, pillar2 1 %``."""
     shares = light.shares_of(shape)
     if not np.isfinite(shares).all():
         return ""

@@ -23,7 +23,7 @@ _BY_SHARE = ("ISO 14253-1", "simple acceptance")
 #: share above which the exact figure is of no use
 _LARGEST_SHARE = 10.0
 
-#: what a kind of measurement is, of its features in their order; other kinds are their name, "of" the features
+#: description of a kind of measurement by its features, in their order; other kinds: their name, "of" the features
 _KINDS = {
     "intersection_distance": "distance between the points where the axes of {1} and {2} meet {0}",
     "axis_distance": "distance between the axes of {0} and {1}",

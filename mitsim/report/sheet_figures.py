@@ -28,7 +28,7 @@ _LINES = ("-", "--", ":", "-.")
 #: distance at which the rays of a cloud are projected into the image [mm]; its origin is that of the camera
 _FAR_MM = 1000.0
 
-#: what a picture of the gallery shows dark
+#: meaning of dark pixels in a picture of the gallery
 _DARK = (
     "black in the image: no light returns, since there is nothing, a shadow of the projector, or a mirror that faces "
     "elsewhere"
@@ -36,7 +36,7 @@ _DARK = (
 
 
 def noise_figure(sheets: Sequence[DataSheet]) -> Figure:
-    """Draw sigma over distance on matt white, a panel for each sensor, with published values of others."""
+    """Draw sigma over distance on matt white, a panel for each sensor, with the values that others published."""
     with drawing():
         figure, panels = _panels(len(sheets), 3.4, 2.9)
         for sheet, axes in zip(sheets, panels, strict=False):
