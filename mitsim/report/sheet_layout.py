@@ -176,8 +176,8 @@ class Columns:
     """Columns of a table as wide as their widest cell, at the largest size of text at which they fit a page.
 
     ``lefts`` [in] from the margin, ``widths`` [in], ``size`` [pt]. Cells of the first column wrap if they are wider
-    than ``first`` [in] and the other columns leave no more. Where one would wrap, all are ``above``: they have lines of their
-    own, over the other cells, which are a little to the right, and the first column has no head.
+    than ``first`` [in] and the other columns leave no more. Where one would wrap, all are ``above``: they have lines of
+    their own, over the other cells, which are a little to the right, and the first column has no head.
 
     Parameters
     ----------
