@@ -101,7 +101,7 @@ Yes = Annotated[
 def asking(yes: bool, extension: str = "") -> Callable[[str], bool] | None:
     """Return the function that answers whether a missing finish may be characterised; None if nobody can answer.
 
-    With ``yes`` it always agrees. At a terminal it asks the user once. ``extension``, the end of the question, names the
+    With ``yes`` it always agrees. At a terminal it asks the user once. ``extension`` ends the question, and names the
     other cases that the answer covers.
     """
     if yes:

@@ -115,7 +115,7 @@ def check(
 def _inspected(
     scene: Path, sensor: Sensor, defined: dict[str, str], task: Path | None, stand: Transform | None, roll: float = 0.0
 ) -> tuple[Authored, VisibleSurfaces, Transform]:
-    """Load a scene and look for mistakes; return also what the sensor sees, and its pose: the usual one if None."""
+    """Load a scene and look for mistakes; return also the surfaces that the sensor sees, and its pose."""
     from mitsim.scene.authoring.check import Authored, findings
     from mitsim.scene.authoring.check_task import read_features
     from mitsim.scene.inspect import inspect

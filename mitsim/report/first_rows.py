@@ -41,8 +41,8 @@ _KINDS = {
 class ResultRow:
     """One measurement in the short table, as texts; ``colour`` of its verdict.
 
-    ``about`` says what is measured. ``share`` of the tolerance with its ``share_interval`` and the largest
-    ``share_limit`` that fits. ``limited`` says what limits the view, ``points`` how many it expects there; ``source``
+    ``about`` describes the measurement. ``share`` of the tolerance with its ``share_interval`` and the largest
+    ``share_limit`` that fits. ``limited`` is the limit of the view, ``points`` how many it expects there; ``source``
     is the largest line of the budget. Texts are empty where nothing is known; values without a number are a dash.
     """
 
@@ -71,9 +71,9 @@ class RowValues:
     """Values of one measurement, in ``unit``; None where a value is not known or there is no tolerance.
 
     ``tolerance`` as in the task, or half the interval that conforms. ``share`` of the tolerance that the uncertainty
-    takes; ``demand`` of the ``rule`` with its interval; ``accepted`` lowest and highest reading. ``limited`` is what
-    limits the view, with the expected ``points`` on that feature; ``source`` the largest line of the budget. Values by
-    screening alone are not ``stated``: they accept no reading, and reject none.
+    takes; ``demand`` of the ``rule`` with its interval; ``accepted`` lowest and highest reading. ``limited`` is
+    the limit of the view, with the expected ``points`` on that feature; ``source`` the largest line of the budget.
+    Values by screening alone are not ``stated``: they accept no reading, and reject none.
     """
 
     name: str

@@ -43,7 +43,7 @@ _NOT_ASKED = "#b9bdc4"
 #: words of the legend, where they are not the verdict
 _LEGEND = {"no tolerance": "measured, without tolerance"}
 
-#: pixels along the longer side of the picture, and of the raster in which places for labels are found
+#: pixels along the longer side of the picture, and of the raster in which labels are anchored
 _PIXELS = 900
 _LABEL_PIXELS = 240
 
@@ -65,7 +65,7 @@ _SIZE_IN = (7.4, 3.9)
 #: size of the figure with the part below the sensor [in]
 _STACKED_IN = (3.9, 5.6)
 
-#: places of both pictures in each figure
+#: left, bottom, width and height of both pictures in each figure, as shares of its size
 _BESIDE = (0.0, 0.09, 0.46, 0.91), (0.46, 0.09, 0.54, 0.91)
 _STACKED = (0.0, 0.54, 1.0, 0.46), (0.0, 0.1, 1.0, 0.42)
 

@@ -1,4 +1,4 @@
-"""Describe a view: its pose, angles in deg and lengths in mm in the part frame, and what is predicted for it."""
+"""Describe a view: its pose, angles in deg and lengths in mm in the part frame, and its predicted figures."""
 
 from __future__ import annotations
 

@@ -85,7 +85,7 @@ def preview_figure(
     sensor, pose
         The sensor, and world_from_sensor [mm].
     visible
-        What the reference camera's pixels see.
+        Surfaces that the reference camera's pixels see.
     first
         Names of the shapes that get the first colours; the largest of the others follow.
     measured

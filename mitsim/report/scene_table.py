@@ -34,7 +34,7 @@ def as_text(
     Parameters
     ----------
     facts, visible, findings
-        About the scene: its shapes, what the sensor sees of them, and the findings.
+        About the scene: its shapes, the surfaces that the sensor sees, and the findings.
     measured
         Names of the shapes that a task measures: they come first.
     every
@@ -72,7 +72,7 @@ def as_text(
 
 
 def _joined(findings: Sequence[SceneFinding]) -> list[SceneFinding]:
-    """Return warnings and notes that differ only in what they are about as one, in the place of the first."""
+    """Merge warnings and notes that differ only in the shapes they are about; each stands where its first stood."""
     about: dict[tuple[Any, ...], list[str]] = {}
     for finding in findings:
         alone = finding.about if finding.severity == "error" else None

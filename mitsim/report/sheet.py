@@ -32,7 +32,7 @@ _PICTURE = 3.4
 #: height of the lines to sign [in]
 _SIGNATURE = 0.9
 
-#: what only the user knows, to be written by hand
+#: facts that only the user knows, to be written by hand
 _TO_FILL_IN = (
     ("Part: drawing number and revision", "Sensor: serial number, date of its calibration", "Valid until"),
     ("Place and date", "Name, organisation", "Signature"),
@@ -208,7 +208,7 @@ def _about(row: DeclaredRow) -> str:
 
 
 def _name_lines(row: DeclaredRow, columns: Columns) -> tuple[list[str], list[str], bool]:
-    """Return the lines of a row's name and of what it is, and whether the latter follows the former in its line."""
+    """Return the lines of a row's name and of its description, and whether they stand on one line."""
     across = ACROSS if columns.above else columns.widths[0]
     names = wrapped(row.result.name, columns.size, across, "bold")
     wide = text_width(row.result.name, columns.size, "bold") + GAP + text_width(_about(row), _small(columns))

@@ -190,7 +190,7 @@ class Columns:
 
     See Also
     --------
-    Page : what the table is written on
+    Page : the page of the table
     """
 
     def __init__(

@@ -164,7 +164,7 @@ def _colours(name: str) -> list[str]:
 
 
 def _numbers(values: ArrayLike, digits: int = 5) -> Any:
-    """Return nested lists of numbers with ``digits`` significant digits; None for what is not finite."""
+    """Return nested lists of numbers with ``digits`` significant digits; None for numbers that are not finite."""
     array = np.asarray(values, float)
     if array.ndim:
         return [_numbers(item, digits) for item in array]

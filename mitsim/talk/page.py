@@ -57,7 +57,7 @@ class _Picture:
     height: int
 
     def shown(self) -> dict[str, Any]:
-        """Return what the template needs: the picture itself, its text and its size."""
+        """Return the content for the template: the picture itself, its text and its size."""
         data = base64.b64encode(self.path.read_bytes()).decode("ascii")
         return {"data": f"data:image/png;base64,{data}", "alt": self.alt, "width": self.width, "height": self.height}
 
