@@ -76,10 +76,10 @@ def acceptance(
         command = "mitsim measure acceptance"
         raise InputError(command, "", "no artefact", "--plane or --sphere", f"see {command} --help")
     chosen = tuple(topic) if topic else None
-    given = [read_cloud(path, sensor, topic=chosen, frame=frame, unit=unit) for path in cloud_paths(clouds)]
-    results = [cloud_figures(input_cloud.cloud, artefacts, baseline) for input_cloud in given]
-    several = len(given) > 1
-    together = joint_figures([input_cloud.cloud for input_cloud in given], artefacts) if several else []
+    input_clouds = [read_cloud(path, sensor, topic=chosen, frame=frame, unit=unit) for path in cloud_paths(clouds)]
+    results = [cloud_figures(input_cloud.cloud, artefacts, baseline) for input_cloud in input_clouds]
+    several = len(input_clouds) > 1
+    together = joint_figures([input_cloud.cloud for input_cloud in input_clouds], artefacts) if several else []
     over = repeatability(results) if several else []
     beside: tuple[list[Result], list[Result]] | None = None
     if simulated is not None:
@@ -87,26 +87,28 @@ def acceptance(
 
         def figures(cloud: PointCloud, name: str, window: Roi | None) -> list[Result]:
             if name in artefacts.planes:
-                own = Artefacts({name: (window, artefacts.planes[name][1])}, {}, [])
+                target = Artefacts({name: (window, artefacts.planes[name][1])}, {}, [])
             else:
-                own = Artefacts({}, {name: (window, artefacts.spheres[name][1])}, [])
-            return cloud_figures(cloud, own, baseline)
+                target = Artefacts({}, {name: (window, artefacts.spheres[name][1])}, [])
+            return cloud_figures(cloud, target, baseline)
 
-        targets = {name: RecordedTarget("plane", *one) for name, one in artefacts.planes.items()}
+        targets = {name: RecordedTarget("plane", *values) for name, values in artefacts.planes.items()}
         targets |= {name: RecordedTarget("sphere", window) for name, (window, _) in artefacts.spheres.items()}
-        beside = beside_simulated(given[0], targets, simulated, figures, seed)
+        beside = beside_simulated(input_clouds[0], targets, simulated, figures, seed)
     if as_json:
-        whose = [(input_cloud.path, input_cloud.cloud.sensor, input_cloud.cloud.source) for input_cloud in given]
-        document = measured_document(whose, results, over) | {"all_clouds": [result_values(one) for one in together]}
+        whose = [(input_cloud.path, input_cloud.cloud.sensor, input_cloud.cloud.source) for input_cloud in input_clouds]
+        document = measured_document(whose, results, over) | {
+            "all_clouds": [result_values(result) for result in together]
+        }
         if beside is not None:
             document |= {"beside": beside_document(simulated or "", *beside)}
         print(json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False))
     else:
-        print(result_tables([input_cloud.path for input_cloud in given], results, over))
+        print(result_tables([input_cloud.path for input_cloud in input_clouds], results, over))
         if together:
             print("\nall clouds\n" + result_table(together))
         if beside is not None:
-            print(f"\n{given[0].path}, beside a simulation\n" + beside_table(*beside, simulated or ""))
+            print(f"\n{input_clouds[0].path}, beside a simulation\n" + beside_table(*beside, simulated or ""))
     say(summary([*results, together] if together else results))
-    if not all(result.possible for found in [*results, together] for result in found):
+    if not all(result.possible for cloud_results in [*results, together] for result in cloud_results):
         raise typer.Exit(1)

@@ -67,8 +67,8 @@ def read_artefacts(planes: Sequence[str], spheres: Sequence[str], spacings: Sequ
         balls[name] = window, _checked_length("--sphere", text, diameter, _SPHERE)
     pairs = []
     for text in spacings:
-        first, _, rest = text.partition(",")
-        second, _, last = rest.partition(",")
+        first, _, remainder = text.partition(",")
+        second, _, last = remainder.partition(",")
         for name in (first, second):
             if name not in balls:
                 allowed = f"{_SPACING}, {', '.join(balls) or 'each a --sphere'}"
@@ -116,10 +116,12 @@ def cloud_figures(cloud: PointCloud, artefacts: Artefacts, baseline_mm: float | 
         out.append(_result(labels[0], "mm", error.form, uncertainty, len(points), count))
         out.append(Result(labels[1], "mm", error.size, points=len(points), points_given=count))
     for first, second, distance in artefacts.spacings:
-        one, other = (window_points(artefacts.spheres[name][0], cloud, name) for name in (first, second))
-        label, count = f"{first}-{second} spacing error SD", len(one) + len(other)
+        first_points, second_points = (
+            window_points(artefacts.spheres[name][0], cloud, name) for name in (first, second)
+        )
+        label, count = f"{first}-{second} spacing error SD", len(first_points) + len(second_points)
         try:
-            out.append(Result(label, "mm", sphere_spacing_error(one, other, distance), points=count))
+            out.append(Result(label, "mm", sphere_spacing_error(first_points, second_points, distance), points=count))
         except InputError as unfit:
             out.append(failed(label, "mm", str(unfit), count))
     return out

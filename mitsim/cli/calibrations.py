@@ -80,11 +80,11 @@ def rig(
     from mitsim.study.calibration.virtual_calibration import calibrate as calibrate_sensor
     from mitsim.study.calibration.virtual_calibration import calibration_table, coverage_table, sensor_drift
 
-    known = list(Drift().numbers())
+    drift_names = list(Drift().numbers())
     terms = {}
     for name, value in options.definitions(drift, "--drift", "NAME=VALUE").items():
-        if name not in known:
-            raise InputError("--drift", "", repr(name), ", ".join(known), nearest(name, known))
+        if name not in drift_names:
+            raise InputError("--drift", "", repr(name), ", ".join(drift_names), nearest(name, drift_names))
         try:
             terms[name] = float(value)
         except ValueError:
@@ -93,17 +93,19 @@ def rig(
     chosen = load_sensor(sensor)
     since = replace(sensor_drift(chosen), **terms)
     say(f"calibrating {chosen.name}: noise of corners, adjustment, accuracy")
-    found = calibrate_sensor(chosen, parse_board(board) if board else None, poses, seed, since)
-    print(calibration_table(found), end="")
+    calibration = calibrate_sensor(chosen, parse_board(board) if board else None, poses, seed, since)
+    print(calibration_table(calibration), end="")
     if check:
         say(f"simulating {check} calibrations")
-        count = len([name for name in found.covariance.names if not name.startswith("path.")])
-        names, sigma = found.covariance.names[:count], found.covariance.one_sigma[:count]
+        count = len([name for name in calibration.covariance.names if not name.startswith("path.")])
+        names, sigma = calibration.covariance.names[:count], calibration.covariance.one_sigma[:count]
         stated = dict(zip(names, sigma, strict=True))
         rng = np.random.default_rng(seed)
-        scores = coverage(chosen.measuring_rig, found.eyes, found.board, found.views, stated, check, rng)
+        scores = coverage(
+            chosen.measuring_rig, calibration.eyes, calibration.board, calibration.views, stated, check, rng
+        )
         print("\n" + coverage_table(names, scores), end="")
-    write_rig_covariance(output, found.covariance, chosen.rig)
+    write_rig_covariance(output, calibration.covariance, chosen.rig)
     say(f"calibration: {output}")
 
 
@@ -157,17 +159,17 @@ def verify(
         settings, imager = decoder_settings(read, None, None)
         cloud = checked_cloud(read, settings, imager, where=str(capture), sensor=None).cloud
     if board is not None:
-        known = verification.corners_of_board(read, parse_board(board), cloud)
+        points = verification.corners_of_board(read, parse_board(board), cloud)
     else:
         assert cloud is not None
         window = Roi(*(int(value) for value in numbers[1:])) if len(numbers) > 1 else None
-        known = verification.dots_of_plate(read, Plate(window, numbers[0]), cloud, printed)
+        points = verification.dots_of_plate(read, Plate(window, numbers[0]), cloud, printed)
     say(f"comparing with the stated calibration of {chosen.name}")
-    found = verification.verify(known, chosen, read.rig, covariance, chosen.published_lengths)
-    print("\n".join([*found.rows(), found.sentence()]))
+    outcome = verification.verify(points, chosen, read.rig, covariance, chosen.published_lengths)
+    print("\n".join([*outcome.rows(), outcome.sentence()]))
     if fitted := shows_the_fit([*chosen.fitted_to, *covariance.fitted_to], read.images, "the calibration"):
         say(f"warning: {fitted}")
-    if not found.usable:
+    if not outcome.usable:
         raise typer.Exit(1)
 
 
@@ -182,9 +184,9 @@ def _plate_numbers(text: str) -> list[float]:
     return numbers
 
 
-def _is_recorded(given: str) -> bool:
+def _is_recorded(argument: str) -> bool:
     """Return whether an argument names recorded corners, rather than a sensor."""
-    path = Path(given)
+    path = Path(argument)
     return path.is_dir() or path.suffix.lower() in (".csv", ".npz", ".yml", ".yaml", ".xml", ".json")
 
 
@@ -199,15 +201,15 @@ def _recorded(path: Path, output: Path, board: str | None) -> None:
         raise InputError("--board", "", "none", "the board of the recording: COLUMNSxROWSxSQUARE_MM:GRADE")
     if output.suffix.lower() in (".yml", ".yaml"):
         raise InputError("--output", "", str(output), "a .toml file; the calibration is written beside it as .yml")
-    known = parse_board(board)
+    chequerboard = parse_board(board)
     options.check_file(output)
     options.check_file(output.with_suffix(".yml"))
-    corners = read_corners(path, known)
+    corners = read_corners(path, chequerboard)
     for line in corners.left_out:
         say(f"left out: {line}")
     say(f"calibrating {', '.join(corners.sizes)}: {len(corners.boards)} poses, and two halves of them")
-    source = f"recorded corners: {path.name}, {known}"[:400]
-    checked = calibrate_checked(corners.boards, known, corners.sizes, source, where=str(path))
+    source = f"recorded corners: {path.name}, {chequerboard}"[:400]
+    checked = calibrate_checked(corners.boards, chequerboard, corners.sizes, source, where=str(path))
     print(calibration_table(checked), end="")
     rig_file = write_calibration(checked, output)
     say(f"calibration: {output}, {rig_file}; in a sensor file:")

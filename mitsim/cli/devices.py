@@ -75,8 +75,8 @@ def mount(sample: str, distance: float) -> None:
         If there is no terminal.
     """
     if not sys.stdin.isatty():
-        found = f"{sample} at {distance:g} mm, which somebody must mount next"
+        pending = f"{sample} at {distance:g} mm, which somebody must mount next"
         allowed = "one sample at one distance without a terminal"
-        raise InputError("campaign", "samples", found, allowed, "run the command in a terminal")
+        raise InputError("campaign", "samples", pending, allowed, "run the command in a terminal")
     asked = f"{sample} at {distance:g} mm: is the coupon mounted, the stage in place, and its path free?"
     typer.confirm(asked, abort=True, err=True)

@@ -50,25 +50,25 @@ def cloud(
     from mitsim.study.task_measurement import read_pose
 
     suffix = _suffix(output, CLOUD_SUFFIXES)
-    for option, given, allowed in (("--in", frame, ("sensor", "part")), ("--unit", unit, ("mm", "m"))):
-        if given not in allowed:
-            raise InputError(option, "", repr(given), " or ".join(allowed))
-    known = None if pose is None else read_pose(pose, view)
-    if frame == "part" and known is None:
+    for option, choice, allowed in (("--in", frame, ("sensor", "part")), ("--unit", unit, ("mm", "m"))):
+        if choice not in allowed:
+            raise InputError(option, "", repr(choice), " or ".join(allowed))
+    part_from_sensor = None if pose is None else read_pose(pose, view)
+    if frame == "part" and part_from_sensor is None:
         raise InputError("--in", "", "part, without --pose", "a JSON file with the sensor's pose", "give --pose FILE")
     read = read_cloud(cloud)
     options.check_file(output)
     if suffix == ".e57":
-        write_e57([(cloud.stem, cloud_points(read), known)], output)
+        write_e57([(cloud.stem, cloud_points(read), part_from_sensor)], output)
     elif suffix == ".mcap":
-        write_mcap([Stamped("/points", "sensor_optical", cloud_points(read), known)], output)
+        write_mcap([Stamped("/points", "sensor_optical", cloud_points(read), part_from_sensor)], output)
     else:
-        points = cloud_points(read, known if frame == "part" else None)
+        points = cloud_points(read, part_from_sensor if frame == "part" else None)
         points = points.in_metres() if unit == "m" else points
         if suffix == ".ply":
             write_cloud_ply(points, output)
         else:
-            write_cloud_pcd(points, output, known)
+            write_cloud_pcd(points, output, part_from_sensor)
     say(f"cloud: {output}: {_counted(read)}")
 
 
@@ -145,16 +145,16 @@ def results(
 
     suffix = _suffix(output, RESULT_SUFFIXES)
     folder = _run_in(folder)
-    found = read_results(folder, task)
+    run_results = read_results(folder, task)
     options.check_file(output)
     if suffix == ".xml":
         issuer = Issuer(laboratory, country, responsible, customer, serial)
-        write_dcc(found, read_declaration(folder, None), issuer, output)
+        write_dcc(run_results, read_declaration(folder, None), issuer, output)
     else:
         write = {".qif": write_qif, ".csv": write_results_csv, ".json": write_results_json}
-        write[suffix](found, output)
-    views = ", ".join(str(number) for number, *_ in found.plan)
-    say(f"results: {output}: {how_many(len(found.results), 'measurement')}, planned from view {views}")
+        write[suffix](run_results, output)
+    views = ", ".join(str(number) for number, *_ in run_results.plan)
+    say(f"results: {output}: {how_many(len(run_results.results), 'measurement')}, planned from view {views}")
 
 
 def targets(
@@ -179,13 +179,13 @@ def targets(
         raise InputError("--robot", "", repr(robot), ", ".join(ROBOT_FORMATS))
     target_format = ROBOT_FORMATS[robot]
     if output.suffix.lower() != target_format.suffix:
-        allowed = f"a name that ends in {target_format.suffix}: {target_format.what}"
+        allowed = f"a name that ends in {target_format.suffix}: {target_format.description}"
         raise InputError("--output", "", output.name, allowed)
-    found, tool = read_targets(_run_in(folder), views)
+    robot_targets, tool = read_targets(_run_in(folder), views)
     options.check_file(output)
-    write_text(output, target_format.write(found, tool))
+    write_text(output, target_format.write(robot_targets, tool))
     hint = "" if tool == "flange" else "; make the tool frame the sensor frame, or give [views.flange_from_sensor]"
-    say(f"targets: {output}: {how_many(len(found), 'pose')} of the {tool} in the part frame{hint}")
+    say(f"targets: {output}: {how_many(len(robot_targets), 'pose')} of the {tool} in the part frame{hint}")
 
 
 def map_(
@@ -251,10 +251,10 @@ def _run_in(folder: Path) -> Path:
     """Return the folder to read: of a comparison of sensors, that of the best one."""
     from mitsim.study.choice_document import winner_folder
 
-    found = winner_folder(folder)
-    if found != folder:
-        say(f"{folder} compares sensors: the export is of the best, {found.name}")
-    return found
+    winner = winner_folder(folder)
+    if winner != folder:
+        say(f"{folder} compares sensors: the export is of the best, {winner.name}")
+    return winner
 
 
 def _suffix(output: Path, allowed: tuple[str, ...]) -> str:
@@ -266,5 +266,5 @@ def _suffix(output: Path, allowed: tuple[str, ...]) -> str:
 def _counted(cloud: PointCloud) -> str:
     import numpy as np
 
-    known = 0 if cloud.sigma is None else int(np.isfinite(cloud.sigma[cloud.valid]).sum())
-    return f"{int(cloud.valid.sum())} points, {known} of them with a covariance"
+    with_sigma = 0 if cloud.sigma is None else int(np.isfinite(cloud.sigma[cloud.valid]).sum())
+    return f"{int(cloud.valid.sum())} points, {with_sigma} of them with a covariance"

@@ -66,17 +66,22 @@ def finish(
     for file in (output, figure):
         if file is not None:
             options.check_file(file)
-    found = fit_captures(captures, sensor, scene, options.definitions(define), block, Roi(*window) if window else None)
-    print(fit_table(found), end="")
-    if found.posterior is not None:
-        print(f"\n# for a study whose part has this finish and the Ra of this scene\n{found.posterior.toml()}", end="")
-    for remark in remarks(found):
+    coupon_fit = fit_captures(
+        captures, sensor, scene, options.definitions(define), block, Roi(*window) if window else None
+    )
+    print(fit_table(coupon_fit), end="")
+    if coupon_fit.posterior is not None:
+        print(
+            f"\n# for a study whose part has this finish and the Ra of this scene\n{coupon_fit.posterior.toml()}",
+            end="",
+        )
+    for remark in remarks(coupon_fit):
         say(remark)
     if output is not None:
-        write_json(output, found.numbers())
+        write_json(output, coupon_fit.numbers())
         say(f"fit: {output}")
     if figure is not None:
-        write_png(fit_figure(found), figure, dpi=90)
+        write_png(fit_figure(coupon_fit), figure, dpi=90)
         say(f"picture: {figure}")
 
 
@@ -133,14 +138,17 @@ def sensor_(
     if journey is not None:
         say("step 1 of 3: the fit; its first message of every capture states the time of a round")
     roi = Roi(*window) if window else None
-    found = fit_sensor(captures or [], sensor, off=off or [], dark=dark or [], roi=roi, seed=seed)
-    write_sensor(found, sensor, output)
-    print(fit_table(found), end="")
-    say(f"sensor: {output}, {len(found.estimates)} fitted parameters, {len(found.undetermined)} not determined")
-    say(f"verdict: {found.verdict.word}: {found.verdict.why}")
+    sensor_fit = fit_sensor(captures or [], sensor, off=off or [], dark=dark or [], roi=roi, seed=seed)
+    write_sensor(sensor_fit, sensor, output)
+    print(fit_table(sensor_fit), end="")
+    say(
+        f"sensor: {output}, {len(sensor_fit.estimates)} fitted parameters, {len(sensor_fit.undetermined)} not "
+        "determined"
+    )
+    say(f"verdict: {sensor_fit.verdict.word}: {sensor_fit.verdict.why}")
     if journey is None:
         return
-    if found.verdict.word == "bad":
+    if sensor_fit.verdict.word == "bad":
         hint = f"to go on nevertheless: mitsim map make {journey.campaign} --sensor {output}, and mitsim run"
         raise InputError(output, "verdict", "bad", "good or fair, for a map and a report", hint)
     map_and_run(journey, output)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Journey:
-    """What follows a fit: the ``study``, the ``campaign`` of its map, and the ``folder`` of map and report.
+    """Steps after a fit: the ``study``, the ``campaign`` of its map, and the ``folder`` of map and report.
 
     ``minutes`` limits the run of the study; ``ask`` answers whether a missing finish may be characterised.
     """

@@ -72,14 +72,14 @@ def remove_partial_beside(path: Path) -> list[Path]:
     return _swept(path.absolute().parent, path.name)
 
 
-def _swept(place: Path, name: str | None = None) -> list[Path]:
+def _swept(folder: Path, name: str | None = None) -> list[Path]:
     gone = []
-    for path in place.iterdir() if place.is_dir() else ():
+    for path in folder.iterdir() if folder.is_dir() else ():
         match = _LEFT_OVER.fullmatch(path.name)
         if match is None or (name is not None and not _is_of(match["name"], name)) or _may_be_alive(path, match):
             continue
-        if match["kind"] == "old" and not os.path.lexists(place / match["name"]):
-            path.rename(place / match["name"])  # killed between the two steps of a replacement: restore
+        if match["kind"] == "old" and not os.path.lexists(folder / match["name"]):
+            path.rename(folder / match["name"])  # killed between the two steps of a replacement: restore
         elif path.is_dir() and not path.is_symlink():
             shutil.rmtree(path, ignore_errors=True)
         else:
@@ -88,9 +88,9 @@ def _swept(place: Path, name: str | None = None) -> list[Path]:
     return gone
 
 
-def _is_of(found: str, name: str) -> bool:
+def _is_of(target: str, name: str) -> bool:
     """Return whether a partial file is for a name; temporary folders of the system add letters to it."""
-    return found == name or re.fullmatch(re.escape(name) + r"\.[a-z0-9_]{8}", found) is not None
+    return target == name or re.fullmatch(re.escape(name) + r"\.[a-z0-9_]{8}", target) is not None
 
 
 def _may_be_alive(path: Path, match: re.Match[str]) -> bool:

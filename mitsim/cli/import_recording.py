@@ -134,14 +134,14 @@ def import_(
 
     Example: mitsim import recording.zip -o captures/real
     """
-    given = locals()  # by the names of the fields of ReadOptions
+    arguments = locals()  # by the names of the fields of ReadOptions
     from mitsim.capture.folder import is_written, write_capture
     from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
     from mitsim.capture.recordings.recognise import NAMES
     from mitsim.capture.recordings.recording_files import plain_name
     from mitsim.decoding.checks.sanity import with_warnings
 
-    named = {field.name: given[field.name] for field in fields(ReadOptions)}
+    named = {field.name: arguments[field.name] for field in fields(ReadOptions)}
     reading = ReadOptions(**named | {"topic": tuple(topic) if topic else None, "images": _patterns(images)})
     imported = read_recording(path, reading, kind)
     capture = with_warnings(imported.capture)
@@ -154,14 +154,17 @@ def import_(
     for name in SETTINGS_TO_CHECK:
         if name in capture.settings:
             say(f"  {name}: {capture.settings[name]}")
-    reference, *others = [*capture.rig.cameras.values(), *([capture.rig.projector] if capture.rig.projector else [])]
-    if others and imported.kind in ("stereo-pair", "images"):
-        baseline = math.dist(others[0].centre, reference.centre)
+    reference, *other_eyes = [
+        *capture.rig.cameras.values(),
+        *([capture.rig.projector] if capture.rig.projector else []),
+    ]
+    if other_eyes and imported.kind in ("stereo-pair", "images"):
+        baseline = math.dist(other_eyes[0].centre, reference.centre)
         say(f"  baseline: {baseline:.4g} mm; lengths of a calibration without a unit count as mm")
     if coupon is not None and capture.world_from_sensor is not None:
-        place = capture.world_from_sensor.translation
-        distance = math.hypot(*place)
-        angle = math.degrees(math.acos(place[2] / distance))
+        position = capture.world_from_sensor.translation
+        distance = math.hypot(*position)
+        angle = math.degrees(math.acos(position[2] / distance))
         say(f"  pose: {distance:.1f} mm from the coupon, {angle:.1f} deg off its normal")
     for warning in capture.settings.get("warnings", []):
         say(f"warning: {warning}")

@@ -135,8 +135,8 @@ def clouds(
     places_in = read_frame(points_in)
     if task is None and places_in.file is None and view is not None:
         raise InputError("--view", "", "no --task", "a task for the scene: --task task.toml")
-    if task is None and (given := _given(scene=scene, pose=pose, correct=correct)):
-        raise InputError(f"--{given}", "", "no --task", "a task for the scene: --task task.toml")
+    if task is None and (option := _given(scene=scene, pose=pose, correct=correct)):
+        raise InputError(f"--{option}", "", "no --task", "a task for the scene: --task task.toml")
     if task is not None and scene is None:
         raise InputError("--scene", "", "none", "the scene of the task's part: --scene part.xml")
     if request.empty and task is None and picture is None:
@@ -164,28 +164,28 @@ def clouds(
     for number, path in enumerate(paths):
         if len(paths) > 1:
             say(f"{path} ({number + 1}/{len(paths)})")
-        one = read_cloud(path, sensor, topic=tuple(topic) if topic else None, frame=frame, unit=unit)
-        if picture is not None and one.cloud.grid.height == 1:
+        input_cloud = read_cloud(path, sensor, topic=tuple(topic) if topic else None, frame=frame, unit=unit)
+        if picture is not None and input_cloud.cloud.grid.height == 1:
             raise InputError("--picture", "", f"{path}, a cloud without a grid", "a cloud with rows and columns")
-        to_frame, about_frame = places_in.of(one, view)
+        to_frame, about_frame = places_in.of(input_cloud, view)
         if about_frame:
             say(about_frame)
-        found, drawn = request.measure(one, reference, to_frame)
+        cloud_results, drawn = request.measure(input_cloud, reference, to_frame)
         if simulated is not None and beside is None:
             from mitsim.cli.simulated_beside import RecordedTarget, beside_simulated
 
             recorded = {name: RecordedTarget(*target) for name, target in targets.items()}
-            beside = beside_simulated(one, recorded, simulated, figures, seed)
+            beside = beside_simulated(input_cloud, recorded, simulated, figures, seed)
         if of_task is not None:
-            found += of_task(one)
+            cloud_results += of_task(input_cloud)
         if picture is not None:
             from mitsim.report.style import write_png
 
-            place = picture if len(paths) == 1 else picture.with_stem(f"{picture.stem}_{number + 1}")
-            write_png(drawn(), place, dpi=100)
-            say(f"picture: {place}")
-        whose.append((path, one.cloud.sensor, one.cloud.source))
-        results.append(found)
+            file = picture if len(paths) == 1 else picture.with_stem(f"{picture.stem}_{number + 1}")
+            write_png(drawn(), file, dpi=100)
+            say(f"picture: {file}")
+        whose.append((path, input_cloud.cloud.sensor, input_cloud.cloud.source))
+        results.append(cloud_results)
     over = repeatability(results) if len(results) > 1 else []
     if as_json:
         document = measured_document(whose, results, over)
@@ -200,14 +200,14 @@ def clouds(
             from mitsim.cli.simulated_beside import beside_table
 
             print(f"\n{paths[0]}, beside a simulation\n" + beside_table(*beside, simulated or ""))
-        if any(result.origin == "fit" for found in results for result in found):
+        if any(result.origin == "fit" for cloud_results in results for result in cloud_results):
             left_out = "; ".join(NOT_INCLUDED)
             say(f"u: standard uncertainty (k = 1) from the covariance of the fit; it does not include: {left_out}")
         if correct is not None:
             say(f"u of the task: standard uncertainty after correction, including that of the bias, from {correct}")
     if results and any(results):
         say(summary(results))
-    if not all(result.possible for found in results for result in found):
+    if not all(result.possible for cloud_results in results for result in cloud_results):
         raise typer.Exit(1)
 
 

@@ -1,4 +1,4 @@
-"""Choose the frame in which ``mitsim measure`` states places and directions: ``--points-in``."""
+"""Choose the frame in which ``mitsim measure`` states positions and directions: ``--points-in``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class MeasuringFrame:
     board: tuple[int, int, float] | None = None
     file: Path | None = None
 
-    def of(self, given: InputCloud, view: int | None = None) -> tuple[NDArray[np.float64], str]:
+    def of(self, input_cloud: InputCloud, view: int | None = None) -> tuple[NDArray[np.float64], str]:
         """Return the transform (4, 4) [mm] from the sensor frame of a cloud, and a sentence about it, or none.
 
         Raises
@@ -32,7 +32,7 @@ class MeasuringFrame:
             If the cloud has no workspace, its images do not show the board, or the pose file cannot be read.
         """
         if self.board is not None:
-            return self._of_board(given, *self.board)
+            return self._of_board(input_cloud, *self.board)
         if self.file is not None:
             from mitsim.study.task_measurement import read_pose
 
@@ -41,25 +41,33 @@ class MeasuringFrame:
             return np.eye(4), ""
         from mitsim.capture.workspace import written_frame
 
-        if given.capture is None:
+        if input_cloud.capture is None:
             hint = "give the capture folder instead of its cloud"
-            raise InputError(given.path, "--points-in", "a cloud, whose workspace is not known", "a capture", hint)
-        frame = written_frame(given.capture, self.text, given.path)
+            raise InputError(
+                input_cloud.path, "--points-in", "a cloud, whose workspace is not known", "a capture", hint
+            )
+        frame = written_frame(input_cloud.capture, self.text, input_cloud.path)
         assert frame is not None  # the text is workspace
         return frame.from_sensor, f"places in the frame {frame.name}"
 
-    def _of_board(self, given: InputCloud, columns: int, rows: int, pitch: float) -> tuple[NDArray[np.float64], str]:
+    def _of_board(
+        self, input_cloud: InputCloud, columns: int, rows: int, pitch: float
+    ) -> tuple[NDArray[np.float64], str]:
         from mitsim.decoding.board_frame import BoardCorners, board_frame
         from mitsim.decoding.plate import image_on_grid
 
-        if given.capture is None or not given.capture.images:
+        if input_cloud.capture is None or not input_cloud.capture.images:
             hint = "give the capture folder, which the command decodes"
-            raise InputError(given.path, "--points-in", "a cloud without images", "images that show the board", hint)
-        image = image_on_grid(given.capture, given.cloud.grid)
+            raise InputError(
+                input_cloud.path, "--points-in", "a cloud without images", "images that show the board", hint
+            )
+        image = image_on_grid(input_cloud.capture, input_cloud.cloud.grid)
         try:
-            frame, scale, rms = board_frame(BoardCorners(columns, rows, pitch), given.cloud, image)
+            frame, scale, rms = board_frame(BoardCorners(columns, rows, pitch), input_cloud.cloud, image)
         except FitError as error:
-            raise InputError(given.path, "--points-in", str(error), "a capture that shows the whole board") from None
+            raise InputError(
+                input_cloud.path, "--points-in", str(error), "a capture that shows the whole board"
+            ) from None
         return frame, f"places in the frame of the board: scale {scale:.5f}, corners {rms:.3g} mm from the print (rms)"
 
 

@@ -64,40 +64,40 @@ class Request:
         return not (self.plan.features or self.plates or self.has_reference)
 
     def measure(
-        self, given: InputCloud, reference: InputCloud | None, frame: NDArray[np.float64] | None = None
+        self, input_cloud: InputCloud, reference: InputCloud | None, frame: NDArray[np.float64] | None = None
     ) -> tuple[list[Result], Callable[[], Figure]]:
         """Return the results of a cloud, and a function that draws its picture.
 
         ``reference`` is the reference cloud of a difference, None without one; ``frame`` (4, 4), from the sensor frame,
-        that of places and directions.
+        that of positions and directions.
 
         Raises
         ------
         InputError
             If a window does not lie in the cloud's grid, or dots are requested of a cloud without images.
         """
-        cloud = given.cloud
+        cloud = input_cloud.cloud
         results = measure_windows(cloud, self.plan, frame)
         if self.plates:
-            if given.capture is None or not given.capture.images:
+            if input_cloud.capture is None or not input_cloud.capture.images:
                 allowed = "a capture folder, whose images show the dots"
                 hint = "give the capture folder, which the command decodes: mitsim measure CAPTURE --dots ..."
-                raise InputError(given.path, "", "a cloud without images", allowed, hint)
-            image = image_on_grid(given.capture, cloud.grid)
+                raise InputError(input_cloud.path, "", "a cloud without images", allowed, hint)
+            image = image_on_grid(input_cloud.capture, cloud.grid)
             for name, plate in self.plates.items():
                 results += measure_plate(name, plate, cloud, image)
         boxes = self._boxes()
         if reference is None:
             return results, lambda: _figures().distance_figure(cloud, boxes)
-        values = self._difference(given, reference)
+        values = self._difference(input_cloud, reference)
         difference = distribution(values, int(cloud.valid[window_slices(self.window, cloud, "difference")].sum()))
         return results + _difference_results(difference), lambda: _figures().difference_figure(
             values, difference, boxes, self.window
         )
 
-    def _difference(self, given: InputCloud, reference: InputCloud) -> NDArray[np.float64]:
+    def _difference(self, input_cloud: InputCloud, reference: InputCloud) -> NDArray[np.float64]:
         """Return the difference (H, W) [mm] of a cloud from the reference, NaN outside the window."""
-        cloud, other = given.cloud, reference.cloud
+        cloud, other = input_cloud.cloud, reference.cloud
         rays = self.by == "rays" or (self.by == "auto" and same_grid(cloud.grid, other.grid))
         inside = window_slices(self.window, cloud, "difference")
         out = np.full(cloud.status.shape, np.nan)
@@ -166,12 +166,12 @@ def read_request(
             if len(names) != 2 or not all(names):
                 raise InputError(f"--{kind}", "", repr(text), "NAME,NAME of two features")
             pairs.append((cast(PairKind, kind), names[0], names[1]))
-    known: dict[str, Plate] = {}
+    named_plates: dict[str, Plate] = {}
     for text in plates:
-        name, region, pitch = parse_window("--dots", text, (1, 5), _PLATE_SYNTAX, {**named, **known})
+        name, region, pitch = parse_window("--dots", text, (1, 5), _PLATE_SYNTAX, {**named, **named_plates})
         if pitch is None or not 0 < pitch < 1e4:
             raise InputError("--dots", "", repr(text), f"{_PLATE_SYNTAX}, the pitch over 0 and under 10000")
-        known[name] = Plate(region, pitch, not bright)
+        named_plates[name] = Plate(region, pitch, not bright)
     if by not in DIRECTIONS:
         raise InputError("--by", "", repr(by), ", ".join(DIRECTIONS))
     if against is None and (by != "auto" or window is not None):
@@ -179,7 +179,7 @@ def read_request(
     region = _window("--window", str(window), window or (), "COLUMN ROW WIDTH HEIGHT")
     plan = WindowPlan(named, pairs)
     plan.check()
-    return Request(plan, known, by, region, against is not None)
+    return Request(plan, named_plates, by, region, against is not None)
 
 
 def _difference_results(difference: Difference) -> list[Result]:
@@ -202,7 +202,7 @@ def _difference_results(difference: Difference) -> list[Result]:
 
 
 def parse_window(
-    option: str, text: str, counts: tuple[int, ...], allowed: str, known: Mapping[str, object]
+    option: str, text: str, counts: tuple[int, ...], allowed: str, used_names: Mapping[str, object]
 ) -> tuple[str, Roi | None, float | None]:
     """Return name, window and length of a text such as ``name=200,150,300,200,600``.
 
@@ -214,7 +214,7 @@ def parse_window(
         How many numbers are allowed: four are the window [px], one more or one alone is the length.
     allowed
         Form of the text, for the error.
-    known
+    used_names
         Names that are in use.
 
     Returns
@@ -226,9 +226,9 @@ def parse_window(
     InputError
         If the text has another form, the name is in use, or the window is not one.
     """
-    name, _, rest = text.partition("=")
+    name, _, numbers_text = text.partition("=")
     try:
-        numbers = [float(word) for word in rest.split(",")] if rest.strip() else []
+        numbers = [float(word) for word in numbers_text.split(",")] if numbers_text.strip() else []
     except ValueError:
         numbers = [float("nan")]
     if not name.strip() or len(numbers) not in counts or not np.isfinite(numbers).all():
@@ -237,7 +237,7 @@ def parse_window(
         name = checked_name(name.strip())
     except ValueError as error:
         raise InputError(option, "", repr(name.strip()), str(error)) from None
-    if name in known:
+    if name in used_names:
         raise InputError(option, "", f"{name!r} a second time", "a different name for each feature")
     length = numbers.pop() if len(numbers) in (1, 5) else None
     return name, _window(option, text, numbers, allowed), length

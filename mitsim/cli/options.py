@@ -98,10 +98,10 @@ Yes = Annotated[
 ]
 
 
-def asking(yes: bool, others: str = "") -> Callable[[str], bool] | None:
+def asking(yes: bool, extension: str = "") -> Callable[[str], bool] | None:
     """Return the function that answers whether a missing finish may be characterised; None if nobody can answer.
 
-    With ``yes`` it always agrees. At a terminal it asks the user once. ``others`` extends the question: it names the
+    With ``yes`` it always agrees. At a terminal it asks the user once. ``extension`` ends the question, and names the
     other cases that the answer covers.
     """
     if yes:
@@ -112,7 +112,7 @@ def asking(yes: bool, others: str = "") -> Callable[[str], bool] | None:
 
     def ask(question: str) -> bool:
         if not answers:
-            answers.append(typer.confirm(f"{question}{others}", default=False, err=True))
+            answers.append(typer.confirm(f"{question}{extension}", default=False, err=True))
         return answers[0]
 
     return ask
@@ -132,7 +132,9 @@ class Group(TyperGroup):
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the list of the commands."""
         named = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
-        rows = [(name, one.get_short_help_str(limit=1000)) for name, one in named if one and not one.hidden]
+        rows = [
+            (name, command.get_short_help_str(limit=1000)) for name, command in named if command and not command.hidden
+        ]
         with formatter.section("Commands"):
             formatter.write_dl(rows)
 
@@ -184,8 +186,8 @@ def check_no_workers(scheduler: str | None, processes: int, allowed: str, hint: 
         Where workers are allowed, and why only there.
     """
     if scheduler is not None or processes != 1:
-        option, given = ("--scheduler", scheduler) if scheduler is not None else ("--processes", str(processes))
-        raise InputError(option, "", given, allowed, hint)
+        option, value = ("--scheduler", scheduler) if scheduler is not None else ("--processes", str(processes))
+        raise InputError(option, "", value, allowed, hint)
 
 
 def requested_workers(scheduler: str | None, processes: int) -> Executor | None:
@@ -236,10 +238,10 @@ def pose_of(position: tuple[float, float, float], target: tuple[float, float, fl
     return look_at(position, target, roll_deg=roll, sensor=sensor)
 
 
-def definitions(given: list[str] | None, option: str = "-D", allowed: str = "name=value") -> dict[str, str]:
+def definitions(items: list[str] | None, option: str = "-D", allowed: str = "name=value") -> dict[str, str]:
     """Return the values of a repeatable option by name; ``allowed`` describes its form in an error."""
     out = {}
-    for item in given or []:
+    for item in items or []:
         name, mark, value = item.partition("=")
         if not mark or not name:
             raise InputError(option, "", repr(item), allowed)
@@ -320,9 +322,9 @@ def check_folder(folder: Path, locked: bool = True) -> None:
         raise InputError("--output", "", f"{folder} ({error.strerror})", "a folder that can be created") from None
     if not os.access(folder, os.W_OK):
         raise InputError("--output", "", f"{folder}, which is not writable", "a writable folder")
-    place = folder.resolve()
-    if locked and place not in _locked_folders:
-        _locked_folders[place] = lock_folder(folder)
+    path = folder.resolve()
+    if locked and path not in _locked_folders:
+        _locked_folders[path] = lock_folder(folder)
 
 
 #: folders that the running command has locked, each with the function that releases it

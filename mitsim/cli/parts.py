@@ -75,7 +75,7 @@ def check(
             raise InputError("--pose", "", "--position too", "one of them")
         stand = read_pose(pose, view)
     checked, visible, placed = _inspected(scene, chosen, options.definitions(define), task, stand, roll)
-    facts, found, centre = checked.facts, checked.findings, checked.scene.centre
+    facts, findings, centre = checked.facts, checked.findings, checked.scene.centre
     if stand is None:
         ends = [" ".join(f"{round(float(v), 1) + 0.0:g}" for v in end) for end in (usual_place(chosen, centre), centre)]
         say(f"no position was given: using --position {ends[0]} --target {ends[1]}")
@@ -105,17 +105,17 @@ def check(
         say(f"page: {html}")
     if json:
         about = {"scene": checked.scene.where, "sensor": chosen.name, "world_from_sensor": placed.matrix().tolist()}
-        print(json_module.dumps({**about, **as_data(facts, visible, found)}, indent=2))
+        print(json_module.dumps({**about, **as_data(facts, visible, findings)}, indent=2))
     else:
-        print(as_text(facts, visible, found, measured, every))
-    if any(finding.severity == "error" for finding in found):
+        print(as_text(facts, visible, findings, measured, every))
+    if any(finding.severity == "error" for finding in findings):
         raise typer.Exit(1)
 
 
 def _inspected(
     scene: Path, sensor: Sensor, defined: dict[str, str], task: Path | None, stand: Transform | None, roll: float = 0.0
 ) -> tuple[Authored, VisibleSurfaces, Transform]:
-    """Load a scene and look for mistakes; return also what the sensor sees, and its pose: the usual one if None."""
+    """Load a scene and look for mistakes; return also the surfaces that the sensor sees, and its pose."""
     from mitsim.scene.authoring.check import Authored, findings
     from mitsim.scene.authoring.check_task import read_features
     from mitsim.scene.inspect import inspect
@@ -127,8 +127,8 @@ def _inspected(
     loaded = load_scene(scene, sensor.wavelength_nm, defined)
     pose = stand or pose_at(sensor, usual_place(sensor, loaded.centre), loaded.centre, roll)
     facts, visible = inspect(loaded), visible_surfaces(loaded, sensor.rig, pose)
-    found = findings(facts, sensor, pose, visible, stand is not None, wanted)
-    return Authored(loaded, facts, sensor, found, task, wanted), visible, pose
+    scene_findings = findings(facts, sensor, pose, visible, stand is not None, wanted)
+    return Authored(loaded, facts, sensor, scene_findings, task, wanted), visible, pose
 
 
 def part(
@@ -197,9 +197,9 @@ def part(
         raise InputError("--chord", "", f"{chord:g} together with --sensor", "one of the two")
     fine = fineness_for(sensor) if sensor else Fineness() if chord is None else Fineness(chord)
     if finish is not None:
-        for option, given in (("--metal", metal), ("--process", process), ("--Ra", roughness)):
-            if given is not None:
-                raise InputError(option, "", f"{given} together with --finish", "one of the two")
+        for option, value in (("--metal", metal), ("--process", process), ("--Ra", roughness)):
+            if value is not None:
+                raise InputError(option, "", f"{value} together with --finish", "one of the two")
     finishing = Finishing(
         metal or "aluminium", process or "ground", 0.8 if roughness is None else roughness, finish, reflectance, gloss
     )

@@ -224,8 +224,10 @@ def _bug() -> int:
 def printable(text: str) -> str:
     """Return a text with control characters and characters that have no encoding as escapes."""
     return "".join(
-        one if one == "\n" or (one.isprintable() and not 0xD800 <= ord(one) < 0xE000) else ascii(one)[1:-1]
-        for one in text
+        character
+        if character == "\n" or (character.isprintable() and not 0xD800 <= ord(character) < 0xE000)
+        else ascii(character)[1:-1]
+        for character in text
     )
 
 

@@ -38,13 +38,13 @@ Figures = Callable[[PointCloud, str, Roi | None], list[Result]]
 
 
 def beside_simulated(
-    given: InputCloud, targets: Mapping[str, RecordedTarget], sensor: str, figures: Figures, seed: int
+    input_cloud: InputCloud, targets: Mapping[str, RecordedTarget], sensor: str, figures: Figures, seed: int
 ) -> tuple[list[Result], list[Result]]:
     """Return the figures of every target in the recorded and in the simulated cloud, in the same order.
 
     Parameters
     ----------
-    given
+    input_cloud
         The recorded cloud.
     targets
         Planes and spheres by name.
@@ -63,15 +63,20 @@ def beside_simulated(
     from mitsim.sensor.preset import load_sensor
     from mitsim.twin.compare.target_twin import seen_target, simulated_target
 
-    recorded = given.cloud
+    recorded = input_cloud.cloud
     if recorded.grid.height == 1:
         raise InputError("--simulated", "", "a cloud without a grid", "a cloud with rows and columns")
     preset = load_sensor(sensor)
     preset.require("simulation")
-    if given.capture is None and preset.fitted_to:
-        names = ", ".join(one.name for one in preset.fitted_to[:3]) + ", ..." * (len(preset.fitted_to) > 3)
-        say(f"warning: {preset.name} was fitted to {names}: if {given.path} is of one of these, this shows the fit")
-    elif fitted := shows_the_fit(preset.fitted_to, given.capture.images if given.capture else {}, preset.name):
+    if input_cloud.capture is None and preset.fitted_to:
+        names = ", ".join(fit.name for fit in preset.fitted_to[:3]) + ", ..." * (len(preset.fitted_to) > 3)
+        say(
+            f"warning: {preset.name} was fitted to {names}: if {input_cloud.path} is of one of these, this shows the "
+            "fit"
+        )
+    elif fitted := shows_the_fit(
+        preset.fitted_to, input_cloud.capture.images if input_cloud.capture else {}, preset.name
+    ):
         say(f"warning: {fitted}")
     real: list[Result] = []
     twin: list[Result] = []

@@ -137,31 +137,31 @@ def choose(
         options.keep_finished(output, overwrite, CHOICE)
         (output / CHOICE).unlink()
     report_doubts(candidates[0].study)
-    for one in excluded:
-        say(f"{one.name} is excluded: {one.reason}")
+    for exclusion in excluded:
+        say(f"{exclusion.name} is excluded: {exclusion.reason}")
     if candidates[0].study.file.set is not None:
         say("[set] of the study is not used: sensors are compared by single views; `mitsim run` chooses the set")
     say(f"about {minutes:g} min for {len(candidates)} sensors: screening, then rounds of those that can still win")
 
-    def report_results(found: list[SensorResult], finished: bool) -> None:
-        known = document(candidates[0].study, found, excluded, limit.elapsed, finished and not stopped_by_user())
-        write_json(output / CHOICE, known.model_dump(mode="json"))
+    def report_results(results: list[SensorResult], finished: bool) -> None:
+        choice = document(candidates[0].study, results, excluded, limit.elapsed, finished and not stopped_by_user())
+        write_json(output / CHOICE, choice.model_dump(mode="json"))
 
     with ending_in_order():
-        found = choose_sensor(
+        results = choose_sensor(
             candidates, output, limit, report_results, options.requested_workers(scheduler, processes)
         )
         stopped = stopped_by_user()
-    best = found[0].candidate.study
+    best = results[0].candidate.study
     write_scene_geometry(output, best.scene, best.sensor)
     write_choice_page(output)
-    known = read_choice(output)
-    assert known is not None
-    print(json.dumps(known.model_dump(mode="json"), indent=2) if as_json else as_text(known))
-    say(f"page: {output / 'choice.html'}\n{known.words}")
+    choice = read_choice(output)
+    assert choice is not None
+    print(json.dumps(choice.model_dump(mode="json"), indent=2) if as_json else as_text(choice))
+    say(f"page: {output / 'choice.html'}\n{choice.words}")
     if stopped:
         raise KeyboardInterrupt  # exit code 130
-    stated = [sensor for sensor in known.sensors if sensor.status == "stated"]
+    stated = [sensor for sensor in choice.sensors if sensor.status == "stated"]
     if not stated or (require_fit and not any(fits_all(judged(sensor_entry)) for sensor_entry in stated)):
         raise typer.Exit(1)
 
@@ -284,7 +284,7 @@ def _tell_statement(
     sets: Sequence[ViewSetEntry] = (),
     remedies: Sequence[str] = (),
 ) -> None:
-    """Print the statements, the result of the sets, and what would make the rest fit.
+    """Print the statements, the result of the sets, and the changes with which the other measurements would fit.
 
     Exit with code 1 without a statement; with ``require_fit`` also if a tolerance or a limit of a set is not kept.
     """

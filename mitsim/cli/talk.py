@@ -51,8 +51,8 @@ def talk(
 
     chosen = read_talk(file)
     options.check_folder(output)
-    others = () if fresh else (chosen.folder / chosen.file.kept,)
-    results = Results(output / "kept", others, any_version=kept)
+    fallbacks = () if fresh else (chosen.folder / chosen.file.kept,)
+    results = Results(output / "kept", fallbacks, any_version=kept)
     errors = {} if measured is None else measured_errors(chosen, measured)
     with ending_in_order():
         if kept:

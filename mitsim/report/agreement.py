@@ -91,12 +91,12 @@ def agreement(scores: xr.Dataset, checks: xr.Dataset, measurement: str) -> Agree
     """Compare the uncertainties predicted for the checked views with the errors measured in them."""
     here = scores.sel(measurement=measurement, view=checks["view"].values)
     errors = np.abs(checks["error"].sel(measurement=measurement).transpose("view", "repeat").values.astype(float))
-    known = np.isfinite(errors)
-    some = known.any(axis=1)
+    valid = np.isfinite(errors)
+    measured = valid.any(axis=1)
     error = np.full(len(errors), np.nan)
-    error[some] = np.nanmean(errors[some], axis=1)
-    least = np.min(errors, axis=1, where=known, initial=np.inf)
-    most = np.max(errors, axis=1, where=known, initial=0.0)
+    error[measured] = np.nanmean(errors[measured], axis=1)
+    least = np.min(errors, axis=1, where=valid, initial=np.inf)
+    most = np.max(errors, axis=1, where=valid, initial=0.0)
 
     possible = here["uncertainty_possible"].values.astype(bool)
     uncertainty, score = here["predicted_uncertainty"].values, here["V_m"].values
@@ -109,12 +109,12 @@ def agreement(scores: xr.Dataset, checks: xr.Dataset, measurement: str) -> Agree
         uncertainty,
         score,
         error,
-        np.where(some, least, np.nan),
-        np.where(some, most, np.nan),
-        1 - known.sum(axis=1) / max(known.shape[1], 1),  # no view was measured: (0, 0)
-        int(some.sum()),
-        spearman(predicted[some], error[some]),
-        spearman(score[some], -error[some]),
+        np.where(measured, least, np.nan),
+        np.where(measured, most, np.nan),
+        1 - valid.sum(axis=1) / max(valid.shape[1], 1),  # no view was measured: (0, 0)
+        int(measured.sum()),
+        spearman(predicted[measured], error[measured]),
+        spearman(score[measured], -error[measured]),
         len(trials),
         *coverage_interval(z),
         float(np.median(trials)) if len(trials) else math.nan,

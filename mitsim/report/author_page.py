@@ -95,20 +95,20 @@ def page_data(about: Authored, served: str) -> dict[str, Any]:
     }
 
 
-def findings_data(found: Sequence[SceneFinding]) -> list[dict[str, str]]:
+def findings_data(findings: Sequence[SceneFinding]) -> list[dict[str, str]]:
     """Return the findings for the script."""
-    return [asdict(finding) for finding in found]
+    return [asdict(finding) for finding in findings]
 
 
 def _definition(kind: Any) -> dict[str, Any]:
-    one = DEFINITIONS[kind]
+    definition = DEFINITIONS[kind]
     return {
-        "kinds": one.kinds,
-        "unit": one.unit,
-        "datums": one.datums,
-        "many": one.many,
-        "zone": one.zone,
-        "outline": "outline" in one.needs,
+        "kinds": definition.kinds,
+        "unit": definition.unit,
+        "datums": definition.datums,
+        "many": definition.many,
+        "zone": definition.zone,
+        "outline": "outline" in definition.needs,
     }
 
 
@@ -132,8 +132,8 @@ def solid(scene: Scene, without_area: Collection[str] = ()) -> dict[str, Any]:
     """
     there = triangles_by_shape(scene)
     every = [there.get(name, np.empty((0, 3, 3))) for name in scene.names]
-    box = box_around([one.reshape(-1, 3) for one in every])
-    most = fair_share([len(one) for one in every], MOST_TRIANGLES)
+    box = box_around([corners.reshape(-1, 3) for corners in every])
+    most = fair_share([len(corners) for corners in every], MOST_TRIANGLES)
     vertices, normals, triangles, faces, start = [], [], [], [], 0
     for name, corners in zip(scene.names, every, strict=True):
         mesh = _shaded(corners, most)

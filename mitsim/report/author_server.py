@@ -59,13 +59,13 @@ class AuthorServer:
                     code, answer = owner.save(self.rfile.read(length))
                     self._answer(code, json.dumps(answer), "application/json")
 
-            def _allowed(self, what: str) -> bool:
+            def _allowed(self, action: str) -> bool:
                 """Return whether a request comes from the page itself."""
                 host = self.headers.get("Host", "")
                 here = {f"{name}:{owner.port}" for name in ("127.0.0.1", "localhost")}
                 origin = self.headers.get("Origin")
-                from_here = origin is None or origin in {f"http://{one}" for one in here}
-                if host in here and from_here and self.path == f"/{owner.token}/{what}":
+                from_here = origin is None or origin in {f"http://{address}" for address in here}
+                if host in here and from_here and self.path == f"/{owner.token}/{action}":
                     return True
                 self._answer(403, "access denied: open the address that mitsim printed", "text/plain")
                 return False
@@ -118,14 +118,14 @@ class AuthorServer:
         try:
             for name, text in texts.items():
                 write_text(self.folder / name, text)
-            found = self.check()
+            findings = self.check()
         except InputError as error:
             for name, data in before.items():  # restore the files, since the new scene does not load
                 _restore(self.folder / name, data)
             return 422, {"fault": str(error)}
         self.saved += 1
         self.done = request.get("done") is True
-        return 200, {"findings": found, "written": sorted(texts)}
+        return 200, {"findings": findings, "written": sorted(texts)}
 
     def _check_texts(self, texts: dict[str, str]) -> None:
         from mitsim.study import StudyFile

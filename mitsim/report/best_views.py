@@ -1,4 +1,4 @@
-"""Make a text table of the best views of a measurement: pose, predicted uncertainty, and what limits them."""
+"""Make a text table of the best views of a measurement: pose, predicted uncertainty, and limit."""
 
 from __future__ import annotations
 

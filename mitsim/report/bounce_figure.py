@@ -75,25 +75,25 @@ def bounced_light(scene: Scene, sensor: Sensor, pose: Transform, visible: Visibl
     coarse = camera.binned(step)
     if not len(rows):
         return light_from_faces(scene, coarse, sensor.projector, pose, 1, _SEED)
-    left, top = (max(0, int(one.min()) // step - 2) for one in (columns, rows))
+    left, top = (max(0, int(indices.min()) // step - 2) for indices in (columns, rows))
     right, bottom = (
-        min(size, int(one.max()) // step + 3)
-        for one, size in ((columns, coarse.width), (rows, coarse.height))
+        min(size, int(indices.max()) // step + 3)
+        for indices, size in ((columns, coarse.width), (rows, coarse.height))
     )  # fmt: skip
     roi = Roi(left, top, right - left, bottom - top)
     return light_from_faces(scene, coarse, sensor.projector, pose, _SAMPLES, _SEED, roi)
 
 
-def bounce_figure(found: LightFromFaces, names: Sequence[str], title: str) -> Figure:
+def bounce_figure(light: LightFromFaces, names: Sequence[str], title: str) -> Figure:
     """Draw the share of interreflected light, and the main source of each pixel."""
-    share = found.share
-    main = np.where(np.nan_to_num(share) > 0, found.by_face.argmax(axis=0), -1)
-    order = np.argsort(-found.by_face.sum(axis=(1, 2)), kind="stable")
-    strong = [int(k) for k in order[:_COLOURED] if found.by_face[k].any()]
-    colours = {k: SHAPES[place] for place, k in enumerate(strong)}
+    share = light.share
+    main = np.where(np.nan_to_num(share) > 0, light.by_face.argmax(axis=0), -1)
+    order = np.argsort(-light.by_face.sum(axis=(1, 2)), kind="stable")
+    strong = [int(k) for k in order[:_COLOURED] if light.by_face[k].any()]
+    colours = {k: SHAPES[rank] for rank, k in enumerate(strong)}
     height, width = share.shape
     with drawing():
-        lines = [line for line in (_line(found, names, k) for k in range(len(names))) if line]
+        lines = [line for line in (_line(light, names, k) for k in range(len(names))) if line]
         shown = lines[:_LISTED] + ([f"and {len(lines) - _LISTED} more faces"] if len(lines) > _LISTED else [])
         tall = min(max(_WIDE_IN * height / width, 1.4), 5.0)
         below = 0.2 * max(len(shown), math.ceil(len(strong) / 2)) + 0.35
@@ -131,9 +131,9 @@ def _sources(main: NDArray[np.integer], share: NDArray[np.floating], colours: di
     return np.asarray(image)
 
 
-def _line(found: LightFromFaces, names: Sequence[str], shape: int) -> str:
-    """Return what a face gets from others: ``pillar1: 91 % of its light met plane (90 %) or pillar2 (1 %) before``."""
-    shares = found.shares_of(shape)
+def _line(light: LightFromFaces, names: Sequence[str], shape: int) -> str:
+    """Describe the light of a face: ``pillar1: 91 % of its light met another face before: plane 90 %, pillar2 1 %``."""
+    shares = light.shares_of(shape)
     if not np.isfinite(shares).all():
         return ""
     best = [int(k) for k in np.argsort(-shares, kind="stable")[:_SOURCES] if shares[k] >= _LEAST]

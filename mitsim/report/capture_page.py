@@ -65,8 +65,8 @@ def write_capture_page(folder: Path, preamble: str, table: str, real: Shown, sim
 def capture_figure(real: Shown, simulated: Shown) -> Figure:
     """Draw both captures side by side, each pair of pictures on one scale."""
     sides = (real, simulated)
-    known = np.concatenate([np.abs(side.residual[np.isfinite(side.residual)]) for side in sides])
-    reach = float(np.percentile(known, _RESIDUAL_PERCENTILE)) if len(known) else 1.0
+    residuals = np.concatenate([np.abs(side.residual[np.isfinite(side.residual)]) for side in sides])
+    reach = float(np.percentile(residuals, _RESIDUAL_PERCENTILE)) if len(residuals) else 1.0
     shares = np.cumsum(real.levels) / real.levels.sum()
     black, white = (int(np.searchsorted(shares, share)) for share in _STRETCH)
     tall = min(max(4.4 * real.image.shape[0] / real.image.shape[1], 1.4), 4.4)
@@ -79,8 +79,8 @@ def capture_figure(real: Shown, simulated: Shown) -> Figure:
             image.set_title(f"{side.name} ({side.source})")
             drawn = field.imshow(side.residual, cmap="RdBu_r", vmin=-reach, vmax=reach)
             field.set_facecolor(FIELD)
-            for one in (image, field):
-                one.set(xticks=[], yticks=[])
+            for panel in (image, field):
+                panel.set(xticks=[], yticks=[])
         colour_scale(figure, drawn, axes[1].tolist(), "residual along V [mm]")
         _histograms(axes[2, 0], sides)
         _statuses(axes[2, 1], sides)
@@ -110,7 +110,7 @@ def _statuses(axes: Axes, sides: tuple[Shown, Shown]) -> None:
         for status in present:
             share = side.shares.get(status, 0.0)
             words, colour = REASONS[status]
-            both = " | ".join(percent(each.shares.get(status, 0.0)) for each in sides)
+            both = " | ".join(percent(other.shares.get(status, 0.0)) for other in sides)
             axes.barh(row, share, left=start, color=colour, label=f"{words}: {both}" if row == 0 else None)
             start += share
     axes.set_yticks([0, 1], ["real", "simulated"])

@@ -24,14 +24,14 @@ def with_labels(markup: str) -> str:
     A label is the text of the column's head, its small print after a comma. Cells that have a label, cells that head
     their row, and cells over several columns stay as they are.
     """
-    return _TABLE.sub(lambda found: _labelled_table(found[0]), markup)
+    return _TABLE.sub(lambda table: _labelled_table(table[0]), markup)
 
 
 def _labelled_table(table: str) -> str:
     head = _HEAD.search(table)
     if head is None:
         return table
-    labels = [_text(one) for one in _HEADING.findall(head[0])]
+    labels = [_text(heading) for heading in _HEADING.findall(head[0])]
     body = _ROW.sub(lambda row: _labelled_row(row[0], labels), table[head.end() :])
     return table[: head.end()] + body
 

@@ -66,13 +66,13 @@ def page_content(choice: ChoiceDocument, folder: Path) -> dict[str, Any]:
 
 
 def _asked(choice: ChoiceDocument, name: str) -> dict[str, str]:
-    one = choice.measurements[name]
+    measurement = choice.measurements[name]
     return {
         "name": name,
-        "nominal": exact(one.nominal, one.unit),
-        "features": listed(one.features),
-        "rule": one.rule,
-        "tolerance": tolerance_words(one.tolerance, one.nominal, one.unit),
+        "nominal": exact(measurement.nominal, measurement.unit),
+        "features": listed(measurement.features),
+        "rule": measurement.rule,
+        "tolerance": tolerance_words(measurement.tolerance, measurement.nominal, measurement.unit),
     }
 
 

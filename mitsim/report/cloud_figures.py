@@ -63,8 +63,8 @@ def camera_images(capture: Capture, part: NDArray[np.floating] | None = None) ->
     frames = {}
     for name, stack in capture.images.items():
         camera = capture.rig.cameras.get(name)
-        known = part is not None and camera is not None and stack.shape[1:] == (camera.height, camera.width)
-        cut = part_window(camera, part) if known and camera is not None and part is not None else (slice(None),) * 2
+        croppable = part is not None and camera is not None and stack.shape[1:] == (camera.height, camera.width)
+        cut = part_window(camera, part) if croppable and camera is not None and part is not None else (slice(None),) * 2
         frames[name] = shrink(stack[0][cut])
     black, white = grey_limits(list(frames.values()))
     uris = {}

@@ -64,9 +64,9 @@ def _map_figure(
 ) -> Figure:
     data = performance_map.data
     order, distances = matt_to_shiny(performance_map.samples), data["distance"].values
-    known = np.isfinite(data["recovered_fraction"].values).any(axis=(0, 1))
+    covered = np.isfinite(data["recovered_fraction"].values).any(axis=(0, 1))
     incidence = incidence_of_nodes(performance_map)
-    largest = float(incidence[known].max()) if known.any() else math.radians(75)
+    largest = float(incidence[covered].max()) if covered.any() else math.radians(75)
     axis = data["a"].values.astype(float)
     with drawing():
         width = max(2.35 * len(order) + 0.7, 5.5)
@@ -114,7 +114,7 @@ def patches_figure(patches: xr.Dataset) -> Figure:
     """Draw the number of patches measured at each orientation, over all distances, a disc for each sample."""
     normal = np.stack([patches["normal_x"].values, patches["normal_y"].values], axis=-1)
     n_z = np.sqrt(np.maximum(1 - (normal**2).sum(-1), 0))
-    places = lambert_projection(np.concatenate([normal, n_z[:, None]], axis=-1))
+    positions = lambert_projection(np.concatenate([normal, n_z[:, None]], axis=-1))
     finishes, roughness = patches["finish"].values.astype(str), patches["roughness"].values.astype(float)
     samples = list(zip(finishes.tolist(), roughness.tolist(), strict=True))
     number = patches["sample_number"].values
@@ -124,7 +124,7 @@ def patches_figure(patches: xr.Dataset) -> Figure:
     counts = []
     for sample in range(len(samples)):
         mine = number == sample
-        counts.append(np.histogram2d(places[mine, 1], places[mine, 0], bins=(edges, edges))[0])
+        counts.append(np.histogram2d(positions[mine, 1], positions[mine, 0], bins=(edges, edges))[0])
     norm = LogNorm(1, max(2.0, max((c.max() for c in counts), default=2.0)))
     with drawing():
         figure = Figure((max(2.35 * len(samples) + 0.4, 5.5), 4.0), layout="constrained")

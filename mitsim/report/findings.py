@@ -59,8 +59,8 @@ def reason_shares(pairs: Iterable[tuple[PointCloud, PointCloud]]) -> dict[Status
 def incidence_of_nodes(performance_map: PerformanceMap) -> Floats:
     """Return the incidence angle of every node of a map, (b, a) [rad]."""
     b, a = np.meshgrid(performance_map.data["b"].values, performance_map.data["a"].values, indexing="ij")
-    places = np.stack([a, b], axis=-1)
-    return np.asarray(np.arccos(np.clip(inverse_lambert_projection(places)[..., 2], -1, 1)))
+    nodes = np.stack([a, b], axis=-1)
+    return np.asarray(np.arccos(np.clip(inverse_lambert_projection(nodes)[..., 2], -1, 1)))
 
 
 def half_recovery_incidence(performance_map: PerformanceMap, sample: int, distance: int) -> float:
@@ -76,11 +76,11 @@ def half_recovery_incidence(performance_map: PerformanceMap, sample: int, distan
         ring = fraction[(incidence >= low) & (incidence < low + np.radians(5.0)) & np.isfinite(fraction)]
         if len(ring):
             means[i] = ring.mean()
-    known = np.flatnonzero(np.isfinite(means))
-    good = known[means[known] >= 0.5]
+    rings = np.flatnonzero(np.isfinite(means))
+    good = rings[means[rings] >= 0.5]
     if not len(good):
-        return 0.0 if len(known) else float("nan")
-    return float("nan") if good[-1] == known[-1] else float(lows[good[-1]] + np.radians(3.75))
+        return 0.0 if len(rings) else float("nan")
+    return float("nan") if good[-1] == rings[-1] else float(lows[good[-1]] + np.radians(3.75))
 
 
 def median_noise(performance_map: PerformanceMap, sample: int, distance: int) -> float:

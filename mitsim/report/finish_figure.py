@@ -21,30 +21,30 @@ _LEAST_REACH = 3.0
 _ALIKE = 0.3
 
 
-def fit_table(found: CouponFit) -> str:
+def fit_table(coupon_fit: CouponFit) -> str:
     """Return the fitted quantities, one line for each, then one line for each view, with cells separated by tabs."""
-    fit, lines = found.fit, []
+    fit, lines = coupon_fit.fit, []
     if fit.log_alpha is not None:
         spread = f"covariance {_percent(fit.log_alpha.by_covariance)}, jackknife {_percent(fit.log_alpha.by_jackknife)}"
-        lines += [("alpha", _with(*found.alpha), spread)]
-        lines += [("Ra-equivalent [um]", _with(*found.roughness), found.finish)]
-    relative = found.power[0] / found.sensor.projector.flux
-    times = "" if found.metal else ", times albedo"
-    lines += [("projector power [W]" + times, _with(*found.power), f"{relative:.3f} of the sensor file's")]
+        lines += [("alpha", _with(*coupon_fit.alpha), spread)]
+        lines += [("Ra-equivalent [um]", _with(*coupon_fit.roughness), coupon_fit.finish)]
+    relative = coupon_fit.power[0] / coupon_fit.sensor.projector.flux
+    times = "" if coupon_fit.metal else ", times albedo"
+    lines += [("projector power [W]" + times, _with(*coupon_fit.power), f"{relative:.3f} of the sensor file's")]
     if fit.wide_angle is not None:
         lines += [("wide-angle share", _with(fit.wide_angle.value, fit.wide_angle.uncertainty), "")]
     if fit.ambient is not None:
         lines += [("light of the room [e-/s]", _with(fit.ambient.value, fit.ambient.uncertainty), "")]
-    for dots in found.dots:
+    for dots in coupon_fit.dots:
         words = (
             f"by its dots: blur {dots.blur_px:.2f} px, contrast {dots.contrast:.2f}, file's {dots.file_contrast:.2f}"
         )
-        lines += [(f"power by {dots.camera}{times}", f"{dots.power * found.sensor.projector.flux:.3f}", words)]
+        lines += [(f"power by {dots.camera}{times}", f"{dots.power * coupon_fit.sensor.projector.flux:.3f}", words)]
     lines += [
-        ("reduced chi-square", f"{fit.reduced_chi_square:.3f}", f"{fit.blocks} blocks of {found.block_px} px"),
-        ("residual rms [DN]", f"{found.rms_dn:.3g}", f"{found.rms_in_noise:.2f} standard deviations"),
+        ("reduced chi-square", f"{fit.reduced_chi_square:.3f}", f"{fit.blocks} blocks of {coupon_fit.block_px} px"),
+        ("residual rms [DN]", f"{coupon_fit.rms_dn:.3g}", f"{coupon_fit.rms_in_noise:.2f} standard deviations"),
         ("grain", f"{fit.grain:.3f}", f"neighbouring blocks correlate by {fit.neighbours:.2f}"),
-        ("left out, saturated", f"{100 * found.censored:.1f} %", ""),
+        ("left out, saturated", f"{100 * coupon_fit.censored:.1f} %", ""),
     ]
     text = "".join("\t".join(line).rstrip("\t") + "\n" for line in lines)
     text += "\ncapture\tcamera\texposure [s]\thalf vector [deg]\tresidual [DN]\tin noise\tleft out\n"
@@ -61,40 +61,40 @@ def fit_table(found: CouponFit) -> str:
     return text
 
 
-def remarks(found: CouponFit) -> list[str]:
+def remarks(coupon_fit: CouponFit) -> list[str]:
     """Return remarks that limit the use of the results."""
-    fit, lines = found.fit, []
-    if found.metal is not None and fit.log_alpha is not None:
-        low, high = found.metal.alpha_range
+    fit, lines = coupon_fit.fit, []
+    if coupon_fit.metal is not None and fit.log_alpha is not None:
+        low, high = coupon_fit.metal.alpha_range
         if fit.at_limit:
             lines.append("alpha reached the end of its range: these poses do not determine the width of the lobe")
         elif fit.log_alpha.uncertainty > 0.3:
             lines.append("alpha is very uncertain: use poses closer to the mirror direction, or shorter exposures")
-        if math.isnan(found.roughness[0]):
-            ends = [f"{end:g}" for end in np.round(found.metal.roughness_range, 3)]
+        if math.isnan(coupon_fit.roughness[0]):
+            ends = [f"{end:g}" for end in np.round(coupon_fit.metal.roughness_range, 3)]
             lines.append(
-                f"no Ra-equivalent: {found.finish} has alpha {low:.3f} to {high:.3f}, of Ra {' to '.join(ends)} um"
+                f"no Ra-equivalent: {coupon_fit.finish} has alpha {low:.3f} to {high:.3f}, of Ra {' to '.join(ends)} um"
             )
     if fit.reduced_chi_square > 2:
         lines.append("the residuals exceed the noise: uncertainties are increased accordingly, but the bias is unknown")
     if fit.neighbours > _ALIKE:
         lines.append("residuals of neighbouring blocks are correlated: light, form or lobe differ from the model")
-    if found.pattern_unknown:
+    if coupon_fit.pattern_unknown:
         lines.append("the pattern is not known to be that of the sensor file: block means were compared, not dots")
-    if any(not math.isnan(place.off_plane) for place in found.places):
-        worst = max(place.off_plane for place in found.places if not math.isnan(place.off_plane))
+    if any(not math.isnan(place.off_plane) for place in coupon_fit.places):
+        worst = max(place.off_plane for place in coupon_fit.places if not math.isnan(place.off_plane))
         lines.append(
             f"the place of the coupon is the plane of its cloud, which scatters by up to {worst:.2g} mm about it"
         )
     return lines
 
 
-def fit_figure(found: CouponFit) -> Figure:
+def fit_figure(coupon_fit: CouponFit) -> Figure:
     """Draw image and model of the worst view [DN over black], and its residuals in standard deviations of a block."""
-    worst = found.worst
+    worst = coupon_fit.worst
     view, gain = worst.view, worst.view.noise.gain
-    image, model = _picture(found, view.electrons * gain), _picture(found, worst.pixels * gain)
-    residual = _picture(found, worst.in_noise[view.block])
+    image, model = _picture(coupon_fit, view.electrons * gain), _picture(coupon_fit, worst.pixels * gain)
+    residual = _picture(coupon_fit, worst.in_noise[view.block])
     bright = float(np.nanpercentile(image, 99.5))
     reach = max(_LEAST_REACH, float(np.nanpercentile(np.abs(residual), 99)))
     with drawing():
@@ -112,16 +112,16 @@ def fit_figure(found: CouponFit) -> Figure:
             axes.set(facecolor=FIELD, title=title, xticks=[], yticks=[])
             figure.colorbar(drawn, ax=axes, orientation="horizontal", label=unit, fraction=0.06, pad=0.03)
         figure.suptitle(
-            f"{Path(view.name).name}, {view.camera} ({found.source}): residual {worst.rms_dn:.2g} DN rms, "
+            f"{Path(view.name).name}, {view.camera} ({coupon_fit.source}): residual {worst.rms_dn:.2g} DN rms, "
             f"{worst.rms_in_noise:.2g} standard deviations",
             fontsize=10,
         )
     return figure
 
 
-def _picture(found: CouponFit, values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _picture(coupon_fit: CouponFit, values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return values (N,) of the worst view's pixels as an image, NaN where no pixel was compared."""
-    view = found.worst.view
+    view = coupon_fit.worst.view
     low = view.rows.min(), view.columns.min()
     out = np.full((int(np.ptp(view.rows)) + 1, int(np.ptp(view.columns)) + 1), np.nan)
     out[view.rows - low[0], view.columns - low[1]] = values
@@ -135,8 +135,8 @@ def _with(value: float, uncertainty: float) -> str:
     if not math.isfinite(uncertainty) or uncertainty <= 0:
         return f"{value:.4g}"
     spread = two_digits(uncertainty)
-    places = len(spread.partition(".")[2])
-    return f"{value:.{places}f} +- {spread}"
+    decimals = len(spread.partition(".")[2])
+    return f"{value:.{decimals}f} +- {spread}"
 
 
 def _percent(share: float) -> str:

@@ -23,7 +23,7 @@ _BY_SHARE = ("ISO 14253-1", "simple acceptance")
 #: share above which the exact figure is of no use
 _LARGEST_SHARE = 10.0
 
-#: what a kind of measurement is, of its features in their order; other kinds are their name, "of" the features
+#: description of a kind of measurement by its features, in their order; other kinds: their name, "of" the features
 _KINDS = {
     "intersection_distance": "distance between the points where the axes of {1} and {2} meet {0}",
     "axis_distance": "distance between the axes of {0} and {1}",
@@ -41,8 +41,8 @@ _KINDS = {
 class ResultRow:
     """One measurement in the short table, as texts; ``colour`` of its verdict.
 
-    ``about`` says what is measured. ``share`` of the tolerance with its ``share_interval`` and the largest
-    ``share_limit`` that fits. ``limited`` says what limits the view, ``points`` how many it expects there; ``source``
+    ``about`` describes the measurement. ``share`` of the tolerance with its ``share_interval`` and the largest
+    ``share_limit`` that fits. ``limited`` is the limit of the view, ``points`` how many it expects there; ``source``
     is the largest line of the budget. Texts are empty where nothing is known; values without a number are a dash.
     """
 
@@ -71,9 +71,9 @@ class RowValues:
     """Values of one measurement, in ``unit``; None where a value is not known or there is no tolerance.
 
     ``tolerance`` as in the task, or half the interval that conforms. ``share`` of the tolerance that the uncertainty
-    takes; ``demand`` of the ``rule`` with its interval; ``accepted`` lowest and highest reading. ``limited`` is what
-    limits the view, with the expected ``points`` on that feature; ``source`` the largest line of the budget. Values by
-    screening alone are not ``stated``: they accept no reading, and reject none.
+    takes; ``demand`` of the ``rule`` with its interval; ``accepted`` lowest and highest reading. ``limited`` is
+    the limit of the view, with the expected ``points`` on that feature; ``source`` the largest line of the budget.
+    Values by screening alone are not ``stated``: they accept no reading, and reject none.
     """
 
     name: str
@@ -145,8 +145,8 @@ def measured_words(kind: str, features: Sequence[str]) -> str:
 def breakable(name: str, after: str = "_") -> Markup:
     """Return a name as safe markup that a browser may break ``after`` some characters; of a path, ``_/``."""
     text = escape(name)
-    for one in after:
-        text = text.replace(one, Markup(f"{one}<wbr>"))
+    for character in after:
+        text = text.replace(character, Markup(f"{character}<wbr>"))
     return Markup(text)
 
 

@@ -54,8 +54,8 @@ class FirstScreen:
     """Content of the first screen: the ``reasons`` of the result, its ``tone``, rows and picture.
 
     The picture shows ``poses`` (label, part_from_sensor) and ``verdicts`` by feature. ``trials`` is the largest number
-    of virtual measurements behind a row. ``remedies`` say what would make the other measurements fit,
-    ``doubts`` why to check the statement.
+    of virtual measurements behind a row. ``remedies`` are changes with which the other measurements fit,
+    ``doubts`` are reasons to check the statement.
     """
 
     reasons: Sequence[Reason]
@@ -113,7 +113,7 @@ class FirstScreen:
 
     @property
     def limited(self) -> bool:
-        """Return whether a row says what limits the view."""
+        """Return whether a row states the limit of the view."""
         return any(row.limited for row in self.rows)
 
     @property
@@ -151,9 +151,9 @@ def of_run(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
     poses: list[tuple[str, ArrayLike]] = [(f"view {document.view}", view_scores["world_from_sensor"].values)]
     verdicts = face_verdicts(asked)
     result = with_sets(result_reasons(results), fits_all(results), run.about.view_sets)
-    first, *rest = result.reasons
+    first, *reasons = result.reasons
     return FirstScreen(
-        [Reason(first.says[:1].upper() + first.says[1:]), *rest],
+        [Reason(first.says[:1].upper() + first.says[1:]), *reasons],
         tone_of(results) if result.good else "bad",
         [_run_row(run, view_scores, name, measurement) for name, measurement in document.measurements.items()],
         _picture(geometry, poses, verdicts, _caption(run, document.view)),

@@ -47,32 +47,32 @@ def common_samples(maps: Sequence[PerformanceMap]) -> list[Sample]:
 
 
 def comparison_figure(
-    maps: Sequence[PerformanceMap], what: Literal["fraction", "noise"], distance_mm: float | None = None
+    maps: Sequence[PerformanceMap], quantity: Literal["fraction", "noise"], distance_mm: float | None = None
 ) -> Figure:
     """Draw discs over the orientation, a row for each map and a column for each sample, on one colour scale."""
     samples = common_samples(maps)
     limits = np.array([noise_limits(performance_map.data["ray_noise_std"].values) for performance_map in maps])
-    norm = Normalize(0, 1) if what == "fraction" else LogNorm(float(limits[:, 0].min()), float(limits[:, 1].max()))
-    colours = SEQUENTIAL if what == "fraction" else NOISE
-    variable = "recovered_fraction" if what == "fraction" else "ray_noise_std"
+    norm = Normalize(0, 1) if quantity == "fraction" else LogNorm(float(limits[:, 0].min()), float(limits[:, 1].max()))
+    colours = SEQUENTIAL if quantity == "fraction" else NOISE
+    variable = "recovered_fraction" if quantity == "fraction" else "ray_noise_std"
     with drawing():
         figure = Figure((1.75 * len(samples) + 1.1, 1.7 * len(maps) + 1.3), layout="constrained")
         grid = np.asarray(figure.subplots(len(maps), len(samples), squeeze=False))
         for number, (performance_map, row) in enumerate(zip(maps, grid, strict=True)):
-            place = nearest_distance(performance_map, distance_mm)
+            knot = nearest_distance(performance_map, distance_mm)
             for sample, axes in zip(samples, row, strict=True):
                 index = _index(performance_map, sample)
                 if index is None:
                     disc(axes, 2 * math.sin(_LARGEST / 2))
                 else:
-                    values = performance_map.data[variable].values[index, place]
+                    values = performance_map.data[variable].values[index, knot]
                     disc_image(axes, values, performance_map.data["a"].values, _LARGEST).set(norm=norm, cmap=colours)
                 disc_view(axes, _LARGEST, labelled=number == 0)
                 if number == 0:
                     axes.set_title(finish_name(*sample).replace(", ", "\n"), fontsize=8)
-            distance = float(performance_map.data["distance"].values[place])
+            distance = float(performance_map.data["distance"].values[knot])
             row[0].set_ylabel(f"{sensor_name(performance_map)}\n{distance:g} mm", labelpad=6, fontsize=7.5)
-        colour_bar(figure, grid, norm, colours, _LABELS[what], "neither" if what == "fraction" else "both")
+        colour_bar(figure, grid, norm, colours, _LABELS[quantity], "neither" if quantity == "fraction" else "both")
     return figure
 
 
@@ -101,7 +101,7 @@ def strip_figure(maps: Sequence[PerformanceMap]) -> Figure:
             top.set_title(finish_name(*sample).replace(", ", "\n"), fontsize=8)
             top.set_ylim(-0.03, 1.03)
             bottom.set(xscale="log", yscale="log")
-            if not any(np.isfinite(line.get_ydata()).any() for each in lower for line in each.lines):
+            if not any(np.isfinite(line.get_ydata()).any() for panel in lower for line in panel.lines):
                 # matplotlib finds no limits if no map has a noise
                 bottom.set_ylim(*noise_limits(maps[0].data["ray_noise_std"].values))
             bottom.set_xlabel("|V| [mm]")
@@ -122,9 +122,9 @@ def strip_figure(maps: Sequence[PerformanceMap]) -> Figure:
 
 def nearest_distance(performance_map: PerformanceMap, distance_mm: float | None) -> int:
     """Return the index of the knot nearest in ratio to a distance [mm], or to mid range if None is given."""
-    known: NDArray[np.float64] = performance_map.data["distance"].values.astype(float)
-    target = math.sqrt(known[0] * known[-1]) if distance_mm is None else distance_mm
-    return int(np.abs(np.log(known / target)).argmin())
+    knots: NDArray[np.float64] = performance_map.data["distance"].values.astype(float)
+    target = math.sqrt(knots[0] * knots[-1]) if distance_mm is None else distance_mm
+    return int(np.abs(np.log(knots / target)).argmin())
 
 
 def check_distance(maps: Sequence[PerformanceMap], distance_mm: float) -> None:
@@ -152,5 +152,5 @@ def sensor_name(performance_map: PerformanceMap) -> str:
 
 
 def _index(performance_map: PerformanceMap, sample: Sample) -> int | None:
-    known = [(name, f"{roughness}") for name, roughness in performance_map.samples]  # as texts, NaN equals NaN
-    return known.index(own) if (own := (sample[0], f"{sample[1]}")) in known else None
+    samples = [(name, f"{roughness}") for name, roughness in performance_map.samples]  # as texts, NaN equals NaN
+    return samples.index(key) if (key := (sample[0], f"{sample[1]}")) in samples else None

@@ -26,8 +26,8 @@ _DEVIATIONS = 6.0
 def distance_figure(cloud: PointCloud, windows: Mapping[str, Roi]) -> Figure:
     """Draw the distance from the sensor along each view ray [mm] over rows and columns, with the named windows."""
     distance = np.linalg.norm(cloud.points.astype(float) - cloud.grid.origin, axis=-1)
-    known = distance[np.isfinite(distance)]
-    near, far = np.percentile(known, [1, 99]) if len(known) else (0.0, 1.0)
+    distances = distance[np.isfinite(distance)]
+    near, far = np.percentile(distances, [1, 99]) if len(distances) else (0.0, 1.0)
     with drawing():
         rows, columns = distance.shape
         figure = Figure((9.0, min(max(8.0 * rows / columns, 2.5), 9.0)), layout="constrained")
@@ -40,7 +40,7 @@ def distance_figure(cloud: PointCloud, windows: Mapping[str, Roi]) -> Figure:
 
 
 def difference_figure(
-    difference: NDArray[np.float64], found: Difference, windows: Mapping[str, Roi], part: Roi | None = None
+    difference: NDArray[np.float64], distribution: Difference, windows: Mapping[str, Roi], part: Roi | None = None
 ) -> Figure:
     """Draw the signed difference of every pixel, in the whole image or a part, and its histogram.
 
@@ -48,7 +48,7 @@ def difference_figure(
     ----------
     difference
         (H, W) [mm], NaN where a pixel has no counterpart.
-    found
+    distribution
         Distribution of the difference.
     windows
         Windows to outline [px], by name.
@@ -60,10 +60,10 @@ def difference_figure(
     distance_figure : the distance of a single cloud
     """
     part = part or Roi.whole(difference.shape[1], difference.shape[0])
-    known = difference[np.isfinite(difference)]
-    reach = float(np.percentile(np.abs(known), _PERCENTILE)) if len(known) else 1.0
-    if found.robust_deviation > 0:
-        reach = min(reach, abs(found.median) + _DEVIATIONS * found.robust_deviation)
+    values = difference[np.isfinite(difference)]
+    reach = float(np.percentile(np.abs(values), _PERCENTILE)) if len(values) else 1.0
+    if distribution.robust_deviation > 0:
+        reach = min(reach, abs(distribution.median) + _DEVIATIONS * distribution.robust_deviation)
     reach = max(reach, 1e-6)
     with drawing():
         tall = min(max(7.4 * part.height / part.width, 2.0), 7.0)
@@ -74,8 +74,8 @@ def difference_figure(
         axes.set(xlim=(part.left - 0.5, part.right - 0.5), ylim=(part.bottom - 0.5, part.top - 0.5))
         colour_scale(figure, drawn, axes, "farther than the reference by [mm]")
         _outline(axes, windows)
-        histogram.hist(np.clip(known, -1.5 * reach, 1.5 * reach), 121, color=BLUE)
-        histogram.axvline(found.median, color=VERMILION, label=f"median {found.median:.3g} mm")
+        histogram.hist(np.clip(values, -1.5 * reach, 1.5 * reach), 121, color=BLUE)
+        histogram.axvline(distribution.median, color=VERMILION, label=f"median {distribution.median:.3g} mm")
         histogram.set_xlabel("farther than the reference by [mm]; the end bins include all values beyond")
         histogram.set_ylabel("pixels")
         histogram.legend(loc="upper right")

@@ -97,11 +97,11 @@ def page_content(run: Run) -> dict[str, Any]:
         "answers": [_answer(run, name) for name in run.measurements],
         "tolerances": bool(np.isfinite(scores["tolerance"].values).any()),
         "coverage": percent(NORMAL_COVERAGE),
-        "agreements": [_agreement_row(name, found) for name, found in agreements.items()],
+        "agreements": [_agreement_row(name, comparison) for name, comparison in agreements.items()],
         "sphere": view_sphere(run),
         "map_pictures": list(map_pictures(run)),
         "measurement_pictures": [
-            (name, list(measurement_pictures(run, name, found))) for name, found in agreements.items()
+            (name, list(measurement_pictures(run, name, comparison))) for name, comparison in agreements.items()
         ],
         "camera_views": [camera_view(run, view) for view in _spread(run.checked, 3)],
         "cloud_pictures": [cloud_picture(run, view) for view in _spread(run.checked, 2)],
@@ -119,8 +119,8 @@ def page_content(run: Run) -> dict[str, Any]:
 
 
 def _standoffs(run: Run) -> str:
-    known = run.scores["standoff_mm"].values
-    nearest, farthest = rounded(float(known.min())), rounded(float(known.max()))
+    standoffs = run.scores["standoff_mm"].values
+    nearest, farthest = rounded(float(standoffs.min())), rounded(float(standoffs.max()))
     return nearest if nearest == farthest else f"{nearest} to {farthest}"
 
 
@@ -133,20 +133,20 @@ def _by_finish(features: dict[str, str]) -> dict[str, str]:
 
 
 def _rolls(run: Run) -> str:
-    known = np.unique(run.scores["roll_deg"].values)
-    if len(known) <= MOST_LISTED:
-        return listed([f"{rounded(roll)}°" for roll in known])
-    return f"{rounded(known[0])}° to {rounded(known[-1])}°"
+    rolls = np.unique(run.scores["roll_deg"].values)
+    if len(rolls) <= MOST_LISTED:
+        return listed([f"{rounded(roll)}°" for roll in rolls])
+    return f"{rounded(rolls[0])}° to {rounded(rolls[-1])}°"
 
 
 def _residual(run: Run) -> dict[str, str] | None:
-    known = run.about.render_residual
-    if known is None:
+    residual = run.about.render_residual
+    if residual is None:
         return None
     return {
-        "noise": two_digits(known.noise),
-        "quadrature": two_digits(known.quadrature),
-        "outliers": percent(known.outliers),
+        "noise": two_digits(residual.noise),
+        "quadrature": two_digits(residual.quadrature),
+        "outliers": percent(residual.outliers),
     }
 
 
@@ -181,18 +181,20 @@ def _runner_up(run: Run, up: RunnerUp) -> dict[str, Any]:
     return pose_texts(pose_of_view(run, up.view)) | texts
 
 
-def _agreement_row(name: str, found: Agreement) -> dict[str, str]:
-    size = "u too small" if found.optimistic else "u holds" if found.trials else ""
+def _agreement_row(name: str, comparison: Agreement) -> dict[str, str]:
+    size = "u too small" if comparison.optimistic else "u holds" if comparison.trials else ""
     return {
         "name": name,
-        "count": f"{found.count} of {len(found.views)}",
-        "spearman": rounded(found.spearman, 2),
-        "score_spearman": rounded(found.score_spearman, 2),
-        "chance": rounded(chance_level(found.count), 2),
-        "coverage": percent(found.coverage),
-        "interval": f"{percent(found.low)} to {percent(found.high)}, n = {found.trials}" if found.trials else "",
-        "ratio": two_digits(found.ratio),
-        "order": found.order,
+        "count": f"{comparison.count} of {len(comparison.views)}",
+        "spearman": rounded(comparison.spearman, 2),
+        "score_spearman": rounded(comparison.score_spearman, 2),
+        "chance": rounded(chance_level(comparison.count), 2),
+        "coverage": percent(comparison.coverage),
+        "interval": f"{percent(comparison.low)} to {percent(comparison.high)}, n = {comparison.trials}"
+        if comparison.trials
+        else "",
+        "ratio": two_digits(comparison.ratio),
+        "order": comparison.order,
         "size": size,
     }
 
@@ -204,10 +206,10 @@ def _reason_rows(run: Run) -> list[dict[str, str]]:
             "colour": html.escape(REASONS[status][1]),
             "name": REASONS[status][0],
             "remedy": REMEDIES[status],
-            "predicted": percent(one),
-            "decoded": percent(other),
+            "predicted": percent(predicted),
+            "decoded": percent(decoded),
         }
-        for status, (one, other) in shares.items()
+        for status, (predicted, decoded) in shares.items()
     ]
 
 

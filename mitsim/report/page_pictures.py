@@ -74,7 +74,7 @@ def map_pictures(run: Run) -> Iterator[tuple[str, Picture]]:
         yield "Where coupons were measured", _picture(figures.patches_figure(run.patches), alt, caption)
 
 
-def measurement_pictures(run: Run, name: str, found: Agreement) -> Iterator[Picture]:
+def measurement_pictures(run: Run, name: str, agreement: Agreement) -> Iterator[Picture]:
     """Yield the predicted uncertainty of a measurement from every view, and the errors in the checked views."""
     best, unit = findings.best_view(run.scores, name), run.about.measurements[name].unit
     if best is None:
@@ -91,21 +91,21 @@ def measurement_pictures(run: Run, name: str, found: Agreement) -> Iterator[Pict
     yield _picture(uncertainty_figure(run.scores, name, unit, run.checked, best), alt, caption)
     if not run.checked:
         return
-    level = rounded(chance_level(found.count), 2)
+    level = rounded(chance_level(agreement.count), 2)
     words = {
         TOO_FEW: "too few views gave a value to test whether u orders them correctly",
-        CHANCE: f"the order of the {found.count} views with a value proves nothing, since a rank correlation within "
-        f"±{level} could be chance",
+        CHANCE: f"the order of the {agreement.count} views with a value proves nothing, since a rank correlation "
+        f"within ±{level} could be chance",
         CONFIRMED: "u orders the views correctly: smaller u, smaller error",
-    }.get(found.order, "u orders the views in reverse: smaller u, larger error")
+    }.get(agreement.order, "u orders the views in reverse: smaller u, larger error")
     tail = ""
-    if found.trials:
-        inside = f"{round(found.coverage * found.trials)} of {found.trials} errors"
-        beyond = ", significantly fewer than 95 %" if found.optimistic else ""
+    if agreement.trials:
+        inside = f"{round(agreement.coverage * agreement.trials)} of {agreement.trials} errors"
+        beyond = ", significantly fewer than 95 %" if agreement.optimistic else ""
         tail = f"; {inside} lie within 2 u{beyond}"
     caption = f"In the rendered views {words}{tail}."
     alt = f"True error of {name} against predicted standard uncertainty and against view score. {caption}"
-    yield _picture(agreement_figure(found, unit), alt, caption)
+    yield _picture(agreement_figure(agreement, unit), alt, caption)
 
 
 def _commonest_limit(run: Run, name: str) -> str:
@@ -137,15 +137,15 @@ def cloud_picture(run: Run, view: int) -> Picture:
     """Return the picture of the predicted and the decoded cloud of a checked view."""
     predicted, decoded = run.predicted(view), run.decoded(view)
     shares = findings.reason_shares([(predicted, decoded)])
-    one, other = shares.get(Status.VALID, (0.0, 0.0))
+    predicted_share, decoded_share = shares.get(Status.VALID, (0.0, 0.0))
     lost = [status for status in shares if status != Status.VALID]
     why = ""
     if lost:
         reason = max(lost, key=lambda status: shares[status][1])
         why = f"; the most frequent reason for a missing point is “{REASONS[reason][0]}” ({percent(shares[reason][1])})"
     caption = (
-        f"View {view}: of the pixels that could show the part, {percent(one)} give a point in the prediction "
-        f"and {percent(other)} in the decoded images{why}."
+        f"View {view}: of the pixels that could show the part, {percent(predicted_share)} give a point in the "
+        f"prediction and {percent(decoded_share)} in the decoded images{why}."
     )
     alt = f"Depth and status of the predicted and the decoded cloud. {caption}"
     return _picture(cloud_figure(predicted, decoded), alt, caption)

@@ -43,7 +43,7 @@ _NOT_ASKED = "#b9bdc4"
 #: words of the legend, where they are not the verdict
 _LEGEND = {"no tolerance": "measured, without tolerance"}
 
-#: pixels along the longer side of the picture, and of the raster in which places for labels are found
+#: pixels along the longer side of the picture, and of the raster in which labels are anchored
 _PIXELS = 900
 _LABEL_PIXELS = 240
 
@@ -65,7 +65,7 @@ _SIZE_IN = (7.4, 3.9)
 #: size of the figure with the part below the sensor [in]
 _STACKED_IN = (3.9, 5.6)
 
-#: places of both pictures in each figure
+#: left, bottom, width and height of both pictures in each figure, as shares of its size
 _BESIDE = (0.0, 0.09, 0.46, 0.91), (0.46, 0.09, 0.54, 0.91)
 _STACKED = (0.0, 0.54, 1.0, 0.46), (0.0, 0.1, 1.0, 0.42)
 
@@ -137,7 +137,7 @@ def draw_placement(
         middle = (geometry.corners.min(axis=(0, 1)) + geometry.corners.max(axis=(0, 1))) / 2
         turn = _viewpoint(matrices[0], middle)
         flat, depth = _projected(geometry.corners - middle, turn)
-        whole, near = (figure.add_axes(place) for place in (_STACKED if stacked else _BESIDE))
+        whole, near = (figure.add_axes(box) for box in (_STACKED if stacked else _BESIDE))
         picture, extent = _part(geometry, flat, depth, turn, verdicts)
         for axes in (whole, near):
             axes.imshow(picture, origin="lower", extent=extent, interpolation="antialiased", zorder=2)
@@ -206,27 +206,27 @@ def _raster(flat: Floats, depth: Floats, pixels: int) -> tuple[NDArray[np.int64]
     return depth_buffer((flat - low) * scale, depth, size)[0], low, high, scale
 
 
-def depth_buffer(places: Floats, depth: Floats, size: tuple[int, ...]) -> tuple[NDArray[np.int64], Floats]:
+def depth_buffer(vertices: Floats, depth: Floats, size: tuple[int, ...]) -> tuple[NDArray[np.int64], Floats]:
     """Return the nearest triangle of every pixel, -1 for none, and its depth, both (rows, columns).
 
-    ``places`` (n, 3, 2) [px] of the vertices, ``depth`` (n, 3), larger is nearer; ``size`` is (columns, rows).
+    ``vertices`` (n, 3, 2) [px] of the triangles, ``depth`` (n, 3), larger is nearer; ``size`` is (columns, rows).
     """
     columns, rows = size
     index, nearest = np.full(rows * columns, -1, np.int64), np.full(rows * columns, -np.inf)
-    low = np.maximum(np.ceil(places.min(axis=1)), 0).astype(int)
-    high = np.minimum(np.floor(places.max(axis=1)), [columns - 1, rows - 1]).astype(int)
-    (ax, ay), (bx, by), (cx, cy) = places.transpose(1, 2, 0)
+    low = np.maximum(np.ceil(vertices.min(axis=1)), 0).astype(int)
+    high = np.minimum(np.floor(vertices.max(axis=1)), [columns - 1, rows - 1]).astype(int)
+    (ax, ay), (bx, by), (cx, cy) = vertices.transpose(1, 2, 0)
     area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
     width = np.where((high >= low).all(axis=1) & (np.abs(area) >= 1e-12), high[:, 0] - low[:, 0] + 1, 0)
-    some = np.flatnonzero(width)  # most triangles of a fine mesh lie between pixels
-    counts = width[some] * (high[some, 1] - low[some, 1] + 1)
+    candidates = np.flatnonzero(width)  # most triangles of a fine mesh lie between pixels
+    counts = width[candidates] * (high[candidates, 1] - low[candidates, 1] + 1)
     ends = np.cumsum(counts)
-    for part in np.split(some, np.flatnonzero(np.diff(ends // _AT_ONCE)) + 1):
+    for part in np.split(candidates, np.flatnonzero(np.diff(ends // _AT_ONCE)) + 1):
         # every pixel of the box around every triangle
         count = width[part] * (high[part, 1] - low[part, 1] + 1)
         t = np.repeat(part, count)
-        place = np.arange(len(t)) - np.repeat(np.cumsum(count) - count, count)
-        x, y = low[t, 0] + place % width[t], low[t, 1] + place // width[t]
+        offset = np.arange(len(t)) - np.repeat(np.cumsum(count) - count, count)
+        x, y = low[t, 0] + offset % width[t], low[t, 1] + offset // width[t]
         first = ((bx[t] - x) * (cy[t] - y) - (cx[t] - x) * (by[t] - y)) / area[t]
         second = ((cx[t] - x) * (ay[t] - y) - (ax[t] - x) * (cy[t] - y)) / area[t]
         third = 1 - first - second
@@ -291,12 +291,12 @@ def _labels(axes: Axes, geometry: SceneGeometry, flat: Floats, depth: Floats, ve
     """Draw the names of the measured features in columns left and right of the part, with lines that do not cross."""
     index, low, high, scale = _raster(flat, depth, _LABEL_PIXELS)
     shown = np.where(index >= 0, geometry.shape[np.maximum(index, 0)], -1)
-    places = {}
+    anchors = {}
     for number, name in enumerate(geometry.names):
         if name in verdicts and (shown == number).any():
-            places[name] = low + np.array(innermost_pixel(shown == number)[::-1]) / scale
-    order = sorted(places, key=lambda name: (-list(VERDICTS).index(verdicts[name]), places[name][0]))  # worst first
-    label_columns(axes, {name: places[name] for name in order}, low, high)
+            anchors[name] = low + np.array(innermost_pixel(shown == number)[::-1]) / scale
+    order = sorted(anchors, key=lambda name: (-list(VERDICTS).index(verdicts[name]), anchors[name][0]))  # worst first
+    label_columns(axes, {name: anchors[name] for name in order}, low, high)
 
 
 def _axes_of_part(axes: Axes, turn: Floats) -> None:

@@ -1,4 +1,4 @@
-"""Describe a view: its pose, angles in deg and lengths in mm in the part frame, and what is predicted for it."""
+"""Describe a view: its pose, angles in deg and lengths in mm in the part frame, and its predicted figures."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def angles_in_words(pose: PoseEntry) -> str:
     return ", ".join(f"{name} {angle}" for name, angle in angle_texts(pose).items())
 
 
-def origin_text(pose: PoseEntry, places: int = 0) -> str:
+def origin_text(pose: PoseEntry, decimals: int = 0) -> str:
     """Return the position of the sensor's origin [mm], rounded to a number of decimal places."""
-    return ", ".join(rounded(row[3], places) for row in pose.world_from_sensor[:3])
+    return ", ".join(rounded(row[3], decimals) for row in pose.world_from_sensor[:3])
 
 
 def pose_texts(pose: PoseEntry) -> dict[str, str]:

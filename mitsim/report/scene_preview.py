@@ -85,7 +85,7 @@ def preview_figure(
     sensor, pose
         The sensor, and world_from_sensor [mm].
     visible
-        What the reference camera's pixels see.
+        Surfaces that the reference camera's pixels see.
     first
         Names of the shapes that get the first colours; the largest of the others follow.
     measured
@@ -107,8 +107,8 @@ def preview_figure(
         _from_above(right, scene, facts, colours, sensor, pose)
         _overview(right.inset_axes((0.30, 1 - _OVERVIEW, 0.685, _OVERVIEW - 0.02)), facts, sensor, pose)
         position = pose.points(camera.centre)
-        place = ", ".join(f"{round(float(value)) + 0:g}" for value in position).replace("-", "\N{MINUS SIGN}")
-        left.set_title(f"from {sensor.name} at ({place}) mm, {camera.width} × {camera.height} px", loc="left")
+        origin = ", ".join(f"{round(float(value)) + 0:g}" for value in position).replace("-", "\N{MINUS SIGN}")
+        left.set_title(f"from {sensor.name} at ({origin}) mm, {camera.width} × {camera.height} px", loc="left")
         right.set_title("from above, along −z of the part", loc="left")
         under = bottom - 0.1 / height
         for handles, x in ((_features(facts, colours, measured), 0.008), (_marks(sensor), wide + 0.028)):
@@ -131,8 +131,8 @@ def _colours(facts: SceneFacts, first: Sequence[str], measured: Collection[str])
         key=lambda i: (shapes[i].emitter, shapes[i].name not in first, -np.nan_to_num(shapes[i].area), i),
     )
     coloured = order if len(order) <= len(SHAPES) else order[: len(SHAPES)]
-    own = dict(zip(coloured, SHAPES, strict=False))
-    return [own.get(i, OTHER_SHAPE) for i in range(len(shapes))]
+    by_shape = dict(zip(coloured, SHAPES, strict=False))
+    return [by_shape.get(i, OTHER_SHAPE) for i in range(len(shapes))]
 
 
 def _painted(
@@ -164,7 +164,9 @@ def _from_sensor(
     hits = first_hits(scene.mitsuba, np.broadcast_to(pose.points(camera.centre), world.shape), world)
     light = np.array([-0.35, -0.45, -0.82])  # from behind the sensor's left shoulder
     lit = np.clip(pose.inverse().directions(hits.normal) @ (light / np.linalg.norm(light)), 0, 1).reshape(size)
-    nearest = tuple(np.clip(np.rint(one).astype(int), 0, end - 1) for one, end in ((rows, height), (columns, width)))
+    nearest = tuple(
+        np.clip(np.rint(coordinate).astype(int), 0, end - 1) for coordinate, end in ((rows, height), (columns, width))
+    )
     clear = (visible.seen_by_all & np.where(seen, _within(sensor, visible), False))[nearest]
     source = without_leaks(hits.shape.reshape(size), hits.front.reshape(size))
     shape, front = hits.shape.reshape(-1)[source], hits.front.reshape(-1)[source]
@@ -181,8 +183,8 @@ def _from_sensor(
     at = float(np.median(depth(sensor, visible.point[seen])))
     pixels = float(camera.matrix[0, 0]) / at
     length = round_length(0.2 * (right - left) / pixels)
-    place = (left + 0.03 * (right - left), bottom - 0.045 * (bottom - top))
-    scale_bar(axes, place, length * pixels, f"{length:g} mm at {at:.0f} mm", -0.02 * (bottom - top))
+    corner = (left + 0.03 * (right - left), bottom - 0.045 * (bottom - top))
+    scale_bar(axes, corner, length * pixels, f"{length:g} mm at {at:.0f} mm", -0.02 * (bottom - top))
     return window
 
 
@@ -195,8 +197,8 @@ def without_leaks(shape: NDArray[np.int16], front: NDArray[np.bool_]) -> NDArray
     surface = 2 * shape.astype(np.int64) + front
     index = np.arange(surface.size).reshape(surface.shape)
     middle, left = surface[1:-1, 1:-1], surface[1:-1, :-2]
-    others = (surface[1:-1, 2:], surface[:-2, 1:-1], surface[2:, 1:-1])
-    leaked = (middle != left) & np.logical_and.reduce([one == left for one in others])
+    neighbours = (surface[1:-1, 2:], surface[:-2, 1:-1], surface[2:, 1:-1])
+    leaked = (middle != left) & np.logical_and.reduce([neighbour == left for neighbour in neighbours])
     index[1:-1, 1:-1] -= leaked
     return index
 
@@ -254,10 +256,10 @@ def _from_above(
     left, right, bottom, top = window
     step = max(right - left, top - bottom) / _FINE
     x, y = np.arange(left + step / 2, right, step), np.arange(top - step / 2, bottom, -step)
-    places = np.stack(np.meshgrid(x, y), axis=-1)
-    size = places.shape[:2]
+    raster = np.stack(np.meshgrid(x, y), axis=-1)
+    size = raster.shape[:2]
     above = float(facts.bounds[1, 2] + 1 + 0.1 * (right - left))
-    origins = np.concatenate([places, np.full((*size, 1), above)], axis=-1).reshape(-1, 3)
+    origins = np.concatenate([raster, np.full((*size, 1), above)], axis=-1).reshape(-1, 3)
     hits = first_hits(scene.mitsuba, origins, np.broadcast_to([0.0, 0.0, -1.0], origins.shape))
     light = np.array([-0.4, 0.35, 0.85])
     lit = np.clip(hits.normal @ (light / np.linalg.norm(light)), 0, 1).reshape(size)
@@ -268,8 +270,8 @@ def _from_above(
     axes.set(xlim=(left, right), ylim=(bottom, top))
     bare(axes)
     length = round_length(0.3 * (right - left))
-    place = (left + 0.04 * (right - left), bottom + 0.045 * (top - bottom))
-    scale_bar(axes, place, length, f"{length:g} mm", 0.02 * (top - bottom))
+    corner = (left + 0.04 * (right - left), bottom + 0.045 * (top - bottom))
+    scale_bar(axes, corner, length, f"{length:g} mm", 0.02 * (top - bottom))
     _axes_mark(axes)
 
 
@@ -321,8 +323,8 @@ def _overview(axes: Axes, facts: SceneFacts, sensor: Sensor, pose: Transform) ->
     axes.set_facecolor("white")
 
 
-def _pair(place: Floats) -> tuple[float, float]:
-    return float(place[0]), float(place[1])
+def _pair(point: Floats) -> tuple[float, float]:
+    return float(point[0]), float(point[1])
 
 
 def _axes_mark(axes: Axes) -> None:
@@ -346,13 +348,13 @@ def _features(facts: SceneFacts, colours: list[str], measured: Collection[str]) 
     handles: list[Patch | Line2D] = [
         Patch(facecolor=colours[i], edgecolor=MUTED, lw=0.5, label=_label(facts.shapes[i])) for i in named
     ]
-    if rest := len(colours) - len(named):
+    if grey := len(colours) - len(named):
         handles.append(
             Patch(
                 facecolor=OTHER_SHAPE,
                 edgecolor=MUTED,
                 lw=0.5,
-                label=f"{rest} {'not measured' if measured else 'more shapes'}",
+                label=f"{grey} {'not measured' if measured else 'more shapes'}",
             )
         )
     return handles

@@ -25,7 +25,7 @@ _NONE = "-"
 def as_text(
     facts: SceneFacts,
     visible: VisibleSurfaces,
-    found: Sequence[SceneFinding],
+    findings: Sequence[SceneFinding],
     measured: Sequence[str] = (),
     every: bool = False,
 ) -> str:
@@ -33,8 +33,8 @@ def as_text(
 
     Parameters
     ----------
-    facts, visible, found
-        About the scene: its shapes, what the sensor sees of them, and the findings.
+    facts, visible, findings
+        About the scene: its shapes, the surfaces that the sensor sees, and the findings.
     measured
         Names of the shapes that a task measures: they come first.
     every
@@ -43,7 +43,7 @@ def as_text(
     """
     features = [("feature", "material", "Ra um", "area mm2", "size mm", "from mm", "to mm", "triangles", "seen px")]
     materials = [("material", "Ra um", "alpha u, v", "1-sigma", "from")]
-    for number, shape in sorted(enumerate(facts.shapes), key=lambda one: one[1].name not in measured):
+    for number, shape in sorted(enumerate(facts.shapes), key=lambda item: item[1].name not in measured):
         material, roughness = _material(shape)
         low, high = shape.bounds
         pixels = int(((visible.shape == number) & visible.front & visible.seen_by_all).sum())
@@ -66,21 +66,23 @@ def as_text(
             materials.append(row)
     kept = len(features) if every else 1 + max(sum(shape.name in measured for shape in facts.shapes), MOST_ROWS)
     more = [f"and {len(features) - kept} more shapes; --all lists them"] if len(features) > kept else []
-    told = found if every else _joined(found)
+    told = findings if every else _joined(findings)
     lines = [*aligned(features[:kept]), *more, "", *aligned(materials), "", *map(str, told)]
-    return "\n".join(lines if found else [*lines, "no problems found"])
+    return "\n".join(lines if findings else [*lines, "no problems found"])
 
 
-def _joined(found: Sequence[SceneFinding]) -> list[SceneFinding]:
-    """Return warnings and notes that differ only in what they are about as one, in the place of the first."""
+def _joined(findings: Sequence[SceneFinding]) -> list[SceneFinding]:
+    """Merge warnings and notes that differ only in the shapes they are about; each stands where its first stood."""
     about: dict[tuple[Any, ...], list[str]] = {}
-    for one in found:
-        alone = one.about if one.severity == "error" else None
-        about.setdefault((one.severity, one.what, one.advice, alone), []).append(one.about)
-    return [SceneFinding(severity, named(names), what, advice) for (severity, what, advice, _), names in about.items()]
+    for finding in findings:
+        alone = finding.about if finding.severity == "error" else None
+        about.setdefault((finding.severity, finding.what, finding.advice, alone), []).append(finding.about)
+    return [
+        SceneFinding(severity, named(names), words, advice) for (severity, words, advice, _), names in about.items()
+    ]
 
 
-def as_data(facts: SceneFacts, visible: VisibleSurfaces, found: Sequence[SceneFinding]) -> dict[str, Any]:
+def as_data(facts: SceneFacts, visible: VisibleSurfaces, findings: Sequence[SceneFinding]) -> dict[str, Any]:
     """Return the same as data; lengths in mm, null without a value."""
     shapes = []
     for number, shape in enumerate(facts.shapes):
@@ -111,7 +113,7 @@ def as_data(facts: SceneFacts, visible: VisibleSurfaces, found: Sequence[SceneFi
         "bounds_mm": facts.bounds.tolist(),
         "features": shapes,
         "emitters": [{"type": kind, "flux_w": or_none(flux)} for kind, flux in facts.emitters],
-        "findings": [asdict(finding) for finding in found],
+        "findings": [asdict(finding) for finding in findings],
     }
 
 

@@ -47,12 +47,12 @@ def set_result(entry: ViewSetEntry) -> SetResult:
         return SetResult((Reason(words), *out_of_reach), not out_of_reach)
     missed, often = list[Reason](), list[Reason]()
     for name, limit in limits.items():
-        one = entry.confirmed.get(name)
-        error = _error(one)
-        if one is None or not reached[name] or not error <= limit:
-            missed.append(Reason(_missed(one, error, limit, reached[name]), (name,)))
-        elif one.without_value >= OFTEN:
-            share = f"{100 * one.without_value:.0f} % of the virtual measurements"
+        confirmed = entry.confirmed.get(name)
+        error = _error(confirmed)
+        if confirmed is None or not reached[name] or not error <= limit:
+            missed.append(Reason(_missed(confirmed, error, limit, reached[name]), (name,)))
+        elif confirmed.without_value >= OFTEN:
+            share = f"{100 * confirmed.without_value:.0f} % of the virtual measurements"
             often.append(Reason(f": no value in {share}", (name,)))
     words = f"{which}, measured together, keeps {len(limits) - len(missed)} of {len(limits)} limits"
     return SetResult((Reason(words), *missed, *often), not missed)

@@ -32,7 +32,7 @@ _PICTURE = 3.4
 #: height of the lines to sign [in]
 _SIGNATURE = 0.9
 
-#: what only the user knows, to be written by hand
+#: facts that only the user knows, to be written by hand
 _TO_FILL_IN = (
     ("Part: drawing number and revision", "Sensor: serial number, date of its calibration", "Valid until"),
     ("Place and date", "Name, organisation", "Signature"),
@@ -145,9 +145,9 @@ def sheet_figures(declaration: Declaration, geometry: SceneGeometry | None) -> l
             _table(page, _taken(rows, page.room, columns) or [rows.pop(0) for _ in rows[:1]], columns)
         _facts(page, declaration, layout.facts)
         _sign(page)
-        for number, one in enumerate(pages, 1):
-            _foot(one, number, len(pages))
-    return [one.figure for one in pages]
+        for number, sheet_page in enumerate(pages, 1):
+            _foot(sheet_page, number, len(pages))
+    return [sheet_page.figure for sheet_page in pages]
 
 
 def _taken(rows: list[DeclaredRow], room: float, columns: Columns) -> list[DeclaredRow]:
@@ -186,10 +186,10 @@ def _result(first: FirstScreen, lines: int) -> str:
 
 def _cells(row: DeclaredRow) -> list[str]:
     result = row.result
-    known = result.tolerance != NONE
+    toleranced = result.tolerance != NONE
     return [
         result.name,
-        result.tolerance if known else "none",
+        result.tolerance if toleranced else "none",
         row.bias,
         result.uncertainty,
         row.expanded,
@@ -208,7 +208,7 @@ def _about(row: DeclaredRow) -> str:
 
 
 def _name_lines(row: DeclaredRow, columns: Columns) -> tuple[list[str], list[str], bool]:
-    """Return the lines of a row's name and of what it is, and whether the latter follows the former in its line."""
+    """Return the lines of a row's name and of its description, and whether they stand on one line."""
     across = ACROSS if columns.above else columns.widths[0]
     names = wrapped(row.result.name, columns.size, across, "bold")
     wide = text_width(row.result.name, columns.size, "bold") + GAP + text_width(_about(row), _small(columns))

@@ -28,7 +28,7 @@ _LINES = ("-", "--", ":", "-.")
 #: distance at which the rays of a cloud are projected into the image [mm]; its origin is that of the camera
 _FAR_MM = 1000.0
 
-#: what a picture of the gallery shows dark
+#: meaning of dark pixels in a picture of the gallery
 _DARK = (
     "black in the image: no light returns, since there is nothing, a shadow of the projector, or a mirror that faces "
     "elsewhere"
@@ -36,7 +36,7 @@ _DARK = (
 
 
 def noise_figure(sheets: Sequence[DataSheet]) -> Figure:
-    """Draw sigma over distance on matt white, a panel for each sensor, with published values of others."""
+    """Draw sigma over distance on matt white, a panel for each sensor, with the values that others published."""
     with drawing():
         figure, panels = _panels(len(sheets), 3.4, 2.9)
         for sheet, axes in zip(sheets, panels, strict=False):
@@ -45,12 +45,14 @@ def noise_figure(sheets: Sequence[DataSheet]) -> Figure:
             spread = np.array([point.spread for point in sheet.noise])
             axes.loglog(distance, spread, "o-", color=BLUE, ms=4, lw=1.4, label="simulated, whole plate")
             axes.loglog(distance, sigma, "o", color=BLUE, ms=4, mfc="white", label="simulated, in discs of 113 px")
-            for style, known in zip(_LINES, sheet.sensor.published_noise, strict=False):
-                mark = {"marker": "D", "ls": "none", "ms": 5} if len(known.distance_mm) == 1 else {"ls": style}
-                source = textwrap.shorten(known.source.split(":")[0].split(" (")[0], 48, placeholder=" ...")
-                axes.loglog(known.distance_mm, known.sigma_mm, color=VERMILION, lw=1.1, label=source, **mark)  # type: ignore[arg-type]
+            for style, published in zip(_LINES, sheet.sensor.published_noise, strict=False):
+                mark = {"marker": "D", "ls": "none", "ms": 5} if len(published.distance_mm) == 1 else {"ls": style}
+                source = textwrap.shorten(published.source.split(":")[0].split(" (")[0], 48, placeholder=" ...")
+                axes.loglog(published.distance_mm, published.sigma_mm, color=VERMILION, lw=1.1, label=source, **mark)  # type: ignore[arg-type]
             axes.set(title=sheet.sensor.name, xlabel="distance [mm]", ylabel="sigma along V [mm]")
-            largest = np.nanmax([*spread, *(s for known in sheet.sensor.published_noise for s in known.sigma_mm)])
+            largest = np.nanmax(
+                [*spread, *(s for published in sheet.sensor.published_noise for s in published.sigma_mm)]
+            )
             axes.set_ylim(max(axes.get_ylim()[0], largest / 300), 2.5 * largest)
             axes.set_xticks([round(float(d)) for d in distance[::2]], [f"{d:.0f}" for d in distance[::2]])
             axes.minorticks_off()
@@ -64,16 +66,23 @@ def residual_figure(sheets: Sequence[DataSheet]) -> Figure:
     with drawing():
         figure, panels = _panels(len(sheets), 3.4, 2.6)
         for sheet, axes in zip(sheets, panels, strict=False):
-            found = sheet.residuals
-            spread = float(found.values.std())
-            if not len(found.values) or spread == 0:
+            residuals = sheet.residuals
+            spread = float(residuals.values.std())
+            if not len(residuals.values) or spread == 0:
                 continue
             reach = 4.5 * spread
-            axes.hist(found.values, bins=np.linspace(-reach, reach, 91).tolist(), density=True, color=BLUE, alpha=0.75)
+            axes.hist(
+                residuals.values, bins=np.linspace(-reach, reach, 91).tolist(), density=True, color=BLUE, alpha=0.75
+            )
             x = np.linspace(-reach, reach, 200)
             axes.plot(x, np.exp(-0.5 * (x / spread) ** 2) / (spread * math.sqrt(2 * math.pi)), color=INK, lw=0.9)
-            axes.set(yticks=[], xlabel="residual along V [mm]", title=f"{sheet.sensor.name}, {found.distance:.0f} mm")
-            label = f"kurtosis {found.excess_kurtosis:+.2f}\n{found.independent} independent: p = {found.p_normal:.2g}"
+            axes.set(
+                yticks=[], xlabel="residual along V [mm]", title=f"{sheet.sensor.name}, {residuals.distance:.0f} mm"
+            )
+            label = (
+                f"kurtosis {residuals.excess_kurtosis:+.2f}\n"
+                f"{residuals.independent} independent: p = {residuals.p_normal:.2g}"
+            )
             axes.text(0.02, 0.97, label, transform=axes.transAxes, va="top", fontsize=7, color=MUTED)
     return figure
 
@@ -112,9 +121,9 @@ def image_on_grid(capture: Capture, cloud: PointCloud) -> NDArray[np.float64]:
     image, camera = _brightest(capture), capture.rig.reference
     if image.shape != (camera.height, camera.width):  # a device's own map
         return image if image.shape == cloud.status.shape else np.full(cloud.status.shape, np.nan)
-    places = camera.project(cloud.grid.origin + _FAR_MM * cloud.grid.rays())
+    pixels = camera.project(cloud.grid.origin + _FAR_MM * cloud.grid.rays())
     return np.asarray(
-        map_coordinates(image, [places[..., 1], places[..., 0]], order=1, mode="constant", cval=math.nan), float
+        map_coordinates(image, [pixels[..., 1], pixels[..., 0]], order=1, mode="constant", cval=math.nan), float
     )
 
 
@@ -177,15 +186,15 @@ def _ratios(sheet: DataSheet) -> str:
         return "none in range"
     distance = np.log([point.distance for point in recovered])
     spread = np.log([point.spread for point in recovered])
-    found: list[float] = []
-    for known in sheet.sensor.published_noise:
-        places = np.log(known.distance_mm)
-        inside = (places >= distance[0] - 1e-6) & (places <= distance[-1] + 1e-6)
-        ours = np.interp(places, distance, spread)
-        found += np.exp(np.log(known.sigma_mm) - ours)[inside].tolist()
-    if not found:
+    ratios: list[float] = []
+    for published in sheet.sensor.published_noise:
+        published_distances = np.log(published.distance_mm)
+        inside = (published_distances >= distance[0] - 1e-6) & (published_distances <= distance[-1] + 1e-6)
+        ours = np.interp(published_distances, distance, spread)
+        ratios += np.exp(np.log(published.sigma_mm) - ours)[inside].tolist()
+    if not ratios:
         return "none in range"
-    low, high = two_digits(min(found)), two_digits(max(found))
+    low, high = two_digits(min(ratios)), two_digits(max(ratios))
     return low if low == high else f"{low} to {high}"
 
 
@@ -215,8 +224,8 @@ def _window_around(cloud: PointCloud) -> tuple[slice, slice]:
     if not len(rows):
         return slice(0, cloud.grid.height), slice(0, cloud.grid.width)
     cut = []
-    for places, size in ((rows, cloud.grid.height), (columns, cloud.grid.width)):
-        first, last = np.percentile(places, (1, 99))
+    for indices, size in ((rows, cloud.grid.height), (columns, cloud.grid.width)):
+        first, last = np.percentile(indices, (1, 99))
         beyond = 0.2 * (last - first) + 4
         cut.append(slice(max(0, int(first - beyond)), min(size, int(last + beyond) + 1)))
     return cut[0], cut[1]

@@ -176,8 +176,8 @@ class Columns:
     """Columns of a table as wide as their widest cell, at the largest size of text at which they fit a page.
 
     ``lefts`` [in] from the margin, ``widths`` [in], ``size`` [pt]. Cells of the first column wrap if they are wider
-    than ``first`` [in] and the others leave no more. Where one would wrap, all are ``above``: they have lines of their
-    own, over the other cells, which are a little to the right, and the first column has no head.
+    than ``first`` [in] and the other columns leave no more. Where one would wrap, all are ``above``: they have lines of
+    their own, over the other cells, which are a little to the right, and the first column has no head.
 
     Parameters
     ----------
@@ -190,7 +190,7 @@ class Columns:
 
     See Also
     --------
-    Page : what the table is written on
+    Page : the page of the table
     """
 
     def __init__(
@@ -210,11 +210,11 @@ class Columns:
                 max(text_width(line, size, "bold") for line in (*(row[k] for row in rows), *head))
                 for k, head in enumerate(heads)
             ]
-            rest = sum(self.widths[1:]) + GAP * (len(heads) - 1)
-            if min(self.widths[0], first) + rest <= ACROSS:
+            remaining_width = sum(self.widths[1:]) + GAP * (len(heads) - 1)
+            if min(self.widths[0], first) + remaining_width <= ACROSS:
                 break
-        self.widths[0] = max(min(self.widths[0], ACROSS - rest), first / 2)
-        spare = max(0.0, ACROSS - self.widths[0] - rest) / max(len(heads) - 1, 1)
+        self.widths[0] = max(min(self.widths[0], ACROSS - remaining_width), first / 2)
+        spare = max(0.0, ACROSS - self.widths[0] - remaining_width) / max(len(heads) - 1, 1)
         self.lefts = [0.0]
         for width in self.widths[:-1]:
             self.lefts.append(self.lefts[-1] + width + GAP + spare)

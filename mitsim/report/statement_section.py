@@ -98,14 +98,14 @@ def exposed_in_words(exposure_entry: ExposureEntry | None) -> str:
 
 
 def _row(name: str, measurement: StatedMeasurement) -> dict[str, str]:
-    known = measurement.bias is not None and measurement.standard_uncertainty is not None
+    has_value = measurement.bias is not None and measurement.standard_uncertainty is not None
     return {
         "name": name,
         "bias": bias_words(measurement.bias, measurement.bias_uncertainty, measurement.unit),
         "bias_uncertainty": quantity(measurement.bias_uncertainty, measurement.unit),
         "uncertainty": quantity(measurement.standard_uncertainty, measurement.unit),
         "uncorrected": quantity(
-            math.hypot(measurement.bias or 0, measurement.standard_uncertainty or 0) if known else None,
+            math.hypot(measurement.bias or 0, measurement.standard_uncertainty or 0) if has_value else None,
             measurement.unit,
         ),
         "interval": interval_words(measurement.interval, measurement.unit),

@@ -65,13 +65,13 @@ def validation_table(table: xr.Dataset) -> str:
     ]
     kept = within_limits(table)
     for row in range(table.sizes["row"]):
-        one = {str(name): values.values[row] for name, values in table.data_vars.items()}
-        name = finish_name(str(one["finish"]), float(one["roughness"]))
+        cells = {str(name): values.values[row] for name, values in table.data_vars.items()}
+        name = finish_name(str(cells["finish"]), float(cells["roughness"]))
         lines.append(
-            f"| {name} | {one['distance']:g} | {one['captures']} | {one['fraction_residual']:.3f} "
-            f"({one['fraction_floor']:.3f}) | {one['fraction_bias']:+.3f} | {100 * one['sigma_residual']:.1f} % "
-            f"({100 * one['sigma_floor']:.1f}) | {100 * one['sigma_bias']:+.1f} % | "
-            f"{100 * one['sigma_residual_captures']:.1f} % | {one['wasserstein']:.3f} | "
+            f"| {name} | {cells['distance']:g} | {cells['captures']} | {cells['fraction_residual']:.3f} "
+            f"({cells['fraction_floor']:.3f}) | {cells['fraction_bias']:+.3f} | {100 * cells['sigma_residual']:.1f} % "
+            f"({100 * cells['sigma_floor']:.1f}) | {100 * cells['sigma_bias']:+.1f} % | "
+            f"{100 * cells['sigma_residual_captures']:.1f} % | {cells['wasserstein']:.3f} | "
             f"{'yes' if kept[row] else 'no'} |"
         )
     return "\n".join(lines) + "\n"

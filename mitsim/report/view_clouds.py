@@ -79,11 +79,11 @@ class CoordinateRaster:
 
 def box_around(clouds: Iterable[Floats]) -> CoordinateRaster:
     """Return the raster that encloses all points (n, 3) [mm]."""
-    known = [places for places in clouds if len(places)]
-    if not known:
+    filled = [points for points in clouds if len(points)]
+    if not filled:
         return CoordinateRaster(np.zeros(3), 1.0)
-    low = np.min([places.min(axis=0) for places in known], axis=0)
-    high = np.max([places.max(axis=0) for places in known], axis=0)
+    low = np.min([points.min(axis=0) for points in filled], axis=0)
+    high = np.max([points.max(axis=0) for points in filled], axis=0)
     return CoordinateRaster(low, max(float((high - low).max()), 1e-6) / LAST_STEP)
 
 
@@ -98,9 +98,9 @@ def choose_clouds(scores: xr.Dataset, available: Sequence[int], first: Sequence[
     by_rank = np.argsort(np.concatenate(ranks), axis=1, kind="stable").T.ravel()
     wanted = dict.fromkeys([*first, *numbers[by_rank[: 10 * 2 * scores.sizes["measurement"]]].tolist()])
     chosen = [view for view in wanted if view in set(available)][:MOST_CLOUDS]
-    rest = [view for view in available if view not in set(chosen)]
-    more = min(MOST_CLOUDS - len(chosen), len(rest))
-    return sorted(chosen + [rest[i * len(rest) // more] for i in range(more)])
+    candidates = [view for view in available if view not in set(chosen)]
+    more = min(MOST_CLOUDS - len(chosen), len(candidates))
+    return sorted(chosen + [candidates[i * len(candidates) // more] for i in range(more)])
 
 
 def shown_cloud(cloud: PointCloud, part_from_sensor: Floats, features: Sequence[str], most: int) -> ShownCloud:
@@ -145,10 +145,10 @@ def shown_cloud(cloud: PointCloud, part_from_sensor: Floats, features: Sequence[
 
 def noise_ends(clouds: Mapping[int, ShownCloud]) -> tuple[float, float] | None:
     """Return the ends [mm] of the colour scale of noise; None if no cloud has a noise."""
-    known = np.concatenate([np.empty(0), *(cloud.sigma[cloud.sigma > 0] for cloud in clouds.values())])
-    if not len(known):
+    sigmas = np.concatenate([np.empty(0), *(cloud.sigma[cloud.sigma > 0] for cloud in clouds.values())])
+    if not len(sigmas):
         return None
-    low, high = np.percentile(known, NOISE_PERCENTILES)
+    low, high = np.percentile(sigmas, NOISE_PERCENTILES)
     return (float(low), float(high)) if high > low else (float(low) / 1.1, float(low) * 1.1)
 
 
@@ -156,9 +156,9 @@ def packed_cloud(cloud: ShownCloud, box: CoordinateRaster, ends: tuple[float, fl
     """Return base64 of planes x, y, z (steps of the box), noise (0 to 254, log of ``ends`` [mm]), feature."""
     noise = np.full(len(cloud.sigma), UNKNOWN, np.uint8)
     if ends is not None:
-        known = cloud.sigma > 0
-        share = np.log(cloud.sigma[known] / ends[0]) / math.log(ends[1] / ends[0])
-        noise[known] = np.rint(np.clip(share, 0, 1) * (UNKNOWN - 1)).astype(np.uint8)
+        valid = cloud.sigma > 0
+        share = np.log(cloud.sigma[valid] / ends[0]) / math.log(ends[1] / ends[0])
+        noise[valid] = np.rint(np.clip(share, 0, 1) * (UNKNOWN - 1)).astype(np.uint8)
     feature = np.where((cloud.feature < 0) | (cloud.feature >= UNKNOWN), UNKNOWN, cloud.feature).astype(np.uint8)
     return packed(box.steps(cloud.points).T.tobytes() + noise.tobytes() + feature.tobytes())
 

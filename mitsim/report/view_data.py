@@ -93,15 +93,15 @@ _BY_MEASUREMENT = {
 
 def _measurement(run: Run, name: str) -> dict[str, Any]:
     here, entry = run.scores.sel(measurement=name), run.about.measurements[name]
-    known = [str(feature) for feature in run.scores["feature"].values]
-    found = agreement(run.scores, run.checks, name)
-    errors = zip(found.views.tolist(), _numbers(found.error), strict=True)
+    features = [str(feature) for feature in run.scores["feature"].values]
+    comparison = agreement(run.scores, run.checks, name)
+    errors = zip(comparison.views.tolist(), _numbers(comparison.error), strict=True)
     return {
         "name": name,
         "unit": entry.unit,
         "nominal": entry.nominal,
         "tolerance": _numbers(here["tolerance"].values),
-        "features": [known.index(feature) for feature in entry.faces if feature in known],
+        "features": [features.index(feature) for feature in entry.faces if feature in features],
         "able": here["uncertainty_possible"].values.astype(int).tolist(),
         "possible": here["possible"].values.astype(int).tolist(),
         "limit": here["limit"].values.astype(str).tolist(),
@@ -160,14 +160,14 @@ def solids(run: Run) -> tuple[list[tuple[int, Markup]], dict[str, Any]]:
 
 def _colours(name: str) -> list[str]:
     """Return a colour scale from bad to good; good is bright."""
-    return [to_hex(matplotlib.colormaps[name](float(place))) for place in np.linspace(0, 1, _STOPS)]
+    return [to_hex(matplotlib.colormaps[name](float(level))) for level in np.linspace(0, 1, _STOPS)]
 
 
 def _numbers(values: ArrayLike, digits: int = 5) -> Any:
-    """Return nested lists of numbers with ``digits`` significant digits; None for what is not finite."""
+    """Return nested lists of numbers with ``digits`` significant digits; None for numbers that are not finite."""
     array = np.asarray(values, float)
     if array.ndim:
-        return [_numbers(one, digits) for one in array]
+        return [_numbers(item, digits) for item in array]
     value = float(array)
     if not math.isfinite(value):
         return None

@@ -41,10 +41,10 @@ def uncertainty_limits(uncertainty: Floats) -> tuple[float, float]:
 
     The scale runs from the least u to the 90th percentile, so that a few hopeless views do not compress it.
     """
-    known = np.sort(uncertainty[uncertainty > 0])
-    if not len(known):
+    values = np.sort(uncertainty[uncertainty > 0])
+    if not len(values):
         return 0.1, 1.0
-    low, high = float(known[0]), float(known[math.ceil(0.9 * (len(known) - 1))])
+    low, high = float(values[0]), float(values[math.ceil(0.9 * (len(values) - 1))])
     return (low, high) if high > low else (low / 1.2, low * 1.2)
 
 
@@ -69,14 +69,14 @@ def uncertainty_figure(scores: xr.Dataset, measurement: str, unit: str, checked:
     worst_first = np.argsort(-scores["uncertainty_rank"].sel(measurement=measurement).values, kind="stable")
     scores = scores.isel(view=worst_first)
     here = scores.sel(measurement=measurement)
-    places, rolls, numbers = view_places(scores), scores["roll_deg"].values, scores["view"].values
+    positions, rolls, numbers = view_places(scores), scores["roll_deg"].values, scores["view"].values
     if one_disc := len(np.unique(rolls)) > _MOST_ROLLS:
         rolls = np.zeros_like(rolls)
     u, possible = here["predicted_uncertainty"].values, here["uncertainty_possible"].values
-    reach = 1.06 * max(float(np.linalg.norm(places, axis=1).max()), 0.5)
+    reach = 1.06 * max(float(np.linalg.norm(positions, axis=1).max()), 0.5)
     norm, colours = LogNorm(*uncertainty_limits(u[possible])), f"{SEQUENTIAL}_r"
     every = np.unique(rolls)
-    size = 5200 / max(len(places) / len(every), 20)  # so that neighbours do not touch
+    size = 5200 / max(len(positions) / len(every), 20)  # so that neighbours do not touch
     with drawing():
         figure = Figure((max(2.75 * len(every), 4.6), 3.75), layout="constrained")
         grid = np.asarray(figure.subplots(1, len(every), squeeze=False))
@@ -84,12 +84,12 @@ def uncertainty_figure(scores: xr.Dataset, measurement: str, unit: str, checked:
             disc(axes, reach)
             sphere_of_views(axes, reach)
             at, no = (rolls == roll) & possible, (rolls == roll) & ~possible
-            axes.scatter(*places[no].T, marker="x", s=size * 0.3, c=MUTED, lw=0.8, zorder=3)
-            axes.scatter(*places[at].T, c=u[at], norm=norm, cmap=colours, s=size, lw=0.4, ec=MUTED, zorder=4)
+            axes.scatter(*positions[no].T, marker="x", s=size * 0.3, c=MUTED, lw=0.8, zorder=3)
+            axes.scatter(*positions[at].T, c=u[at], norm=norm, cmap=colours, s=size, lw=0.4, ec=MUTED, zorder=4)
             dots = (rolls == roll) & np.isin(numbers, checked)
-            axes.scatter(*places[dots].T, marker="D", s=size * 1.15, fc="none", ec=INK, lw=0.9, zorder=5)
+            axes.scatter(*positions[dots].T, marker="D", s=size * 1.15, fc="none", ec=INK, lw=0.9, zorder=5)
             if best is not None and roll == rolls[numbers == best][0]:
-                ring = places[numbers == best]
+                ring = positions[numbers == best]
                 axes.scatter(*ring.T, s=size * 3.2, fc="none", ec=VERMILION, lw=2.0, zorder=6)
             axes.set_title("all rolls" if one_disc else f"roll {signed(f'{roll:g}')}°", pad=12)
         extend = "max" if (u[possible] > norm.vmax).any() else "neither"
@@ -127,15 +127,15 @@ def sphere_of_views(axes: Axes, reach: float) -> None:
         )
 
 
-def agreement_figure(found: Agreement, unit: str) -> Figure:
+def agreement_figure(agreement: Agreement, unit: str) -> Figure:
     """Draw the true error of the checked views over the predicted standard uncertainty, and over the view score."""
     with drawing():
         figure = Figure((5.6, 3.5), layout="constrained")
         left, right = figure.subplots(1, 2, sharey=True)
-        band = _error_axis(left, found, unit)
+        band = _error_axis(left, agreement, unit)
         failed_at = math.sqrt(band[0] * band[1])
-        known = np.isfinite(found.uncertainty) & (found.uncertainty > 0)
-        scale = found.uncertainty[known] if known.any() else np.array([0.1, 1.0])
+        has_uncertainty = np.isfinite(agreement.uncertainty) & (agreement.uncertainty > 0)
+        scale = agreement.uncertainty[has_uncertainty] if has_uncertainty.any() else np.array([0.1, 1.0])
         ends = np.array([scale.min() / 1.5, scale.max() * 1.5])
         left.set_xscale("log")
         left.set_xlim(*ends)
@@ -143,22 +143,22 @@ def agreement_figure(found: Agreement, unit: str) -> Figure:
             left.plot(ends, k * ends, color=MUTED, lw=1.0, ls=style, label=name, zorder=1)[0]
             for k, style, name in ((1, "-", "error = u"), (2, "--", "error = 2 u"))
         ]
-        _errors(left, np.where(known, found.uncertainty, np.nan), found, failed_at)
+        _errors(left, np.where(has_uncertainty, agreement.uncertainty, np.nan), agreement, failed_at)
         left.set_xlabel(f"predicted standard uncertainty u [{unit}]")
         for axis in (left.xaxis, left.yaxis):
             plain_log(axis)
-        missing, unknown = len(found.views) - found.count, int((~known).sum())
+        missing, unknown = len(agreement.views) - agreement.count, int((~has_uncertainty).sum())
         notes = [f"{missing} without a value"] * bool(missing) + [f"{unknown} without u"] * bool(unknown)
-        left.set_title("\n".join([f"{_rank(found.spearman)}, n = {found.count}", *notes]))
+        left.set_title("\n".join([f"{_rank(agreement.spearman)}, n = {agreement.count}", *notes]))
 
         right.axhspan(*band, color=FIELD, lw=0, zorder=0)
-        _errors(right, found.score, found, failed_at)
+        _errors(right, agreement.score, agreement, failed_at)
         right.set_xlabel("view score Vₘ [1]")
-        highest = max(float(found.score.max(initial=0.0)), 0.1)
+        highest = max(float(agreement.score.max(initial=0.0)), 0.1)
         right.set_xlim(1.06 * highest, -0.04 * highest)  # as on the left, better views are on the left
-        right.set_title(_rank(found.score_spearman))
+        right.set_title(_rank(agreement.score_spearman))
         handles = [Line2D([], [], marker="o", ls="none", color=BLUE, ms=5, label="mean of repeats; bar: min to max")]
-        if (np.isfinite(found.error) & (found.failed > 0)).any():
+        if (np.isfinite(agreement.error) & (agreement.failed > 0)).any():
             handles.append(
                 Line2D([], [], marker="o", ls="none", mec=BLUE, mfc="none", ms=5, label="some repeats failed")
             )
@@ -173,11 +173,11 @@ def _rank(spearman: float) -> str:
     return f"Spearman {rounded(spearman, 2)}" if math.isfinite(spearman) else "no rank correlation"
 
 
-def _error_axis(axes: Axes, found: Agreement, unit: str) -> tuple[float, float]:
+def _error_axis(axes: Axes, agreement: Agreement, unit: str) -> tuple[float, float]:
     """Format the logarithmic axis of |error|; return the band at the top that holds failed measurements."""
-    known = np.concatenate([found.least, found.most])
-    known = known[np.isfinite(known) & (known > 0)]
-    low, high = (known.min() / 1.5, known.max() * 1.5) if len(known) else (0.1, 1.0)
+    errors = np.concatenate([agreement.least, agreement.most])
+    errors = errors[np.isfinite(errors) & (errors > 0)]
+    low, high = (errors.min() / 1.5, errors.max() * 1.5) if len(errors) else (0.1, 1.0)
     axes.set_yscale("log")
     decades = math.log10(high / low)
     top = float(high * 10 ** (0.12 * decades))
@@ -189,12 +189,12 @@ def _error_axis(axes: Axes, found: Agreement, unit: str) -> tuple[float, float]:
     return float(high), top
 
 
-def _errors(axes: Axes, x: NDArray[np.float64], found: Agreement, failed_at: float) -> None:
+def _errors(axes: Axes, x: NDArray[np.float64], agreement: Agreement, failed_at: float) -> None:
     at = np.isfinite(x)
-    measured, failed = at & np.isfinite(found.error), at & ~np.isfinite(found.error)
-    axes.vlines(x[measured], found.least[measured], found.most[measured], color=BLUE, lw=1.0, zorder=2)
-    whole = measured & (found.failed == 0)
-    axes.plot(x[whole], found.error[whole], "o", color=BLUE, ms=5, zorder=3)
-    part = measured & (found.failed > 0)
-    axes.plot(x[part], found.error[part], "o", mec=BLUE, mfc=PAPER, ms=5, zorder=3)
+    measured, failed = at & np.isfinite(agreement.error), at & ~np.isfinite(agreement.error)
+    axes.vlines(x[measured], agreement.least[measured], agreement.most[measured], color=BLUE, lw=1.0, zorder=2)
+    whole = measured & (agreement.failed == 0)
+    axes.plot(x[whole], agreement.error[whole], "o", color=BLUE, ms=5, zorder=3)
+    part = measured & (agreement.failed > 0)
+    axes.plot(x[part], agreement.error[part], "o", mec=BLUE, mfc=PAPER, ms=5, zorder=3)
     axes.plot(x[failed], np.full(failed.sum(), failed_at), "X", color=VERMILION, mec="none", ms=6, zorder=3)

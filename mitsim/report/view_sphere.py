@@ -67,8 +67,8 @@ def _rows(run: Run, name: str) -> list[dict[str, str]]:
     rows = list[dict[str, str]]()
     for rank, i in enumerate(findings.ranked_views(run.scores, name)[:TOP], 1):
         pose = pose_of_view(run, int(numbers[i]))
-        own = {"rank": str(rank), "standoff": rounded(pose.standoff_mm)}
-        rows.append(pose_texts(pose) | expected_texts(run, name, pose.view) | own)
+        texts = {"rank": str(rank), "standoff": rounded(pose.standoff_mm)}
+        rows.append(pose_texts(pose) | expected_texts(run, name, pose.view) | texts)
     return rows
 
 
@@ -93,19 +93,19 @@ def _set_words(run: Run, entry: ViewSetEntry) -> dict[str, Any]:
 
 def _tried_words(tried: TriedEntry) -> str:
     """Describe a set that was measured and not chosen."""
-    how = "a measurement without a value" if tried.excess is None else f"{two_digits(tried.excess)} times a limit"
+    excess = "a measurement without a value" if tried.excess is None else f"{two_digits(tried.excess)} times a limit"
     views = f"{len(tried.views)} view{'s' if len(tried.views) > 1 else ''} ({', '.join(map(str, tried.views))})"
-    return f"also measured: {views}, {how}"
+    return f"also measured: {views}, {excess}"
 
 
 def _confirmed_words(entry: ViewSetEntry, name: str) -> str:
     """Describe the result of the virtual measurements of the set."""
-    one = entry.confirmed.get(name)
-    if one is None:
+    confirmed = entry.confirmed.get(name)
+    if confirmed is None:
         return ""
-    if one.bias is None or one.standard_uncertainty is None:
+    if confirmed.bias is None or confirmed.standard_uncertainty is None:
         return "; measured together it has no value"
-    found = quantity(one.standard_uncertainty, one.unit)
-    lost = f", no value in {percent(one.without_value)}" if one.without_value > 0 else ""
-    bias = bias_words(one.bias, one.standard_uncertainty, one.unit)
-    return f"; measured together {one.trials} times: {found}, bias {bias}{lost}"
+    uncertainty = quantity(confirmed.standard_uncertainty, confirmed.unit)
+    lost = f", no value in {percent(confirmed.without_value)}" if confirmed.without_value > 0 else ""
+    bias = bias_words(confirmed.bias, confirmed.standard_uncertainty, confirmed.unit)
+    return f"; measured together {confirmed.trials} times: {uncertainty}, bias {bias}{lost}"

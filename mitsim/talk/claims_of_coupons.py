@@ -1,4 +1,4 @@
-"""State the claims of the talk's slides on flat coupons, with the figures that were found."""
+"""State the claims of the talk's slides on flat coupons, with the figures of the results."""
 
 from __future__ import annotations
 
@@ -55,27 +55,28 @@ def coupons(talk: Talk, results: Results) -> list[Slide]:
     collection, processing = Slide("Data Collection"), Slide("Point Cloud Processing")
     maps = Slide(f"Results – {talk.sensor.name}")
     normal = blinding_normal(talk.sensor, talk.file.coupons.distance_mm)
-    blinding = tuple(float(one[0]) for one in figures.gradient(normal[:1], normal[1:2]))
-    found = collected(results, {name: name for name in ("characterised", "sub_clouds", "tilts")}, collection)
-    if len(found) == 3:
-        poses, tilts = found["characterised"], found["tilts"]
-        picture = figures.collection_figure(poses, found["sub_clouds"], tilts, (blinding[0], blinding[1]))
+    blinding = tuple(float(component[0]) for component in figures.gradient(normal[:1], normal[1:2]))
+    datasets = collected(results, {name: name for name in ("characterised", "sub_clouds", "tilts")}, collection)
+    if len(datasets) == 3:
+        poses, tilts = datasets["characterised"], datasets["tilts"]
+        picture = figures.collection_figure(poses, datasets["sub_clouds"], tilts, (blinding[0], blinding[1]))
         words = "Poses in gradient space, a cloud cut into sub-clouds, and the projected area of these over the tilt"
         collection.pictures["collection"] = (picture, words)
         collection.claims.extend([_density(poses, normal), _area(tilts)])
-    if "tilts" in found:
+    if "tilts" in datasets:
         words = "F by three definitions, and sigma along V and along N, over the tilt"
-        processing.pictures["processing"] = (figures.processing_figure(found["tilts"]), words)
-        processing.claims.extend(_processing(found["tilts"]))
+        processing.pictures["processing"] = (figures.processing_figure(datasets["tilts"]), words)
+        processing.claims.extend(_processing(datasets["tilts"]))
     else:
         processing.missing.append("tilts")
-    if "characterised" in found:
-        one = found["characterised"]
+    if "characterised" in datasets:
+        dataset = datasets["characterised"]
         words = (
-            f"Samples, F and sigma of Ra {one.attrs['Ra_um']:g} at {one.attrs['distance_mm']:g} mm in gradient space"
+            f"Samples, F and sigma of Ra {dataset.attrs['Ra_um']:g} at {dataset.attrs['distance_mm']:g} mm in gradient "
+            "space"
         )
-        maps.pictures["results"] = (figures.results_figure(one, (blinding[0], blinding[1])), words)
-        maps.claims.append(_regions(one, normal))
+        maps.pictures["results"] = (figures.results_figure(dataset, (blinding[0], blinding[1])), words)
+        maps.claims.append(_regions(dataset, normal))
     else:
         maps.missing.append("characterised")
     return [collection, processing, maps]
@@ -121,8 +122,8 @@ def _area(tilts: xr.Dataset) -> Claim:
 
 def _processing(tilts: xr.Dataset) -> list[Claim]:
     along_ray, along_normal = (tilts[name].values.astype(float) for name in ("along_ray", "along_normal"))
-    known = np.isfinite(along_ray)
-    first, last = np.flatnonzero(known)[[0, -1]]
+    valid = np.isfinite(along_ray)
+    first, last = np.flatnonzero(valid)[[0, -1]]
     ray, normal = along_ray[last] / along_ray[first], along_normal[last] / along_normal[first]
     pixels, density, reference = (
         tilts[f"fraction_{name}"].values.astype(float) for name in ("pixels", "density", "reference")
@@ -191,11 +192,11 @@ def validation(talk: Talk, results: Results) -> Slide:
     for ra in rough:
         for distance in table.validated_distances_mm:
             name = validation_name(ra, distance)
-            one = results.get(name)
-            if one is None:
+            residuals = results.get(name)
+            if residuals is None:
                 slide.missing.append(name)
             else:
-                cells.append(("matt white" if ra is None else f"Ra {ra:g}", distance, one))
+                cells.append(("matt white" if ra is None else f"Ra {ra:g}", distance, residuals))
     clouds = collected(results, {"clouds": "clouds"}, slide)
     if not cells or not clouds:
         return slide
@@ -209,7 +210,7 @@ def validation(talk: Talk, results: Results) -> Slide:
     good = {name: largest_of(values) < _LIMIT for name, values in worst.items()}
     last = list(good)[-1]
     floor = largest_of([float(dataset["sigma_floor"]) for n, _, dataset in cells if n == last])
-    others = [good[name] for name in good if name != last]
+    duller = [good[name] for name in good if name != last]
     slide.claims.append(
         Claim(
             "Residual absolute mean error is less than 10 % for all but the shiniest surface.",
@@ -217,7 +218,7 @@ def validation(talk: Talk, results: Results) -> Slide:
             + "; ".join(f"{name} {100 * f:.1f} % and {100 * s:.1f} %" for name, (f, s) in worst.items())
             + f". For {last}, {100 * floor:.1f} % of σ follow from few points alone.",
             f"{sum(good.values())} of {len(good)} samples below 10 %",
-            verdict(all(others), any(others)),
+            verdict(all(duller), any(duller)),
             f"{last} stays below the limit too: a single coupon sees no other surface." if good[last] else "",
             "validation",
         )
@@ -236,11 +237,11 @@ def _multiple_reflections(talk: Talk, results: Results, slide: Slide) -> None:
         for sample in talk.file.samples
         for light in ("direct", "all")
     }
-    found = {key: results.get(name) for key, name in names.items()}
-    slide.missing.extend(names[key] for key, dataset in found.items() if dataset is None)
+    datasets = {key: results.get(name) for key, name in names.items()}
+    slide.missing.extend(names[key] for key, dataset in datasets.items() if dataset is None)
     pairs: dict[str, tuple[xr.Dataset, xr.Dataset]] = {}
     for sample in talk.file.samples:
-        direct, every = found[sample.name, "direct"], found[sample.name, "all"]
+        direct, every = datasets[sample.name, "direct"], datasets[sample.name, "all"]
         if direct is not None and every is not None:
             pairs[sample.name] = (direct, every)
     if not pairs:

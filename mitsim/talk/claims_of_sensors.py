@@ -1,4 +1,4 @@
-"""State the claims of the talk's slides on surfaces, noise and maps, with the figures that were found."""
+"""State the claims of the talk's slides on surfaces, noise and maps, with the figures of the results."""
 
 from __future__ import annotations
 
@@ -24,22 +24,23 @@ _GAUSSIAN = 0.05
 def surfaces(talk: Talk, results: Results) -> Slide:
     """Return slide *Measuring Challenging Surfaces*."""
     slide = Slide("Measuring Challenging Surfaces")
-    found = collected(results, {finish.name: f"finish_{finish.key}" for finish in talk.file.finishes}, slide)
-    if not found:
+    datasets = collected(results, {finish.name: f"finish_{finish.key}" for finish in talk.file.finishes}, slide)
+    if not datasets:
         return slide
     slide.pictures["surfaces"] = (
-        figures.surfaces_figure(found),
-        f"The artefact in {listed(list(found))} before {talk.sensor.name}: image, cloud, and why pixels lack a point",
+        figures.surfaces_figure(datasets),
+        f"The artefact in {listed(list(datasets))} before {talk.sensor.name}: image, cloud, and why pixels lack a "
+        "point",
     )
-    shares = {name: figures.share(dataset) for name, dataset in found.items()}
+    shares = {name: figures.share(dataset) for name, dataset in datasets.items()}
     by_feature = {
         name: (dataset["points"] / dataset["possible"].where(dataset["possible"] >= 100)).values
-        for name, dataset in found.items()
+        for name, dataset in datasets.items()
     }
     spread = largest_of([largest_of(values) + largest_of(-values) for values in by_feature.values()])
-    known = map_in(talk.folder, talk.map_name)
-    ends = known.data["distance"].values[[0, -1]]
-    near, far = (_noise_at(known, distance) for distance in ends)
+    performance_map = map_in(talk.folder, talk.map_name)
+    ends = performance_map.data["distance"].values[[0, -1]]
+    near, far = (_noise_at(performance_map, distance) for distance in ends)
     values = list(shares.values())
     slide.claims.append(
         Claim(
@@ -54,28 +55,28 @@ def surfaces(talk: Talk, results: Results) -> Slide:
     return slide
 
 
-def _noise_at(known: PerformanceMap, distance: float) -> float:
+def _noise_at(performance_map: PerformanceMap, distance: float) -> float:
     """Return the mean sigma [mm] of the roughest metal of a map at 25 deg, over all azimuths."""
     turn = np.linspace(0, 2 * math.pi, 73)[:-1]
     normals = np.stack(
         [math.sin(0.436) * np.cos(turn), math.sin(0.436) * np.sin(turn), np.full(72, math.cos(0.436))], 1
     )
-    finish, rough = max(((f, r) for f, r in known.samples if not math.isnan(r)), key=lambda one: one[1])
-    return mean_of(known.query(finish, rough, distance, normals).sigma)
+    finish, rough = max(((f, r) for f, r in performance_map.samples if not math.isnan(r)), key=lambda sample: sample[1])
+    return mean_of(performance_map.query(finish, rough, distance, normals).sigma)
 
 
 def noise(talk: Talk, results: Results) -> Slide:
     """Return slide *Noise Distributions*."""
     slide = Slide("Noise Distributions")
-    found = collected(results, {name: f"noise_{name}" for name in map(sensor_key, talk.file.noise_sensors)}, slide)
-    if not found:
+    datasets = collected(results, {name: f"noise_{name}" for name in map(sensor_key, talk.file.noise_sensors)}, slide)
+    if not datasets:
         return slide
-    words = f"Residuals of {listed(list(found))} on a matt-white plate, with their histograms and the normal curve"
-    slide.pictures["noise"] = (figures.noise_figure(found), words)
-    apart = {name: dataset.attrs["distance_one"] for name, dataset in found.items()}
-    two = [name for name, dataset in found.items() if dataset.attrs["two"]]
+    words = f"Residuals of {listed(list(datasets))} on a matt-white plate, with their histograms and the normal curve"
+    slide.pictures["noise"] = (figures.noise_figure(datasets), words)
+    apart = {name: dataset.attrs["distance_one"] for name, dataset in datasets.items()}
+    two = [name for name, dataset in datasets.items() if dataset.attrs["two"]]
     kurtosis = ", ".join(
-        f"{name} {dataset.attrs['kurtosis']:+.2f}".replace("-0", "−0") for name, dataset in found.items()
+        f"{name} {dataset.attrs['kurtosis']:+.2f}".replace("-0", "−0") for name, dataset in datasets.items()
     )
     worst = max(apart.values())
     slide.claims.extend(
@@ -89,7 +90,7 @@ def noise(talk: Talk, results: Results) -> Slide:
             Claim(
                 "Some fringe projection sensors can be sums of gaussians.",
                 f"A sum of two normals is needed for {listed(two) if two else 'none of them'}.",
-                f"needed for {len(two)} of {len(found)} sensors",
+                f"needed for {len(two)} of {len(datasets)} sensors",
                 verdict(bool(two)),
                 ""
                 if two
@@ -104,17 +105,17 @@ def noise(talk: Talk, results: Results) -> Slide:
 def performance_maps(talk: Talk) -> Slide:
     """Return slide *Performance Maps*."""
     slide = Slide("Performance Maps")
-    known = map_in(talk.folder, talk.map_name)
-    near, far = known.data["distance"].values[[0, -1]]
-    count = known.data.sizes["distance"]
-    words = f"F and sigma of {len(known.samples)} samples at {count} distances, {near:g} to {far:g} mm"
-    slide.pictures["maps"] = (figures.maps_figure(known), words)
-    order = matt_to_shiny(known.samples)
-    fraction, sigma = (known.data[name].values[order] for name in ("recovered_fraction", "ray_noise_std"))
-    usable = np.array([(one[np.isfinite(one)] >= _USABLE).mean() for one in fraction])
+    performance_map = map_in(talk.folder, talk.map_name)
+    near, far = performance_map.data["distance"].values[[0, -1]]
+    count = performance_map.data.sizes["distance"]
+    words = f"F and sigma of {len(performance_map.samples)} samples at {count} distances, {near:g} to {far:g} mm"
+    slide.pictures["maps"] = (figures.maps_figure(performance_map), words)
+    order = matt_to_shiny(performance_map.samples)
+    fraction, sigma = (performance_map.data[name].values[order] for name in ("recovered_fraction", "ray_noise_std"))
+    usable = np.array([(values[np.isfinite(values)] >= _USABLE).mean() for values in fraction])
     noise_of = np.array([median_of(s[0][f[0] >= _USABLE]) for f, s in zip(fraction, sigma, strict=True)])
     ratio = median_of(sigma[0, -1] / sigma[0, 0])
-    names = [finish_name(*known.samples[number]).split(", ")[-1] for number in order]
+    names = [finish_name(*performance_map.samples[number]).split(", ")[-1] for number in order]
     falls, grows = bool((np.diff(usable) <= 0.02).all()), bool((np.diff(noise_of) >= -0.02 * noise_of[:-1]).all())
     slide.claims.extend(
         [

@@ -1,4 +1,4 @@
-"""State the claims of the talk's slides on views, with the figures that were found."""
+"""State the claims of the talk's slides on views, with the figures of the results."""
 
 from __future__ import annotations
 
@@ -70,12 +70,14 @@ def scoring(talk: Talk, judged: JudgedViews) -> Slide:
     points = scores["n"].sel(feature=feature).values
     reached, outside = scores.sizes["view"], scores.sizes["outside"]
     reasons = Counter(_reason(str(words)) for words in scores["reason"].values)
-    others = f" Of the others {listed([f'{count} {why}' for why, count in reasons.most_common()])}." if reasons else ""
+    left_out = (
+        f" Of the others {listed([f'{count} {why}' for why, count in reasons.most_common()])}." if reasons else ""
+    )
     moved = scores.attrs["moved_out"] or "No"
     slide.claims.append(
         Claim(
             "Sub divide icosahedron to sample a sphere. Ensure reachability by the tilt table.",
-            f"The three-axis table reaches {reached} of {reached + outside} directions.{others} {moved} views moved "
+            f"The three-axis table reaches {reached} of {reached + outside} directions.{left_out} {moved} views moved "
             f"away to keep clear of the part. {feature} has {points.min():.0f} to {points.max():.0f} points.",
             f"{reached} of {reached + outside} directions",
             "shown",
@@ -86,8 +88,8 @@ def scoring(talk: Talk, judged: JudgedViews) -> Slide:
 
 def _reason(words: str) -> str:
     """Return why a direction is left out, without the numbers of the single case."""
-    kind, _, rest = words.partition(": ")
-    return f"need a {rest.split()[0]} beyond its limits" if kind == "stage" and " beyond " in rest else words
+    kind, _, detail = words.partition(": ")
+    return f"need a {detail.split()[0]} beyond its limits" if kind == "stage" and " beyond " in detail else words
 
 
 def view_score(talk: Talk, judged: JudgedViews) -> Slide:
@@ -105,23 +107,25 @@ def view_score(talk: Talk, judged: JudgedViews) -> Slide:
     blocked = product < _HIDDEN
     reach = largest_of(sums[blocked]) / sums.max() if blocked.any() else 0.0
     figure = f"S_m up to {100 * reach:.0f} % of the largest with a feature out of sight"
-    found = (
+    findings = (
         f"{int(blocked.sum())} views see little of a feature (R_m below {_HIDDEN:g}). Their S_m is up to "
         f"{100 * reach:.0f} % of the largest."
     )
     better = reach > _BIASED
     if shown.sample in judged.errors:
         error = true_error(judged.errors[shown.sample], shown.measurement)
-        known = np.isfinite(error)
-        alone = spearman(sums[known], error[known])
-        together = spearman(np.where(here["possible"].values > 0, here["V_m"].values, 0)[known], error[known])
-        found += f" Rank correlation with the true error of views: S_m alone {_signed(alone)}, V_m {_signed(together)}."
+        valid = np.isfinite(error)
+        alone = spearman(sums[valid], error[valid])
+        together = spearman(np.where(here["possible"].values > 0, here["V_m"].values, 0)[valid], error[valid])
+        findings += (
+            f" Rank correlation with the true error of views: S_m alone {_signed(alone)}, V_m {_signed(together)}."
+        )
         better = better and together < alone
         figure = f"rank correlation with error: S_m alone {_signed(alone)}, V_m {_signed(together)}"
     slide.claims.append(
         Claim(
             "[S_m] is susceptible to bias. Doesn't take into account if all features are actually visible.",
-            found,
+            findings,
             figure,
             verdict(better, reach > _BIASED),
         )
@@ -171,13 +175,13 @@ def _example(judged: JudgedViews, example: ExampleEntry) -> Claim:
     measurable = int((np.isfinite(trials).mean(axis=1) >= 0.5).sum())
     if not possible:
         return _nothing_possible(judged, example, measurable, float(share[0]))
-    known = np.flatnonzero(np.isfinite(values[1:])) + 1
+    bins = np.flatnonzero(np.isfinite(values[1:])) + 1
     correlations = [cell.attrs[f"{name}_correlation"] for name in QUANTITIES]
-    ratio = float(values[known[0]] / values[known[-1]]) if len(known) > 1 else math.nan
-    best = [values[number] for number in known[-3:]]
+    ratio = float(values[bins[0]] / values[bins[-1]]) if len(bins) > 1 else math.nan
+    best = [values[number] for number in bins[-3:]]
     top = max(best) / min(best) if len(best) > 1 else math.nan
-    ends = "" if math.isnan(ratio) else f" ({two_digits(values[known[0]])} to {two_digits(values[known[-1]])} {unit})"
-    found = (
+    ends = "" if math.isnan(ratio) else f" ({two_digits(values[bins[0]])} to {two_digits(values[bins[-1]])} {unit})"
+    findings = (
         f"{example.measurement}, {example.sample}: {possible} of {int(views.sum())} views are possible by V_m; "
         f"{measurable} have a value in half of the trials. Trials with a value: {_percent(share[0])} where V_m says "
         f"impossible, "
@@ -191,7 +195,7 @@ def _example(judged: JudgedViews, example: ExampleEntry) -> Claim:
     why = _SURVIVORS if predicts and not all(good) else ""
     return Claim(
         _WORDS.get(example.slide, example.measurement),
-        found,
+        findings,
         figure,
         verdict(bool(good) and all(good), any(good) or predicts),
         why,
@@ -247,16 +251,16 @@ def accuracy(judged: JudgedViews) -> Slide:
         "Mean rank of the ten bins by error, standard deviation and share of trials with a value, for V_m, predicted "
         "risk and number of points"
     )
-    found = {kind: judged.ranks(kind) for kind in SCORES}
-    slide.pictures["accuracy"] = (figures.ranks_figure(found), words)
+    ranks = {kind: judged.ranks(kind) for kind in SCORES}
+    slide.pictures["accuracy"] = (figures.ranks_figure(ranks), words)
     count = len(judged.task.measurements) * len(judged.errors)
 
     def correlations(kind: str) -> str:
-        return listed([_signed(found[kind][quantity].attrs["correlation"]) for quantity in QUANTITIES])
+        return listed([_signed(ranks[kind][quantity].attrs["correlation"]) for quantity in QUANTITIES])
 
-    talks = [found["V_m"][quantity].attrs["correlation"] for quantity in ("error", "deviation")]
+    talks = [ranks["V_m"][quantity].attrs["correlation"] for quantity in ("error", "deviation")]
     good = max(talks) <= _VERY_GOOD
-    trend = spearman(found["V_m"]["error"]["bin"].values, found["V_m"]["error"]["rank"].values)
+    trend = spearman(ranks["V_m"]["error"]["bin"].values, ranks["V_m"]["error"]["rank"].values)
     why = "The predicted risk also knows how the points constrain a fit."
     slide.claims.append(
         Claim(
@@ -272,7 +276,7 @@ def accuracy(judged: JudgedViews) -> Slide:
             "" if good else why,
         )
     )
-    misses = np.abs(found["V_m"]["error"]["rank"].values - np.arange(10, 0, -1))
+    misses = np.abs(ranks["V_m"]["error"]["rank"].values - np.arange(10, 0, -1))
     bad, best = mean_of(misses[:_END]), mean_of(misses[-_END:])
     cells = [judged.cell(sample, name, "V_m") for sample in judged.errors for name in judged.task.measurements]
     impossible = mean_of([cell["share"].values[0] for cell in cells])

@@ -63,16 +63,16 @@ class CouponPlace:
     roughness: float | None
 
 
-def campaign_of(folder: str, place: CouponPlace, **changes: object) -> Campaign:
+def campaign_of(folder: str, coupon_place: CouponPlace, **changes: object) -> Campaign:
     """Return the campaign of one sample at one distance."""
-    path, roughness, distance = Path(folder) / place.campaign, place.roughness, place.distance
+    path, roughness, distance = Path(folder) / coupon_place.campaign, coupon_place.roughness, coupon_place.distance
     content = read_toml(path, CampaignFile)
     entries = [sample for sample in content.samples if roughness_of(sample) == roughness]
     if not entries:
         named = "matt white" if roughness is None else f"Ra {roughness:g}"
         raise InputError(path, "samples", "no such sample", f"one of {named}", "the talk shows it")
     updated = content.model_copy(update={"distances_mm": [distance], "samples": entries, **changes})
-    return plan_campaign(path, updated, sensor_in(folder, place.sensor))
+    return plan_campaign(path, updated, sensor_in(folder, coupon_place.sensor))
 
 
 def roughness_of(entry: SampleEntry) -> float | None:
@@ -86,7 +86,7 @@ def tilted(angle_deg: float) -> Floats:
     return np.array([math.sin(tilt) * math.cos(azimuth), math.sin(tilt) * math.sin(azimuth), math.cos(tilt)])
 
 
-def characterised(folder: str, place: CouponPlace, subdivisions: int, refined: int, seed: int) -> xr.Dataset:
+def characterised(folder: str, coupon_place: CouponPlace, subdivisions: int, refined: int, seed: int) -> xr.Dataset:
     """Return the samples of a coupon at one distance and their map: orientations refined where F or sigma changes.
 
     Over ``shot``: the normal ``shot_x`` and ``shot_y`` of each capture, in the order in which they were taken, and its
@@ -97,7 +97,7 @@ def characterised(folder: str, place: CouponPlace, subdivisions: int, refined: i
     ----------
     folder
         Folder of the talk.
-    place
+    coupon_place
         The coupon and its distance.
     subdivisions, refined
         Density of the planned orientations, and the largest one of those added.
@@ -105,15 +105,15 @@ def characterised(folder: str, place: CouponPlace, subdivisions: int, refined: i
         Of the choice of patches.
     """
     bands = [Band(up_to_deg=20, subdivisions=subdivisions), Band(up_to_deg=80, subdivisions=max(subdivisions - 1, 0))]
-    plan = campaign_of(folder, place, orientations=bands)
+    plan = campaign_of(folder, coupon_place, orientations=bands)
     if plan.file.refine is not None:
         changed = plan.file.refine.model_copy(update={"subdivisions": refined})
         plan = replace(plan, file=plan.file.model_copy(update={"refine": changed}))
     source = in_turn(simulated_source(prepared_sensor(plan.sensor).simulated, plan.file.samples_per_pixel), plan)
     shots: list[Shot] = []
 
-    def noted(some: Sequence[Shot]) -> Iterator[tuple[Shot, Finished]]:
-        for shot, finished in source(some):
+    def noted(planned_shots: Sequence[Shot]) -> Iterator[tuple[Shot, Finished]]:
+        for shot, finished in source(planned_shots):
             shots.append(shot)
             yield shot, finished
 
@@ -125,7 +125,7 @@ def characterised(folder: str, place: CouponPlace, subdivisions: int, refined: i
     planned = len(plan.file.normals())
     normals = np.array([shot.normal for shot in shots])
     count = patches.sizes["patch"]
-    data = xr.Dataset(attrs={"distance_mm": place.distance, "Ra_um": place.roughness, "patches": count})
+    data = xr.Dataset(attrs={"distance_mm": coupon_place.distance, "Ra_um": coupon_place.roughness, "patches": count})
     data["shot_x"], data["shot_y"] = ("shot", normals[:, 0]), ("shot", normals[:, 1])
     data["level"] = ("shot", (np.arange(len(shots)) >= planned).astype(np.int8))
     for name, column in (
@@ -141,15 +141,18 @@ def characterised(folder: str, place: CouponPlace, subdivisions: int, refined: i
     return data.assign_coords(a=("a", whole["a"].values), b=("b", whole["b"].values))
 
 
-def tilts(folder: str, place: CouponPlace, angles: tuple[float, ...]) -> xr.Dataset:
+def tilts(folder: str, coupon_place: CouponPlace, angles: tuple[float, ...]) -> xr.Dataset:
     """Return F by three definitions, sigma along V and along N, and the sizes of patches, over the tilt.
 
     The coupon and a matt-white one stand at the same pose; the second is the reference of ``fraction_reference``.
     ``fraction_density`` is the talk's rho. ``along_ray`` and ``along_normal`` [mm] are of matt white, whose finish
     looks the same at every tilt, and ``metal_along_ray`` is of the coupon.
     """
-    prepared = prepared_sensor(sensor_in(folder, place.sensor))
-    plans = {"metal": campaign_of(folder, place), "white": campaign_of(folder, replace(place, roughness=None))}
+    prepared = prepared_sensor(sensor_in(folder, coupon_place.sensor))
+    plans = {
+        "metal": campaign_of(folder, coupon_place),
+        "white": campaign_of(folder, replace(coupon_place, roughness=None)),
+    }
     rows: list[dict[str, float]] = []
     for angle in angles:
         clouds = {name: _taken(prepared, plan, tilted(angle)) for name, plan in plans.items()}
@@ -179,10 +182,10 @@ def tilts(folder: str, place: CouponPlace, angles: tuple[float, ...]) -> xr.Data
     return xr.Dataset(columns, {"tilt": ("tilt", np.array(angles, float), {"units": "deg"})})
 
 
-def sub_clouds(folder: str, place: CouponPlace, angle: float) -> xr.Dataset:
+def sub_clouds(folder: str, coupon_place: CouponPlace, angle: float) -> xr.Dataset:
     """Return the cloud of a tilted coupon with its patches: status (row, column), and the ellipses (patch,)."""
-    prepared = prepared_sensor(sensor_in(folder, place.sensor))
-    plan = campaign_of(folder, place)
+    prepared = prepared_sensor(sensor_in(folder, coupon_place.sensor))
+    plan = campaign_of(folder, coupon_place)
     cloud, coupon = _taken(prepared, plan, tilted(angle))
     patches = measure_patches(cloud, coupon)
     window, corner = _window(cloud, coupon)
@@ -191,10 +194,10 @@ def sub_clouds(folder: str, place: CouponPlace, angle: float) -> xr.Dataset:
     depth = np.where(cloud.valid, cloud.points[..., 2], np.nan)[window]
     data["depth"] = (("y", "x"), depth.astype(np.float32), {"units": "mm"})
     data["status"] = (("y", "x"), cloud.status[window])
-    return data.assign_attrs(tilt_deg=angle, distance_mm=place.distance)
+    return data.assign_attrs(tilt_deg=angle, distance_mm=coupon_place.distance)
 
 
-def hold_out(folder: str, place: CouponPlace, map_name: str, count: int, seed: int) -> xr.Dataset:
+def hold_out(folder: str, coupon_place: CouponPlace, map_name: str, count: int, seed: int) -> xr.Dataset:
     """Return F and sigma of one sample at one distance, captured and predicted, over poses no map was made from.
 
     Over ``pose``: ``incidence`` [rad], and ``fraction`` and ``sigma`` [mm] as ``..._measured`` and ``..._predicted``.
@@ -204,7 +207,7 @@ def hold_out(folder: str, place: CouponPlace, map_name: str, count: int, seed: i
     ----------
     folder
         Folder of the talk.
-    place
+    coupon_place
         The coupon and its distance.
     map_name
         Map that predicts.
@@ -213,9 +216,9 @@ def hold_out(folder: str, place: CouponPlace, map_name: str, count: int, seed: i
     seed
         Of poses and noise.
     """
-    prepared, plan = prepared_sensor(sensor_in(folder, place.sensor)), campaign_of(folder, place)
+    prepared, plan = prepared_sensor(sensor_in(folder, coupon_place.sensor)), campaign_of(folder, coupon_place)
     series = replace(plan.series[0], seed=plan.series[0].seed ^ (seed + 1))
-    rng = np.random.default_rng([seed, round(place.distance), round(1000 * (place.roughness or 0.0))])
+    rng = np.random.default_rng([seed, round(coupon_place.distance), round(1000 * (coupon_place.roughness or 0.0))])
     normals = random_normals(count, min(_LARGEST_DEG, plan.file.largest_deg), rng)
     performance_map = map_in(folder, map_name)
     take = simulated_source(prepared.simulated, plan.file.samples_per_pixel)
@@ -229,7 +232,7 @@ def hold_out(folder: str, place: CouponPlace, map_name: str, count: int, seed: i
     return data
 
 
-def clouds_of_coupon(folder: str, place: CouponPlace, map_name: str, angle: float, seed: int) -> xr.Dataset:
+def clouds_of_coupon(folder: str, coupon_place: CouponPlace, map_name: str, angle: float, seed: int) -> xr.Dataset:
     """Return the captured cloud of a large coupon and one drawn from the map, as residuals along V from the true plane.
 
     ``captured`` and ``drawn`` (row, column), thinned, are in steps of :data:`STEP_MM`; :data:`NO_POINT` is no point.
@@ -238,7 +241,7 @@ def clouds_of_coupon(folder: str, place: CouponPlace, map_name: str, angle: floa
     ----------
     folder
         Folder of the talk.
-    place
+    coupon_place
         The coupon and its distance.
     map_name
         Map from which the second cloud is drawn.
@@ -247,14 +250,16 @@ def clouds_of_coupon(folder: str, place: CouponPlace, map_name: str, angle: floa
     seed
         Of the drawn cloud.
     """
-    prepared = prepared_sensor(sensor_in(folder, place.sensor))
-    plan = campaign_of(folder, place, coupon_px=5000.0)  # as large as the field of view
+    prepared = prepared_sensor(sensor_in(folder, coupon_place.sensor))
+    plan = campaign_of(folder, coupon_place, coupon_px=5000.0)  # as large as the field of view
     cloud, coupon = _taken(prepared, plan, tilted(angle))
     scene, pose = plan.series[0].sample.scene, plan.shot(plan.series[0], tilted(angle)).sensor_from_coupon
-    known = CharacterisedScene(scene, map_in(folder, map_name))
-    drawn = prepared.predictor.predict(known, pose.inverse(), np.random.default_rng(seed), correlated=True)
+    characterised_scene = CharacterisedScene(scene, map_in(folder, map_name))
+    drawn = prepared.predictor.predict(
+        characterised_scene, pose.inverse(), np.random.default_rng(seed), correlated=True
+    )
     window, _ = _window(cloud, coupon)
-    data = xr.Dataset(attrs={"distance_mm": place.distance, "Ra_um": place.roughness, "tilt_deg": angle})
+    data = xr.Dataset(attrs={"distance_mm": coupon_place.distance, "Ra_um": coupon_place.roughness, "tilt_deg": angle})
     for name, point_cloud in (("captured", cloud), ("drawn", drawn)):
         rays = point_cloud.grid.rays()
         reach = ((coupon.centre - point_cloud.grid.origin) @ coupon.normal) / (rays @ coupon.normal)

@@ -75,7 +75,7 @@ def score_of(scores: xr.Dataset, task: Task, measurement: str, kind: str) -> Flo
 def true_error(errors: xr.Dataset, measurement: str) -> Floats:
     """Return the mean absolute error (view,) over the trials with a value, NaN without any."""
     values = np.abs(errors["error"].sel(measurement=measurement).values.astype(float))
-    known = np.isfinite(values)
-    count = known.sum(axis=1)
-    total = np.where(known, values, 0).sum(axis=1)
+    valid = np.isfinite(values)
+    count = valid.sum(axis=1)
+    total = np.where(valid, values, 0).sum(axis=1)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)

@@ -99,10 +99,10 @@ def make(
     wanted = [sample for sample in talk.file.samples if sample.key not in measured]
     wanted.sort(key=lambda sample: sample.name not in shown)  # those of the examples first
     samples = [_unfinished(talk, results, sample, folder) for sample in wanted]
-    unfinished = [one for one in samples if one is not None]
-    place = str(talk.folder)
-    of_trials = [trial_order for found in unfinished for trial_order in _trial_orders(talk, found)]
-    orders: list[_Order] = [*((place, piece) for piece in missing), *of_trials]
+    unfinished = [entry for entry in samples if entry is not None]
+    talk_folder = str(talk.folder)
+    of_trials = [trial_order for entry in unfinished for trial_order in _trial_orders(talk, entry)]
+    orders: list[_Order] = [*((talk_folder, piece) for piece in missing), *of_trials]
     if orders:
         trials = sum(len(of_trial.jobs) for of_trial in of_trials)
         seconds = _PIECE_S * len(missing) + _TRIAL_S * trials
@@ -114,15 +114,15 @@ def make(
     made = here if workers is None else workers.distribute(orders, lambda order: order, work)
     for order, result in track(made, "the talk", len(orders)):
         if isinstance(order, TrialOrder):
-            kept = next(one.session.trials for one in unfinished if one.session.digest == order.digest)
+            kept = next(entry.session.trials for entry in unfinished if entry.session.digest == order.digest)
             for job, outcome in zip(order.jobs, result, strict=True):
                 kept.add(job.view.number, job.trial, outcome)
         else:
             results.add(order[1].name, result)
         if limit.over():
             break
-    for found in unfinished:
-        _finish(talk, results, found)
+    for entry in unfinished:
+        _finish(talk, results, entry)
     return results_known(talk, results, measured)
 
 
@@ -136,23 +136,23 @@ def _unfinished(talk: Talk, results: Results, sample: ArtefactEntry, folder: Pat
     days = [Trial(day) for day in range(talk.file.trials)]
     missing = {}
     for view in session.study.views:
-        known = session.trials.known(view.number)
-        if jobs := tuple(Job(view, trial) for trial in days if trial not in known):
+        finished = session.trials.known(view.number)
+        if jobs := tuple(Job(view, trial) for trial in days if trial not in finished):
             missing[view.number] = jobs
     return _Unfinished(sample, session, missing)
 
 
-def _trial_orders(talk: Talk, found: _Unfinished) -> Iterator[TrialOrder]:
-    session = found.session
-    for jobs in found.missing.values():
+def _trial_orders(talk: Talk, unfinished: _Unfinished) -> Iterator[TrialOrder]:
+    session = unfinished.session
+    for jobs in unfinished.missing.values():
         path = str(talk.path.absolute())
         rendering = rendering_of(session.study)
         yield TrialOrder(path, session.study.file, session.unknowns, False, session.digest, jobs, rendering)
 
 
-def _finish(talk: Talk, results: Results, found: _Unfinished) -> None:
+def _finish(talk: Talk, results: Results, unfinished: _Unfinished) -> None:
     """Keep the errors of a sample once all of its views are measured."""
-    views = [view.number for view in found.session.study.views]
-    data: xr.Dataset = errors_of(found.session.trials, views, talk.file.trials)
+    views = [view.number for view in unfinished.session.study.views]
+    data: xr.Dataset = errors_of(unfinished.session.trials, views, talk.file.trials)
     if (data["tried"].values >= talk.file.trials).all():
-        results.add(trials_name(found.sample), data)
+        results.add(trials_name(unfinished.sample), data)

@@ -41,34 +41,38 @@ def measured_errors(talk: Talk, folder: Path) -> dict[str, xr.Dataset]:
     InputError
         If there is no capture, or one without a pose, of another sensor, of no sample of the talk, or of no view.
     """
-    places = sorted(path.parent for path in folder.rglob("capture.json"))
-    if not places:
+    capture_folders = sorted(path.parent for path in folder.rglob("capture.json"))
+    if not capture_folders:
         raise InputError(folder, "", "no captures", "a folder with captures of the artefact")
-    found: dict[str, dict[int, list[dict[str, float]]]] = {}
-    for place in track(places, "measure captures"):
-        sample, view = _shown(talk, place, folder)
-        found.setdefault(sample.key, {}).setdefault(view.number, []).append(_errors(talk, sample, place))
-    return {key: _as_trials(talk, views) for key, views in found.items()}
+    errors: dict[str, dict[int, list[dict[str, float]]]] = {}
+    for capture_folder in track(capture_folders, "measure captures"):
+        sample, view = _shown(talk, capture_folder, folder)
+        errors.setdefault(sample.key, {}).setdefault(view.number, []).append(_errors(talk, sample, capture_folder))
+    return {key: _as_trials(talk, views) for key, views in errors.items()}
 
 
-def _shown(talk: Talk, place: Path, folder: Path) -> tuple[ArtefactEntry, View]:
+def _shown(talk: Talk, capture_folder: Path, folder: Path) -> tuple[ArtefactEntry, View]:
     """Return the sample and the candidate view that a capture shows."""
-    sensor, settings, pose = read_settings_and_pose(place)
+    sensor, settings, pose = read_settings_and_pose(capture_folder)
     if sensor != talk.sensor.name:
-        raise InputError(place / "capture.json", "sensor", sensor, talk.sensor.name, "the sensor of the talk")
+        raise InputError(capture_folder / "capture.json", "sensor", sensor, talk.sensor.name, "the sensor of the talk")
     if pose is None:
-        raise InputError(place / "pose.json", "world_from_sensor", "null", "the pose, in the frame of the part")
+        raise InputError(
+            capture_folder / "pose.json", "world_from_sensor", "null", "the pose, in the frame of the part"
+        )
     coupon = settings.get("coupon")
     named = coupon.get("sample") if isinstance(coupon, dict) else None
-    above = {part.name for part in (place, *place.parents) if part.is_relative_to(folder)}
+    above = {part.name for part in (capture_folder, *capture_folder.parents) if part.is_relative_to(folder)}
     for sample in talk.file.samples:
         if named == sample.name or (named is None and above & {sample.name, sample.key}):
-            return sample, _nearest(talk, pose, place)
+            return sample, _nearest(talk, pose, capture_folder)
     names = ", ".join(sample.name for sample in talk.file.samples)
-    raise InputError(place / "settings.json", "coupon.sample", repr(named), names, "or a folder of this name above it")
+    raise InputError(
+        capture_folder / "settings.json", "coupon.sample", repr(named), names, "or a folder of this name above it"
+    )
 
 
-def _nearest(talk: Talk, pose: Transform, place: Path) -> View:
+def _nearest(talk: Talk, pose: Transform, capture_folder: Path) -> View:
     """Return the candidate view whose pose is nearest to that of a capture."""
 
     def turned(view: View) -> float:
@@ -78,14 +82,16 @@ def _nearest(talk: Talk, pose: Transform, place: Path) -> View:
     view = min(talk.views, key=turned)
     apart = float(np.linalg.norm(pose.translation - view.world_from_sensor.translation))
     if turned(view) > NEAR_DEG or apart > NEAR_SHARE * view.standoff + math.radians(NEAR_DEG) * view.standoff:
-        found = f"{turned(view):.1f} deg and {apart:.0f} mm from the nearest view, number {view.number}"
+        offset = f"{turned(view):.1f} deg and {apart:.0f} mm from the nearest view, number {view.number}"
         allowed = f"a pose within {NEAR_DEG:g} deg of a candidate view, at its standoff within {100 * NEAR_SHARE:g} %"
-        raise InputError(place / "pose.json", "world_from_sensor", found, allowed, "poses.json of mitsim study score")
+        raise InputError(
+            capture_folder / "pose.json", "world_from_sensor", offset, allowed, "poses.json of mitsim study score"
+        )
     return view
 
 
-def _errors(talk: Talk, sample: ArtefactEntry, place: Path) -> dict[str, float]:
-    study, capture = talk.study(sample), read_capture(place)
+def _errors(talk: Talk, sample: ArtefactEntry, capture_folder: Path) -> dict[str, float]:
+    study, capture = talk.study(sample), read_capture(capture_folder)
     settings, imager = decoder_settings(capture, talk.sensor)
     cloud = capture_cloud(capture, settings, imager=imager)
     assert capture.world_from_sensor is not None  # as _shown has checked
@@ -97,7 +103,7 @@ def _as_trials(talk: Talk, views: dict[int, list[dict[str, float]]]) -> xr.Datas
     """Return errors (measurement, view, trial) over all candidate views; ``tried`` is 0 for one without a capture."""
     names = list(next(iter(views.values()))[0])
     numbers = [view.number for view in talk.views]
-    most = max(len(one) for one in views.values())
+    most = max(len(captures) for captures in views.values())
     errors = np.full((len(names), len(numbers), most), np.nan)
     for number, captures in views.items():
         for trial, values in enumerate(captures):

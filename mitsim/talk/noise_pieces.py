@@ -65,16 +65,18 @@ def two_normals(values: Floats) -> TwoNormals:
     """
     square = np.asarray(values, float) ** 2
     spread = math.sqrt(float(square.mean()))
-    found = TwoNormals(0.7 * spread, 1.6 * spread, 0.3)
+    mixture = TwoNormals(0.7 * spread, 1.6 * spread, 0.3)
     for _ in range(_STEPS):
-        wide = found.share * stats.norm.pdf(np.sqrt(square), 0, found.wide)
-        odds = wide / np.maximum(wide + (1 - found.share) * stats.norm.pdf(np.sqrt(square), 0, found.narrow), 1e-300)
+        wide = mixture.share * stats.norm.pdf(np.sqrt(square), 0, mixture.wide)
+        odds = wide / np.maximum(
+            wide + (1 - mixture.share) * stats.norm.pdf(np.sqrt(square), 0, mixture.narrow), 1e-300
+        )
         share = float(odds.mean())
         if not 1e-6 < share < 1 - 1e-6:
             break
         narrow = math.sqrt(float(((1 - odds) * square).sum() / (1 - odds).sum()))
-        found = TwoNormals(narrow, math.sqrt(float((odds * square).sum() / odds.sum())), share)
-    return found
+        mixture = TwoNormals(narrow, math.sqrt(float((odds * square).sum() / odds.sum())), share)
+    return mixture
 
 
 def noise_of(folder: str, sensor: str, seed: int) -> xr.Dataset:
@@ -87,13 +89,13 @@ def noise_of(folder: str, sensor: str, seed: int) -> xr.Dataset:
     """
     chosen = sensor_in(folder, sensor)
     near, far = chosen.working_range_mm
-    found: Residuals = measure_piece(SheetPiece(chosen, seed, "residuals", (math.sqrt(near * far),)))
-    return described(found)
+    residuals: Residuals = measure_piece(SheetPiece(chosen, seed, "residuals", (math.sqrt(near * far),)))
+    return described(residuals)
 
 
-def described(found: Residuals) -> xr.Dataset:
+def described(residuals: Residuals) -> xr.Dataset:
     """Return the description of residuals that :func:`noise_of` returns."""
-    values = found.values - found.values.mean()
+    values = residuals.values - residuals.values.mean()
     sigma = float(values.std())
     edges = np.linspace(-_REACH * sigma, _REACH * sigma, _BINS + 1)
     density, _ = np.histogram(values, edges)
@@ -105,11 +107,12 @@ def described(found: Residuals) -> xr.Dataset:
         for model in (stats.norm.cdf(ordered, 0, sigma), two.distribution(ordered))
     ]
     likelihoods = [
-        float(np.log(np.maximum(one, 1e-300)).mean()) for one in (stats.norm.pdf(values, 0, sigma), two.density(values))
+        float(np.log(np.maximum(densities, 1e-300)).mean())
+        for densities in (stats.norm.pdf(values, 0, sigma), two.density(values))
     ]
-    gain = 2 * found.independent * (likelihoods[1] - likelihoods[0]) - 2 * math.log(max(found.independent, 1))
-    rows, columns = np.nonzero(np.isfinite(found.image))
-    cut = found.image[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+    gain = 2 * residuals.independent * (likelihoods[1] - likelihoods[0]) - 2 * math.log(max(residuals.independent, 1))
+    rows, columns = np.nonzero(np.isfinite(residuals.image))
+    cut = residuals.image[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
     step = max(1, -(-max(cut.shape) // _SIDE_PX))
     width = edges[1] - edges[0]
     return xr.Dataset(
@@ -119,12 +122,12 @@ def described(found: Residuals) -> xr.Dataset:
             "middle": ("interval", (edges[1:] + edges[:-1]) / 2, {"units": "mm"}),
         },
         attrs={
-            "distance_mm": found.distance,
+            "distance_mm": residuals.distance,
             "sigma": sigma,
-            "kurtosis": found.excess_kurtosis,
-            "skewness": found.skewness,
-            "correlation_px": found.correlation_px,
-            "independent": found.independent,
+            "kurtosis": residuals.excess_kurtosis,
+            "skewness": residuals.skewness,
+            "correlation_px": residuals.correlation_px,
+            "independent": residuals.independent,
             "narrow": two.narrow,
             "wide": two.wide,
             "share": two.share,

@@ -1,4 +1,4 @@
-"""Render what sensors project on the artefact: frames of fringes or dots, for the strip that opens the page."""
+"""Render the light that sensors project on the artefact: fringes or dots, for the strip that opens the page."""
 
 from __future__ import annotations
 
@@ -63,13 +63,13 @@ def projected_frames(folder: str, scene: str, parameters: tuple[tuple[str, str],
     bright = stack.reshape(len(stack), -1).mean(axis=1, dtype=float)
     lit = stack[bright > _LIT * bright.max()]
     chosen_frames = lit[np.unique(np.linspace(0, len(lit) - 1, MOST_FRAMES).round().astype(int))]
-    places = capture.rig.cameras[name].project(pose.inverse().points(hull_corners(loaded)))
-    return xr.Dataset({"frames": (("frame", "row", "column"), _fitted(chosen_frames.astype(float), places))})
+    corners = capture.rig.cameras[name].project(pose.inverse().points(hull_corners(loaded)))
+    return xr.Dataset({"frames": (("frame", "row", "column"), _fitted(chosen_frames.astype(float), corners))})
 
 
-def _fitted(frames: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.uint8]:
+def _fitted(frames: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Return frames cut to the part with the proportions of the strip, in 8 bits."""
-    low, high = places.min(axis=0), places.max(axis=0)
+    low, high = corners.min(axis=0), corners.max(axis=0)
     middle, half = (low + high) / 2, 0.56 * max((high - low)[0], (high - low)[1] * WIDTH_PX / HEIGHT_PX)
     reach = half * np.array([1.0, HEIGHT_PX / WIDTH_PX])
     box = (*(middle - reach).tolist(), *(middle + reach).tolist())

@@ -57,7 +57,7 @@ class _Picture:
     height: int
 
     def shown(self) -> dict[str, Any]:
-        """Return what the template needs: the picture itself, its text and its size."""
+        """Return the content for the template: the picture itself, its text and its size."""
         data = base64.b64encode(self.path.read_bytes()).decode("ascii")
         return {"data": f"data:image/png;base64,{data}", "alt": self.alt, "width": self.width, "height": self.height}
 
@@ -105,9 +105,9 @@ def write_talk(
     images = folder / "images"
     images.mkdir(parents=True, exist_ok=True)
     frames = {sensor_key(name): results.get(f"opening_{sensor_key(name)}") for name in talk.file.opening_sensors}
-    known = {name: frame for name, frame in frames.items() if frame is not None}
-    words = f"What {listed(list(known))} see of the artefact: rendered images of the projected light"
-    opening = _drawn(images, "opening", opening_figure(known), words) if known else None
+    shown_frames = {name: frame for name, frame in frames.items() if frame is not None}
+    words = f"What {listed(list(shown_frames))} see of the artefact: rendered images of the projected light"
+    opening = _drawn(images, "opening", opening_figure(shown_frames), words) if shown_frames else None
     pictures = [
         [_drawn(images, name, figure, alt) for name, (figure, alt) in slide.pictures.items()] for slide in slides
     ]
@@ -191,10 +191,10 @@ def _markdown(
     made = [f"<!-- made by: {command}; takes 60 s -->", "<!-- made by: as above -->"]
     first = True
 
-    def picture(one: _Picture) -> list[str]:
+    def picture(image: _Picture) -> list[str]:
         nonlocal first
         comment, first = made[0 if first else 1], False
-        return [comment, f"![{one.alt}](images/{one.path.name})", ""]
+        return [comment, f"![{image.alt}](images/{image.path.name})", ""]
 
     if opening is not None:
         lines += picture(opening)
@@ -202,11 +202,11 @@ def _markdown(
         lines += [f"## {number}. {slide.title}", ""]
         if slide.missing:
             lines += [f"Not made yet: {_missing(slide.missing)}.", ""]
-        for one, claims in _parts(slide, drawn):
-            lines += [] if one is None else picture(one)
+        for image, claims in _parts(slide, drawn):
+            lines += [] if image is None else picture(image)
             for claim in claims:
-                found = f"**{claim.verdict.capitalize()}.** {claim.found}{' ' if claim.why else ''}{claim.why}"
-                lines += [f"> {html.escape(claim.words, quote=False)}", "", html.escape(found, quote=False), ""]
+                text = f"**{claim.verdict.capitalize()}.** {claim.found}{' ' if claim.why else ''}{claim.why}"
+                lines += [f"> {html.escape(claim.words, quote=False)}", "", html.escape(text, quote=False), ""]
     lines += ["## Every claim with its figure", ""]
     lines += ["| slide | claim of the talk | figure | verdict |", "|---|---|---|---|"]
     for number, slide in enumerate(slides, 1):

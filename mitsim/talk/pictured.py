@@ -61,12 +61,12 @@ def features_in_light(folder: str, file: StudyFile, numbers: tuple[int, ...]) ->
     """
     study = open_study(Path(folder) / "talk.toml", file)
     renderer = RenderedMeasurements(study, study_unknowns(study), rendering_of(study))
-    found = []
+    counts = []
     for number in numbers:
         view = study.view(number)
         _, cloud = renderer.at_best_estimates(view)
-        found.append(_counts(renderer, study.task.shapes, view, cloud.valid, study.performance_map))
-    return xr.concat(found, xr.Variable("view", list(numbers)))
+        counts.append(_counts(renderer, study.task.shapes, view, cloud.valid, study.performance_map))
+    return xr.concat(counts, xr.Variable("view", list(numbers)))
 
 
 def _counts(

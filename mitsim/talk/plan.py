@@ -95,7 +95,7 @@ def pieces_of(talk: Talk) -> list[Piece]:
     """Return all pieces of a talk but its virtual measurements, those of the first slides first."""
     file, coupons = talk.file, talk.file.coupons
     number = pictured_view(talk)
-    sensor, known = (file.sensor,), talk.map_name
+    sensor, map_name = (file.sensor,), talk.map_name
     pieces = [
         Piece(
             f"opening_{sensor_key(name)}",
@@ -111,30 +111,40 @@ def pieces_of(talk: Talk) -> list[Piece]:
         Piece(f"finish_{finish.key}", "finish", (talk.study_file(finish), number), sensor, (_scene(finish),))
         for finish in file.finishes
     ]
-    place = CouponPlace(coupons.campaign, file.sensor, coupons.distance_mm, coupons.roughness_um)
+    coupon_place = CouponPlace(coupons.campaign, file.sensor, coupons.distance_mm, coupons.roughness_um)
     campaign = read_toml(talk.folder / coupons.campaign, CampaignFile)
     of_coupons = tuple(
         (str(Path(coupons.campaign).parent / sample_entry.scene), ()) for sample_entry in campaign.samples
     )
     refined = (coupons.subdivisions, coupons.refined, file.seed)
-    pieces.append(Piece("characterised", "characterised", (place, *refined), sensor, of_coupons))
-    pieces.append(Piece("tilts", "tilts", (place, tuple(coupons.tilts_deg)), sensor, of_coupons))
-    pieces.append(Piece("sub_clouds", "sub_clouds", (place, _SUB_CLOUDS_TILT_DEG), sensor, of_coupons))
+    pieces.append(Piece("characterised", "characterised", (coupon_place, *refined), sensor, of_coupons))
+    pieces.append(Piece("tilts", "tilts", (coupon_place, tuple(coupons.tilts_deg)), sensor, of_coupons))
+    pieces.append(Piece("sub_clouds", "sub_clouds", (coupon_place, _SUB_CLOUDS_TILT_DEG), sensor, of_coupons))
     pieces += [Piece(f"noise_{sensor_key(name)}", "noise", (name, file.seed), (name,)) for name in file.noise_sensors]
     shown = CouponPlace(coupons.campaign, file.sensor, coupons.shown_distance_mm, coupons.shown_roughness_um)
-    pieces.append(Piece("clouds", "clouds", (shown, known, _CLOUDS_TILT_DEG, file.seed), sensor, of_coupons, known))
+    pieces.append(
+        Piece("clouds", "clouds", (shown, map_name, _CLOUDS_TILT_DEG, file.seed), sensor, of_coupons, map_name)
+    )
     for sample in campaign.samples:
         rough = coupon_pieces.roughness_of(sample)
         for distance in coupons.validated_distances_mm:
             there = CouponPlace(coupons.campaign, file.sensor, distance, rough)
             poses = coupons.poses * (_SHOWN_POSES if rough == coupons.shown_roughness_um else 1)
-            arguments = (there, known, poses, file.seed)
-            pieces.append(Piece(validation_name(rough, distance), "validation", arguments, sensor, of_coupons, known))
+            arguments = (there, map_name, poses, file.seed)
+            pieces.append(
+                Piece(validation_name(rough, distance), "validation", arguments, sensor, of_coupons, map_name)
+            )
     for artefact_entry in file.samples:
         study = (talk.study_file(artefact_entry),)
         pieces.append(
             Piece(
-                f"scores_{artefact_entry.key}", "scores", study, sensor, (_scene(artefact_entry),), known, (file.task,)
+                f"scores_{artefact_entry.key}",
+                "scores",
+                study,
+                sensor,
+                (_scene(artefact_entry),),
+                map_name,
+                (file.task,),
             )
         )
     numbers = compared_views(talk)
@@ -142,7 +152,7 @@ def pieces_of(talk: Talk) -> list[Piece]:
         for name, depth in (("direct", 1), ("all", file.light_path_depth)):
             seen = (talk.study_file(artefact_entry, depth), numbers)
             pieces.append(
-                Piece(f"light_{name}_{artefact_entry.key}", "light", seen, sensor, (_scene(artefact_entry),), known)
+                Piece(f"light_{name}_{artefact_entry.key}", "light", seen, sensor, (_scene(artefact_entry),), map_name)
             )
     return pieces
 

@@ -24,10 +24,10 @@ _LONG = 50
 
 
 class Results:
-    """Results of the pieces of a talk by their names, in ``folder`` and, read only, in ``others``."""
+    """Results of the pieces of a talk by their names, in ``folder`` and, read only, in ``fallbacks``."""
 
-    def __init__(self, folder: Path, others: tuple[Path, ...] = (), any_version: bool = False) -> None:
-        self.folder, self.others, self.any_version = folder, others, any_version
+    def __init__(self, folder: Path, fallbacks: tuple[Path, ...] = (), any_version: bool = False) -> None:
+        self.folder, self.fallbacks, self.any_version = folder, fallbacks, any_version
         self.digests: dict[str, str] = {}
         self._known: dict[str, xr.Dataset] = {}
 
@@ -40,10 +40,10 @@ class Results:
             If its file is damaged.
         """
         if name not in self._known:
-            found = self._read(name)
-            if found is None:
+            result = self._read(name)
+            if result is None:
                 return None
-            self._known[name] = found
+            self._known[name] = result
         return self._known[name]
 
     def add(self, name: str, data: xr.Dataset) -> None:
@@ -51,15 +51,15 @@ class Results:
         self.folder.mkdir(parents=True, exist_ok=True)
         marked = data.assign_attrs(version=VERSION, digest=self.digests.get(name, ""))
         encoding = {
-            one: {"zlib": True, "complevel": 9, "shuffle": True}
-            for one, values in marked.variables.items()
+            variable: {"zlib": True, "complevel": 9, "shuffle": True}
+            for variable, values in marked.variables.items()
             if values.dtype.kind in "fiu" and values.size > _LONG
         }
         write_netcdf(_narrow(marked), self.folder / f"{name}.nc", encoding)
         self._known[name] = marked
 
     def _read(self, name: str) -> xr.Dataset | None:
-        for folder in (self.folder, *self.others):
+        for folder in (self.folder, *self.fallbacks):
             path = folder / f"{name}.nc"
             if not path.exists():
                 continue

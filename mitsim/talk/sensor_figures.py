@@ -56,15 +56,15 @@ def opening_figure(frames: Mapping[str, xr.Dataset]) -> Figure:
     return figure
 
 
-def surfaces_figure(found: Mapping[str, xr.Dataset]) -> Figure:
+def surfaces_figure(datasets: Mapping[str, xr.Dataset]) -> Figure:
     """Draw image, cloud and status of the artefact in each finish."""
     with drawing():
-        figure = Figure((3.1 * len(found), 7.3), layout="constrained")
-        grid = np.asarray(figure.subplots(3, len(found), squeeze=False))
-        depth = np.concatenate([dataset["depth"].values.ravel() for dataset in found.values()])
+        figure = Figure((3.1 * len(datasets), 7.3), layout="constrained")
+        grid = np.asarray(figure.subplots(3, len(datasets), squeeze=False))
+        depth = np.concatenate([dataset["depth"].values.ravel() for dataset in datasets.values()])
         low, high = depth_limits(depth[np.isfinite(depth)], 2.0)
         present: set[int] = set()
-        for (name, dataset), (image, cloud, status) in zip(found.items(), grid.T, strict=True):
+        for (name, dataset), (image, cloud, status) in zip(datasets.items(), grid.T, strict=True):
             image.imshow(dataset["image"].values, cmap="gray", vmin=0, vmax=255)
             image.set_title(f"{name}: {100 * share(dataset):.0f} % of the points")
             shown = cloud.imshow(np.ma.masked_invalid(dataset["depth"].values), cmap=SEQUENTIAL, vmin=low, vmax=high)
@@ -158,12 +158,12 @@ def processing_figure(tilts: xr.Dataset) -> Figure:
     return figure
 
 
-def noise_figure(found: Mapping[str, xr.Dataset]) -> Figure:
+def noise_figure(datasets: Mapping[str, xr.Dataset]) -> Figure:
     """Draw the residuals of each sensor as a picture, and their histogram with the normal curve."""
     with drawing():
-        figure = Figure((2.65 * len(found), 5.0), layout="constrained")
-        grid = np.asarray(figure.subplots(2, len(found), squeeze=False))
-        for (name, dataset), (picture, curve) in zip(found.items(), grid.T, strict=True):
+        figure = Figure((2.65 * len(datasets), 5.0), layout="constrained")
+        grid = np.asarray(figure.subplots(2, len(datasets), squeeze=False))
+        for (name, dataset), (picture, curve) in zip(datasets.items(), grid.T, strict=True):
             limit = residual_limit(dataset["image"].values)
             shown = picture.imshow(dataset["image"].values, cmap=DIVERGING, vmin=-limit, vmax=limit)
             picture.set_facecolor(FIELD)
@@ -183,19 +183,19 @@ def noise_figure(found: Mapping[str, xr.Dataset]) -> Figure:
     return figure
 
 
-def results_figure(found: xr.Dataset, blinding: tuple[float, float]) -> Figure:
+def results_figure(characterised: xr.Dataset, blinding: tuple[float, float]) -> Figure:
     """Draw samples, F and sigma in gradient space for one coupon at one distance, with the named regions."""
     with drawing():
         figure = Figure((10.4, 3.7), layout="constrained")
         panels = figure.subplots(1, 3)
-        x, y = gradient(found["patch_x"].values.astype(float), found["patch_y"].values.astype(float))
+        x, y = gradient(characterised["patch_x"].values.astype(float), characterised["patch_y"].values.astype(float))
         panels[0].plot(x, y, ".", ms=1.6, color=BLUE)
-        panels[0].set_title(f"{found.attrs['patches']:,} point cloud samples".replace(",", " "))
-        sigma = found["ray_noise_std"].values
+        panels[0].set_title(f"{characterised.attrs['patches']:,} point cloud samples".replace(",", " "))
+        sigma = characterised["ray_noise_std"].values
         norms = (Normalize(0, 1), LogNorm(*noise_limits(sigma)))
-        inside = _in_gradient_space(found["a"].values.astype(float))
+        inside = _in_gradient_space(characterised["a"].values.astype(float))
         for axes, values, norm, colours, label in (
-            (panels[1], found["recovered_fraction"].values, norms[0], SEQUENTIAL, "F [1]"),
+            (panels[1], characterised["recovered_fraction"].values, norms[0], SEQUENTIAL, "F [1]"),
             (panels[2], sigma, norms[1], NOISE, "σ [mm]"),
         ):
             shown = axes.imshow(
@@ -212,11 +212,11 @@ def results_figure(found: xr.Dataset, blinding: tuple[float, float]) -> Figure:
             _gradient_axes(axes, blinding if axes is not panels[2] else None)
         arrow = {"arrowstyle": "->", "color": INK}
         box = {"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1.0}
-        for words, place, at in (
+        for words, target, at in (
             ("self-blinding", blinding, (1.2, 1.0)),
             ("adverse scattering", (0.0, -2.1), (1.2, -1.3)),
         ):
-            panels[1].annotate(words, place, at, arrowprops=arrow, bbox=box, fontsize=8, ha="center", zorder=6)
+            panels[1].annotate(words, target, at, arrowprops=arrow, bbox=box, fontsize=8, ha="center", zorder=6)
     return figure
 
 
@@ -225,9 +225,9 @@ def _in_gradient_space(axis: Floats) -> tuple[NDArray[np.int64], NDArray[np.int6
     steps = np.linspace(-_GRADIENT, _GRADIENT, 201)
     x, y = np.meshgrid(steps, steps)
     normals = np.stack([x, y, np.ones_like(x)], axis=-1)
-    places = lambert_projection(normals / np.linalg.norm(normals, axis=-1, keepdims=True))
+    positions = lambert_projection(normals / np.linalg.norm(normals, axis=-1, keepdims=True))
     step = axis[1] - axis[0]
-    nodes = np.clip(np.rint((places - axis[0]) / step), 0, len(axis) - 1).astype(np.int64)
+    nodes = np.clip(np.rint((positions - axis[0]) / step), 0, len(axis) - 1).astype(np.int64)
     return nodes[..., 1], nodes[..., 0]
 
 
@@ -275,7 +275,7 @@ def validation_figure(clouds: xr.Dataset, cells: Sequence[tuple[str, float, xr.D
             name: np.where(clouds[name].values == NO_POINT, np.nan, STEP_MM * clouds[name].values.astype(float))
             for name in ("captured", "drawn")
         }
-        limit = residual_limit(np.concatenate([one.ravel() for one in pictures.values()]))
+        limit = residual_limit(np.concatenate([residuals.ravel() for residuals in pictures.values()]))
         for name, residuals in pictures.items():
             picture = axes[name].imshow(residuals, cmap=DIVERGING, vmin=-limit, vmax=limit)
             axes[name].set_facecolor(FIELD)
@@ -312,8 +312,8 @@ def validation_figure(clouds: xr.Dataset, cells: Sequence[tuple[str, float, xr.D
                     )
                     for sample in names
                 ]
-                places = np.arange(len(names)) + (number - (len(distances) - 1) / 2) * width
-                axes[key].bar(places, values, 0.92 * width, label=f"{distance:g} mm", color=f"C{number}")
+                positions = np.arange(len(names)) + (number - (len(distances) - 1) / 2) * width
+                axes[key].bar(positions, values, 0.92 * width, label=f"{distance:g} mm", color=f"C{number}")
             axes[key].axhline(10, color=VERMILION, lw=1)
             axes[key].set_xticks(range(len(names)), names)
             axes[key].set(ylabel=label, ylim=(0, max(13.0, axes[key].get_ylim()[1])))
@@ -321,12 +321,12 @@ def validation_figure(clouds: xr.Dataset, cells: Sequence[tuple[str, float, xr.D
     return figure
 
 
-def light_figure(found: Mapping[str, tuple[xr.Dataset, xr.Dataset]]) -> Figure:
+def light_figure(pairs: Mapping[str, tuple[xr.Dataset, xr.Dataset]]) -> Figure:
     """Draw captured over expected F of the artefact's features, in direct light alone and in all light, by sample."""
     with drawing():
-        figure = Figure((2.1 * len(found) + 0.5, 2.9), layout="constrained")
-        row = np.asarray(figure.subplots(1, len(found), squeeze=False, sharey=True))[0]
-        for axes, (name, pair) in zip(row, found.items(), strict=True):
+        figure = Figure((2.1 * len(pairs) + 0.5, 2.9), layout="constrained")
+        row = np.asarray(figure.subplots(1, len(pairs), squeeze=False, sharey=True))[0]
+        for axes, (name, pair) in zip(row, pairs.items(), strict=True):
             for dataset, mark, colour, words in zip(
                 pair, "ox", (MUTED, VERMILION), ("direct light", "all light"), strict=True
             ):

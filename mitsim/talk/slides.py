@@ -1,4 +1,4 @@
-"""A slide of the talk as it was made again: its claim, its figure, the figures found, and the verdict."""
+"""Hold a slide of the talk as it was made again: claims, each with the figures of the results and a verdict."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Verdict = Literal["holds", "holds in part", "does not hold", "shown", "missing"]
 
 @dataclass(frozen=True)
 class Claim:
-    """One claim of a slide, word for word, and what was found.
+    """One claim of a slide, word for word, and the results that decide on it.
 
     ``found`` has the numbers in sentences, ``figure`` those that decide. ``why`` explains a claim that does not hold.
     ``picture`` names the picture of the slide that shows it; by default all do.
@@ -54,16 +54,16 @@ def verdict(holds: bool, in_part: bool = False) -> Verdict:
 
 def collected(results: Results, names: Mapping[str, str], slide: Slide) -> dict[str, xr.Dataset]:
     """Return the results of pieces by the keys of ``names``; missing ones are noted in the slide."""
-    found = {key: results.get(name) for key, name in names.items()}
-    slide.missing.extend(names[key] for key, dataset in found.items() if dataset is None)
-    return {key: dataset for key, dataset in found.items() if dataset is not None}
+    datasets = {key: results.get(name) for key, name in names.items()}
+    slide.missing.extend(names[key] for key, dataset in datasets.items() if dataset is None)
+    return {key: dataset for key, dataset in datasets.items() if dataset is not None}
 
 
 def finite(values: ArrayLike) -> NDArray[np.float64]:
     """Return the finite values (n,); NaN alone without any."""
-    known = np.asarray(values, float)
-    known = known[np.isfinite(known)]
-    return known if len(known) else np.array([math.nan])
+    numbers = np.asarray(values, float)
+    numbers = numbers[np.isfinite(numbers)]
+    return numbers if len(numbers) else np.array([math.nan])
 
 
 def mean_of(values: ArrayLike) -> float:

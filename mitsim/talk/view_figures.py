@@ -36,28 +36,28 @@ def sphere(axes: Axes, scores: xr.Dataset, values: Floats, title: str, label: st
     error
         Draw small values bright, on a logarithmic scale.
     """
-    places = view_places(scores)
+    positions = view_places(scores)
     outside = scores["left_out"].values
-    reach = 1.06 * float(np.linalg.norm(places, axis=1).max())
+    reach = 1.06 * float(np.linalg.norm(positions, axis=1).max())
     disc(axes, reach)
     sphere_of_views(axes, reach)
-    known = np.isfinite(values)
-    size = 4200 / max(len(places), 20)
+    valid = np.isfinite(values)
+    size = 4200 / max(len(positions), 20)
     if len(outside):
         zenith = np.arccos(np.clip(outside[:, 2], -1, 1))
         around = np.arctan2(outside[:, 1], outside[:, 0])
         there = (2 * np.sin(zenith / 2))[:, None] * np.stack([np.cos(around), np.sin(around)], axis=-1)
         axes.plot(*there[np.linalg.norm(there, axis=1) < reach].T, "s", ms=4, mfc="none", mec=MUTED, zorder=3)
-    x, y = places.T
-    axes.scatter(x[~known], y[~known], marker="x", s=0.4 * size, c=MUTED, lw=0.9, zorder=3)
-    if known.any():
-        low, high = float(values[known].min()), float(np.percentile(values[known], 95 if error else 100))
+    x, y = positions.T
+    axes.scatter(x[~valid], y[~valid], marker="x", s=0.4 * size, c=MUTED, lw=0.9, zorder=3)
+    if valid.any():
+        low, high = float(values[valid].min()), float(np.percentile(values[valid], 95 if error else 100))
         norm: Normalize = Normalize(0 if low >= 0 else low, max(high, 1e-9))
         if error and low > 0:
             norm = LogNorm(low, max(high, 1.05 * low))
         colours = f"{SEQUENTIAL}_r" if error else SEQUENTIAL
         shown = axes.scatter(
-            x[known], y[known], c=values[known], s=size, norm=norm, cmap=colours, lw=0.3, ec=MUTED, zorder=4
+            x[valid], y[valid], c=values[valid], s=size, norm=norm, cmap=colours, lw=0.3, ec=MUTED, zorder=4
         )
         bar = colour_scale(
             figure_of(axes), shown, axes, label, extend="max" if error else "neither", location="bottom", shrink=0.8
@@ -122,16 +122,16 @@ def bars(axes: Axes, cell: xr.Dataset, name: str) -> None:
     """
     values = cell[name].values
     low, high = cell[f"{name}_low"].values, cell[f"{name}_high"].values
-    known = np.isfinite(values)
+    valid = np.isfinite(values)
     colours = [MUTED if number == 0 else BLUE for number in cell["bin"].values]
-    axes.bar(cell["bin"].values[known], values[known], 0.8, color=np.array(colours)[known])
-    ends = known & np.isfinite(low)
+    axes.bar(cell["bin"].values[valid], values[valid], 0.8, color=np.array(colours)[valid])
+    ends = valid & np.isfinite(low)
     spread = np.abs(np.stack([values - low, high - values])[:, ends])
     axes.errorbar(cell["bin"].values[ends], values[ends], spread, fmt="none", ecolor=INK, elinewidth=0.8, capsize=1.8)
-    top = 1.15 * float(values[known].max()) if known.any() else 1.0
-    if known.any():
+    top = 1.15 * float(values[valid].max()) if valid.any() else 1.0
+    if valid.any():
         axes.set_ylim(0, min(max(top, 1.03 * float(np.where(ends, high, 0).max())), 2.2 * top))
-    empty = (cell["views"].values > 0) & ~known
+    empty = (cell["views"].values > 0) & ~valid
     axes.plot(cell["bin"].values[empty], np.full(empty.sum(), 0.03 * axes.get_ylim()[1]), "x", color=VERMILION, ms=6)
     shares = ["–" if math.isnan(share) else f"{100 * share:.0f}" for share in cell["share"].values]
     names = ["imp.", *map(str, range(1, 11))]
@@ -150,17 +150,17 @@ def ranks_figure(ranks: Mapping[str, Mapping[str, xr.Dataset]]) -> Figure:
         for axes, (quantity, words) in zip(panels, QUANTITIES.items(), strict=True):
             axes.plot([1, 10], [10, 1], color=MUTED, lw=0.8, label="perfect")
             for number, (kind, name) in enumerate(SCORES.items()):
-                found = ranks[kind][quantity]
-                rank = found["rank"].values
-                spread = np.stack([rank - found["rank_low"].values, found["rank_high"].values - rank])
+                mean_ranks = ranks[kind][quantity]
+                rank = mean_ranks["rank"].values
+                spread = np.stack([rank - mean_ranks["rank_low"].values, mean_ranks["rank_high"].values - rank])
                 spread = np.where(np.isfinite(spread), np.maximum(spread, 0), 0)
-                place = found["bin"].values + 0.13 * (number - 1)
-                correlation = found.attrs["correlation"]
-                ends = f"({found.attrs['correlation_low']:+.2f} to {found.attrs['correlation_high']:+.2f})"
+                position = mean_ranks["bin"].values + 0.13 * (number - 1)
+                correlation = mean_ranks.attrs["correlation"]
+                ends = f"({mean_ranks.attrs['correlation_low']:+.2f} to {mean_ranks.attrs['correlation_high']:+.2f})"
                 label = name if math.isnan(correlation) else f"{name}: {correlation:+.2f} {ends}".replace("-", "−")
                 colour = (BLUE, VERMILION, "#009e73")[number]
                 axes.errorbar(
-                    place, rank, spread, fmt="osD"[number] + "-", ms=4, lw=0.9, capsize=2, color=colour, label=label
+                    position, rank, spread, fmt="osD"[number] + "-", ms=4, lw=0.9, capsize=2, color=colour, label=label
                 )
             axes.set(xlabel="decile of the score, 10 is best", title=f"by {words}", xticks=range(1, 11))
             axes.set(yticks=range(2, 11, 2), ylim=(0.5, 12.5))  # the legend is above

@@ -89,20 +89,20 @@ def find_sources(folder: str | Path) -> list[Source]:
     InputError
         If there is none, or a scene no longer exists.
     """
-    found = []
+    sources = []
     for path in sorted(Path(folder).glob("*/view_*/settings.json")):
         try:
             many = json.loads(path.read_text(encoding="utf-8"))["many"]
             scene, view = Path(many["scene"]), int(many["view"])
-            found.append(Source(path.parent, str(many["finish"]), view, scene, dict(many["parameters"])))
+            sources.append(Source(path.parent, str(many["finish"]), view, scene, dict(many["parameters"])))
         except (OSError, ValueError, KeyError, TypeError) as error:
             allowed = "a capture taken by mitsim render --many"
             raise InputError(path, "many", f"unreadable data ({error})", allowed) from None
         if not scene.is_file():
             raise InputError(path, "many.scene", f"{scene}, which does not exist", "the scene that was rendered")
-    if not found:
+    if not sources:
         raise InputError(folder, "", "no captures", "FINISH/view_NNNN folders, as mitsim render --many writes them")
-    return found
+    return sources
 
 
 def objects_of(names: Sequence[str], patterns: Sequence[str]) -> list[tuple[str, ...]]:
@@ -123,8 +123,8 @@ def objects_of(names: Sequence[str], patterns: Sequence[str]) -> list[tuple[str,
     for name in every:
         if every.count(name) > 1:
             both = [pattern for pattern, shapes in zip(patterns, objects, strict=True) if name in shapes]
-            found = f"{' and '.join(both)}, which both have {name}"
-            raise InputError("--object", "", found, "objects without common shapes")
+            overlap = f"{' and '.join(both)}, which both have {name}"
+            raise InputError("--object", "", overlap, "objects without common shapes")
     return objects
 
 
@@ -154,8 +154,10 @@ def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train
     output = Path(output).absolute()
     if output.exists():
         raise InputError("--output", "", f"{output}, which exists", "a new folder")
-    finishes = list(dict.fromkeys(one.finish for one in sources))
-    tables: dict[str, dict[str, dict[str, Any]]] = {one: {"camera": {}, "gt": {}, "gt_info": {}} for one in finishes}
+    finishes = list(dict.fromkeys(source.finish for source in sources))
+    tables: dict[str, dict[str, dict[str, Any]]] = {
+        finish: {"camera": {}, "gt": {}, "gt_info": {}} for finish in finishes
+    }
     scenes: dict[str, tuple[Scene, list[Scene]]] = {}
     camera: dict[str, Any] = {}
     with atomic_folder(output) as partial:
@@ -165,8 +167,8 @@ def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train
                 scene = load_scene(source.scene, _ANY_NM, dict(source.parameters))
                 scenes[source.finish] = scene, [scene.only(*names) for names in objects_of(scene.names, patterns)]
             frame, scale = bop_frame(capture, *scenes[source.finish], source.folder)
-            place = partial / split / f"{finishes.index(source.finish) + 1:06d}"
-            _write_frame(frame, place, len(tables[source.finish]["camera"]), scale, tables[source.finish])
+            folder = partial / split / f"{finishes.index(source.finish) + 1:06d}"
+            _write_frame(frame, folder, len(tables[source.finish]["camera"]), scale, tables[source.finish])
             camera = camera or _camera_file(frame.grid, scale)
         for number, finish in enumerate(finishes, 1):
             for name, table in tables[finish].items():
@@ -177,7 +179,7 @@ def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train
         _write_json(partial / "statuses.json", {str(status.value): status.name.lower() for status in Status})
         _write_json(partial / "features.json", {str(k): name for k, name in enumerate(first.names, 1)})
         _write_json(partial / "finishes.json", {f"{k:06d}": name for k, name in enumerate(finishes, 1)})
-        described = _about(sources, finishes, split, [one.names for one in objects])
+        described = _about(sources, finishes, split, [part.names for part in objects])
         (partial / "dataset_info.md").write_text(described, encoding="utf-8")
     return len(sources)
 
@@ -208,8 +210,8 @@ def bop_frame(capture: Capture, scene: Scene, objects: Sequence[Scene], where: s
     rays, there = PixelRays.of_grid(grid), capture.world_from_sensor
     seen, met = cast(scene, rays, there, np.zeros((0, 3))), shapes_met(scene, rays, there)
     masks = tuple(
-        (shapes_met(one, rays, there) >= 0, np.isin(met, [scene.names.index(name) for name in one.names]))
-        for one in objects
+        (shapes_met(part, rays, there) >= 0, np.isin(met, [scene.names.index(name) for name in part.names]))
+        for part in objects
     )
     along = grid.rays() @ grid.rotation[:, 2]
     pose = (capture.world_from_sensor @ sensor_from_grid(grid)).inverse()
@@ -222,10 +224,10 @@ def on_pinhole(cloud: PointCloud, grid: ViewGrid) -> tuple[NDArray[np.float64], 
     depth = (cloud.points.astype(np.float64) - cloud.grid.origin) @ cloud.grid.rotation[:, 2]
     if cloud.grid.normalised is None:
         return depth, cloud.status
-    place = np.rint(cloud.grid.project(grid.origin + 1000.0 * grid.rays()))
+    pixel = np.rint(cloud.grid.project(grid.origin + 1000.0 * grid.rays()))
     last = np.array([grid.width, grid.height]) - 1
-    inside = np.asarray(np.isfinite(place).all(-1) & (place >= 0).all(-1) & (place <= last).all(-1))
-    column, row = np.moveaxis(np.where(inside[..., None], place, 0).astype(np.intp), -1, 0)
+    inside = np.asarray(np.isfinite(pixel).all(-1) & (pixel >= 0).all(-1) & (pixel <= last).all(-1))
+    column, row = np.moveaxis(np.where(inside[..., None], pixel, 0).astype(np.intp), -1, 0)
     return np.where(inside, depth[row, column], np.nan), np.where(
         inside, cloud.status[row, column], np.uint8(Status.NO_SURFACE)
     )
@@ -246,14 +248,14 @@ def _grey(capture: Capture, grid: ViewGrid) -> NDArray[np.uint8] | None:
     lit = capture.images[name]
     if capture.decoding.ambient_image and len(lit) > 1:
         lit = lit[:-1]
-    place = camera.project((camera.centre + 1000.0 * grid.rays()).reshape(-1, 3)).reshape(grid.height, grid.width, 2)
-    place = np.nan_to_num(place, nan=-9.0)  # outside the image
+    pixels = camera.project((camera.centre + 1000.0 * grid.rays()).reshape(-1, 3)).reshape(grid.height, grid.width, 2)
+    pixels = np.nan_to_num(pixels, nan=-9.0)  # outside the image
     mean = lit.mean(axis=0, dtype=np.float64) * 255 / (2**capture.bits - 1)
-    sampled = map_coordinates(mean, [place[..., 1], place[..., 0]], order=1, mode="constant", cval=0.0)
+    sampled = map_coordinates(mean, [pixels[..., 1], pixels[..., 0]], order=1, mode="constant", cval=0.0)
     return np.asarray(np.rint(np.nan_to_num(sampled)).clip(0, 255), np.uint8)
 
 
-def _write_frame(frame: Frame, place: Path, number: int, scale: float, tables: dict[str, dict[str, Any]]) -> None:
+def _write_frame(frame: Frame, folder: Path, number: int, scale: float, tables: dict[str, dict[str, Any]]) -> None:
     name = f"{number:06d}"
     counts = np.rint(np.nan_to_num(frame.depth) / scale).clip(0, 65535).astype(np.uint16)
     true = np.rint(np.nan_to_num(frame.true_depth) / scale).clip(0, 65535).astype(np.uint16)
@@ -269,8 +271,8 @@ def _write_frame(frame: Frame, place: Path, number: int, scale: float, tables: d
         images[f"mask_visib/{name}_{k:06d}"] = np.where(visible, 255, 0).astype(np.uint8)
     for path, image in images.items():
         if image is not None:
-            (place / path).parent.mkdir(parents=True, exist_ok=True)
-            (place / f"{path}.png").write_bytes(encode_png(np.ascontiguousarray(image)))
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            (folder / f"{path}.png").write_bytes(encode_png(np.ascontiguousarray(image)))
     pose, key = frame.camera_from_part, str(number)
     turn, shift = pose.rotation.ravel().tolist(), pose.translation.tolist()
     grid = frame.grid

@@ -65,12 +65,12 @@ class Issuer:
             raise InputError("--country", "", repr(self.country), "two capital letters after ISO 3166-1: GB")
 
 
-def write_dcc(found: RunResults, declared: Declaration, issuer: Issuer, path: str | Path) -> None:
+def write_dcc(run_results: RunResults, declared: Declaration, issuer: Issuer, path: str | Path) -> None:
     """Write results as one DCC document.
 
     Parameters
     ----------
-    found, declared
+    run_results, declared
         Results of a run, and their declaration.
     issuer
         Who issues the certificate.
@@ -84,31 +84,31 @@ def write_dcc(found: RunResults, declared: Declaration, issuer: Issuer, path: st
     register_namespace("dcc", DCC)
     register_namespace("si", SI)
     register_namespace("xsi", _XSI)
-    root = dcc_document(found, declared, issuer)
+    root = dcc_document(run_results, declared, issuer)
     indent(root)
     with atomic_write(path) as file:
         ElementTree(root).write(file, encoding="utf-8", xml_declaration=True)
 
 
-def dcc_document(found: RunResults, declared: Declaration, issuer: Issuer) -> Element:
+def dcc_document(run_results: RunResults, declared: Declaration, issuer: Issuer) -> Element:
     """Return the document; its identifier derives from the statement's digest and the issuer."""
     root = Element(f"{{{DCC}}}digitalCalibrationCertificate", {"schemaVersion": "3.2.1"})
     root.set(f"{{{_XSI}}}schemaLocation", _SCHEMA)
-    _administrative(_add(root, "administrativeData"), found, declared, issuer)
+    _administrative(_add(root, "administrativeData"), run_results, declared, issuer)
     result = _add(_add(root, "measurementResults"), "measurementResult")
     _text(result, "name", "Measurement uncertainty by virtual measurements")
-    _methods(result, found, declared)
+    _methods(result, run_results, declared)
     _software(_add(result, "usedSoftware"))
     equipment = _add(_add(result, "measuringEquipments"), "measuringEquipment")
-    _text(equipment, "name", f"3D vision sensor {found.sensor}, simulated")
+    _text(equipment, "name", f"3D vision sensor {run_results.sensor}, simulated")
     _identified(_add(equipment, "identifications"), "owner", issuer.serial, "serial number")
     results = _add(result, "results")
-    for expected_result in found.results:
+    for expected_result in run_results.results:
         _result(results, expected_result)
     return root
 
 
-def _administrative(to: Element, found: RunResults, declared: Declaration, issuer: Issuer) -> None:
+def _administrative(to: Element, run_results: RunResults, declared: Declaration, issuer: Issuer) -> None:
     _software(_add(to, "dccSoftware"))
     core = _add(to, "coreData")
     _add(core, "countryCodeISO3166_1", issuer.country)
@@ -126,8 +126,8 @@ def _administrative(to: Element, found: RunResults, declared: Declaration, issue
         _add(core, name, declared.date)
     _add(core, "performanceLocation", "other")
     item = _add(_add(to, "items"), "item")
-    _text(item, "name", f"3D vision sensor {found.sensor}, simulated")
-    _add(item, "model", found.sensor)
+    _text(item, "name", f"3D vision sensor {run_results.sensor}, simulated")
+    _add(item, "model", run_results.sensor)
     _identified(_add(item, "identifications"), "owner", issuer.serial, "serial number")
     laboratory = _add(_add(to, "calibrationLaboratory"), "contact")
     _text(laboratory, "name", issuer.laboratory)
@@ -149,19 +149,21 @@ def _administrative(to: Element, found: RunResults, declared: Declaration, issue
             _text(statement, "declaration", text)
 
 
-def _methods(to: Element, found: RunResults, declared: Declaration) -> None:
+def _methods(to: Element, run_results: RunResults, declared: Declaration) -> None:
     used = _add(_add(to, "usedMethods"), "usedMethod", refType="basic_methodMeasurementUncertainty")
     _text(used, "name", "Simulate and analyse, a virtual experiment")
-    how = "rendered and decoded" if found.source == "render" else "drawn from a performance map"
-    _text(used, "description", " ".join([f"Virtual measurements {how}.", *(note.in_full for note in declared.notes)]))
+    method = "rendered and decoded" if run_results.source == "render" else "drawn from a performance map"
+    _text(
+        used, "description", " ".join([f"Virtual measurements {method}.", *(note.in_full for note in declared.notes)])
+    )
     for norm in ("JCGM 101:2008", "ISO/TS 15530-4:2008"):
         _add(used, "norm", norm)
 
 
 def _software(to: Element) -> None:
-    one = _add(to, "software")
-    _text(one, "name", "mitsim")
-    _add(one, "release", __version__)
+    software = _add(to, "software")
+    _text(software, "name", "mitsim")
+    _add(software, "release", __version__)
 
 
 def _result(to: Element, expected_result: ExpectedResult) -> None:
@@ -220,9 +222,9 @@ def _limits(result: ExpectedResult) -> tuple[float | None, float | None]:
 
 
 def _quantity(to: Element, name: str, reference: str = "") -> Element:
-    one = _add(to, "quantity", **({"refType": reference} if reference else {}))
-    _text(one, "name", name)
-    return one
+    quantity = _add(to, "quantity", **({"refType": reference} if reference else {}))
+    _text(quantity, "name", name)
+    return quantity
 
 
 def _real(to: Element, value: float, unit: str) -> Element:
@@ -238,10 +240,10 @@ def _number(value: float) -> str:
 
 
 def _identified(to: Element, issuer: str, value: str, name: str) -> None:
-    one = _add(to, "identification")
-    _add(one, "issuer", issuer)
-    _add(one, "value", value)
-    _text(one, "name", name)
+    identification = _add(to, "identification")
+    _add(identification, "issuer", issuer)
+    _add(identification, "value", value)
+    _text(identification, "name", name)
 
 
 def _text(to: Element, tag: str, text: str) -> None:

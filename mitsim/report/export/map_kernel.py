@@ -32,7 +32,7 @@ class SensorMap:
 
     def __init__(self, path: str | Path) -> None:
         with np.load(path, allow_pickle=False) as file:
-            self.sensor, self.finishes = str(file["sensor"]), [str(one) for one in file["finish"]]
+            self.sensor, self.finishes = str(file["sensor"]), [str(name) for name in file["finish"]]
             self.roughness, self.distances = file["roughness"].astype(float), file["distance"].astype(float)
             self.axis, self.baseline = file["axis"].astype(float), file["baseline"].astype(float)
             self.fields = file["probit"], file["log_sigma"]  # (sample, distance, b, a) each
@@ -99,49 +99,53 @@ class SensorMap:
         n = np.asarray(normals, float)
         with np.errstate(divide="ignore", invalid="ignore"):
             at = n[..., :2] * np.sqrt(2 / (1 + n[..., 2:]))  # Lambert's equal-area projection
-            place = np.log(np.asarray(distance, float))
+            log_distance = np.log(np.asarray(distance, float))
         knots, last = np.log(self.distances), len(self.axis) - 1
         column, row = np.moveaxis((at - self.axis[0]) / (self.axis[1] - self.axis[0]), -1, 0)
         inside = (np.minimum(column, row) >= -1e-4) & (np.maximum(column, row) <= last + 1e-4) & (n[..., 2] > 0)
         if len(knots) == 1:
-            inside, j, t = inside & (np.abs(place - knots[0]) < 1e-9), np.zeros(place.shape, int), np.zeros(place.shape)
+            inside, j, t = (
+                inside & (np.abs(log_distance - knots[0]) < 1e-9),
+                np.zeros(log_distance.shape, int),
+                np.zeros(log_distance.shape),
+            )
         else:
-            j = np.clip(np.searchsorted(knots, place) - 1, 0, len(knots) - 2)
-            t = (place - knots[j]) / np.diff(knots)[j]
+            j = np.clip(np.searchsorted(knots, log_distance) - 1, 0, len(knots) - 2)
+            t = (log_distance - knots[j]) / np.diff(knots)[j]
             inside = inside & (t >= -1e-9) & (t <= 1 + 1e-9)
-        column, row = (np.clip(np.where(inside, one, 0), 0, last) for one in (column, row))
-        left, low = (np.minimum(one.astype(int), last - 1) for one in (column, row))
+        column, row = (np.clip(np.where(inside, index, 0), 0, last) for index in (column, row))
+        left, low = (np.minimum(index.astype(int), last - 1) for index in (column, row))
         u, v = column - left, row - low
         share = np.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], axis=-1)
         corners = (low[..., None] + [0, 0, 1, 1], left[..., None] + [0, 1, 0, 1])
         far = np.minimum(j + 1, len(knots) - 1)
-        found: list[tuple[Any, Any]] = []
+        means: list[tuple[Any, Any]] = []
         for k, field in enumerate((probit, log_sigma)):
             near, beyond = field[(j[..., None], *corners)], field[(far[..., None], *corners)]
             values = _between(near, beyond, np.clip(t, 0, 1)[..., None], either=k == 1)
-            known = np.isfinite(values) & (share > 0)
-            weight = np.where(known, share, 0.0).sum(-1)
+            valid = np.isfinite(values) & (share > 0)
+            weight = np.where(valid, share, 0.0).sum(-1)
             # corners with F must have half of the weight
-            enough = inside & ((weight >= 0.5) if k == 0 else found[0][1])
+            enough = inside & ((weight >= 0.5) if k == 0 else means[0][1])
             with np.errstate(invalid="ignore", divide="ignore"):
-                mean = np.where(known, share * values, 0.0).sum(-1) / weight
-            found.append((np.where(enough, mean, np.nan), enough))
-        fraction = (np.interp(found[0][0], _Z, _PHI) - _MARGIN) / (1 - 2 * _MARGIN)
+                mean = np.where(valid, share * values, 0.0).sum(-1) / weight
+            means.append((np.where(enough, mean, np.nan), enough))
+        fraction = (np.interp(means[0][0], _Z, _PHI) - _MARGIN) / (1 - 2 * _MARGIN)
         fraction = np.where(fraction < _ROUNDED, 0.0, np.where(fraction > 1 - _ROUNDED, 1.0, fraction))
-        return fraction, np.exp(found[1][0])
+        return fraction, np.exp(means[1][0])
 
     def _surface(self, finish: str, roughness: float) -> tuple[Any, Any]:
         """Return the fields (distance, b, a) of a finish at Ra [um], linear in ln Ra between its samples."""
-        members = sorted((i for i, one in enumerate(self.finishes) if one == finish), key=lambda i: self.roughness[i])
+        members = sorted((i for i, name in enumerate(self.finishes) if name == finish), key=lambda i: self.roughness[i])
         if not members:
             raise ValueError(f"finish {finish!r}: the map has {', '.join(dict.fromkeys(self.finishes))}")
-        known, (probit, log_sigma) = self.roughness[members], self.fields
-        if math.isnan(known[0]) or (len(known) == 1 and abs(roughness / known[0] - 1) < 1e-6):
+        samples, (probit, log_sigma) = self.roughness[members], self.fields
+        if math.isnan(samples[0]) or (len(samples) == 1 and abs(roughness / samples[0] - 1) < 1e-6):
             return probit[members[0]].astype(float), log_sigma[members[0]].astype(float)
-        if not known[0] * (1 - 1e-6) <= roughness <= known[-1] * (1 + 1e-6):
-            raise ValueError(f"Ra {roughness:g} um: the map has {known[0]:g} to {known[-1]:g} um of {finish}")
-        j = int(np.clip(np.searchsorted(np.log(known), math.log(roughness)) - 1, 0, len(known) - 2))
-        t = np.asarray(np.clip(math.log(roughness / known[j]) / math.log(known[j + 1] / known[j]), 0.0, 1.0))
+        if not samples[0] * (1 - 1e-6) <= roughness <= samples[-1] * (1 + 1e-6):
+            raise ValueError(f"Ra {roughness:g} um: the map has {samples[0]:g} to {samples[-1]:g} um of {finish}")
+        j = int(np.clip(np.searchsorted(np.log(samples), math.log(roughness)) - 1, 0, len(samples) - 2))
+        t = np.asarray(np.clip(math.log(roughness / samples[j]) / math.log(samples[j + 1] / samples[j]), 0.0, 1.0))
         low, high = members[j], members[j + 1]
         return _between(probit[low], probit[high], t, False), _between(log_sigma[low], log_sigma[high], t, True)
 

@@ -42,20 +42,20 @@ NAMESPACE = "http://qifstandards.org/xsd/qif3"
 _PRECEDENCE = ("PRIMARY", "SECONDARY", "TERTIARY")
 
 
-def write_qif(found: RunResults, path: str | Path) -> None:
+def write_qif(run_results: RunResults, path: str | Path) -> None:
     """Write results and plan as one QIF document."""
-    root = qif_document(found)
+    root = qif_document(run_results)
     indent(root)
     with atomic_write(path) as file:
         ElementTree(root).write(file, encoding="utf-8", xml_declaration=True)
 
 
-def qif_document(found: RunResults) -> Element:
+def qif_document(run_results: RunResults) -> Element:
     """Return the document of a run; its id derives from its content, so equal runs give equal documents."""
     ids = Ids()
     standard = {"Organization": {"StandardsOrganizationEnum": "ISO"}, "Designator": "1101"}
     standards = [element("Standard", standard, id=ids.new("standard"))]
-    for name in found.task.features:
+    for name in run_results.task.features:
         ids.new("nominal", name)
     content = {
         "QPId": "",
@@ -67,12 +67,12 @@ def qif_document(found: RunResults) -> Element:
                 "LinearUnit": _unit("meter", "mm", "0.001"),
             }
         },
-        **_datums(ids, found),
-        "MeasurementResources": {"MeasurementDevices": [_device(ids, found)]},
-        "Features": _features(ids, found),
-        "Characteristics": _characteristics(ids, found),
-        "Plan": _plan(ids, found),
-        "Results": {"MeasurementResultsSet": [_results(ids, found)]},
+        **_datums(ids, run_results),
+        "MeasurementResources": {"MeasurementDevices": [_device(ids, run_results)]},
+        "Features": _features(ids, run_results),
+        "Characteristics": _characteristics(ids, run_results),
+        "Plan": _plan(ids, run_results),
+        "Results": {"MeasurementResultsSet": [_results(ids, run_results)]},
     }
     root = element("QIFDocument", content, xmlns=NAMESPACE, versionQIF="3.0.0")
     root.set("idMax", str(ids.last))
@@ -91,10 +91,10 @@ def _datums_of(asked: Measurement) -> tuple[str, ...]:
     return asked.features[1:] if of_zone else ()
 
 
-def _datums(ids: Ids, found: RunResults) -> dict[str, list[Element] | None]:
+def _datums(ids: Ids, run_results: RunResults) -> dict[str, list[Element] | None]:
     """Return datums, poses of the views, and datum reference frames, in QIF's order."""
-    used = {name: _datums_of(asked) for name, asked in found.task.measurements.items() if _datums_of(asked)}
-    names = list(dict.fromkeys(name for some in used.values() for name in some))
+    used = {name: _datums_of(asked) for name, asked in run_results.task.measurements.items() if _datums_of(asked)}
+    names = list(dict.fromkeys(name for datums in used.values() for name in datums))
     definitions = [
         element(
             "DatumDefinition",
@@ -105,15 +105,15 @@ def _datums(ids: Ids, found: RunResults) -> dict[str, list[Element] | None]:
     ]
     transforms = [
         transform(ids.new("transform", str(number)), f"part_from_sensor of view {number}", pose)
-        for number, pose, _ in found.plan
+        for number, pose, _ in run_results.plan
     ]
     frames = [
         element(
             "DatumReferenceFrame",
-            {"Datums": [_datum(ids, *pair) for pair in zip(some, _PRECEDENCE, strict=False)]},
+            {"Datums": [_datum(ids, *pair) for pair in zip(datums, _PRECEDENCE, strict=False)]},
             id=ids.new("frame", measurement),
         )
-        for measurement, some in used.items()
+        for measurement, datums in used.items()
     ]
     return {"DatumDefinitions": definitions or None, "Transforms": transforms, "DatumReferenceFrames": frames or None}
 
@@ -128,16 +128,20 @@ def _label(k: int) -> str:
     return (chr(ord("A") + k // 26 - 1) if k >= 26 else "") + chr(ord("A") + k % 26)
 
 
-def _device(ids: Ids, found: RunResults) -> Element:
-    how = "rendered" if found.source == "render" else "drawn from its performance map"
-    words = f"3D vision sensor, simulated: virtual measurements {how}"
-    return element("MeasurementDevice", {"Name": found.sensor, "Description": words}, id=ids.new("device"))
+def _device(ids: Ids, run_results: RunResults) -> Element:
+    method = "rendered" if run_results.source == "render" else "drawn from its performance map"
+    words = f"3D vision sensor, simulated: virtual measurements {method}"
+    return element("MeasurementDevice", {"Name": run_results.sensor, "Description": words}, id=ids.new("device"))
 
 
-def _features(ids: Ids, found: RunResults) -> dict[str, list[Element]]:
+def _features(ids: Ids, run_results: RunResults) -> dict[str, list[Element]]:
     definitions, nominals, items = list[Element](), list[Element](), list[Element]()
-    for name, feature in found.task.features.items():
-        nominal, number, of_nominal = found.task.nominal(name), ids.new("definition", name), ids.of("nominal", name)
+    for name, feature in run_results.task.features.items():
+        nominal, number, of_nominal = (
+            run_results.task.nominal(name),
+            ids.new("definition", name),
+            ids.of("nominal", name),
+        )
         tag, head = f"{FEATURES[feature.kind]}Feature", {"Name": name, "FeatureDefinitionId": number}
         definitions.append(element(f"{tag}Definition", feature_size(nominal), id=number))
         nominals.append(element(f"{tag}Nominal", head | feature_geometry(nominal), id=of_nominal))
@@ -146,8 +150,8 @@ def _features(ids: Ids, found: RunResults) -> dict[str, list[Element]]:
     return {"FeatureDefinitions": definitions, "FeatureNominals": nominals, "FeatureItems": items}
 
 
-def _characteristics(ids: Ids, found: RunResults) -> dict[str, Any]:
-    task = found.task
+def _characteristics(ids: Ids, run_results: RunResults) -> dict[str, Any]:
+    task = run_results.task
     definitions, nominals, items = list[Element](), list[Element](), list[Element]()
     for name, asked in task.measurements.items():
         kind, datums = characteristic(task, asked), _datums_of(asked)
@@ -181,14 +185,14 @@ def _characteristics(ids: Ids, found: RunResults) -> dict[str, Any]:
     }
 
 
-def _plan(ids: Ids, found: RunResults) -> dict[str, Any]:
+def _plan(ids: Ids, run_results: RunResults) -> dict[str, Any]:
     """Return a step for each view; its pose is a readable instruction and a transform for computation."""
     instructions, steps = list[Element](), list[Element]()
-    for order, (number, pose, names) in enumerate(found.plan, 1):
+    for order, (number, pose, names) in enumerate(run_results.plan, 1):
         instruction, turn = ids.new("instruction", str(number)), ids.of("transform", str(number))
         origin = ", ".join(decimal(round(float(value), 6)) for value in pose.translation)
         words = (
-            f"Move {found.sensor} to view {number}: the origin of its frame to {origin} mm in the part frame, "
+            f"Move {run_results.sensor} to view {number}: the origin of its frame to {origin} mm in the part frame, "
             f"rotated by transform {turn} (x right, y down, z forward). Capture once."
         )
         instructions.append(element("TextInstruction", {"TextInstruction": words}, id=instruction))
@@ -202,21 +206,21 @@ def _plan(ids: Ids, found: RunResults) -> dict[str, Any]:
     return {"WorkInstructions": instructions, "OrderedPlanRoot": {"Steps": steps}}
 
 
-def _results(ids: Ids, found: RunResults) -> Element:
+def _results(ids: Ids, run_results: RunResults) -> Element:
     number = ids.new("results")
-    virtual = {"virtual": "expectations; no part was inspected", "study": found.study}
+    virtual = {"virtual": "expectations; no part was inspected", "study": run_results.study}
     content = {
         "Attributes": attributes(virtual),
         "MeasuredCharacteristics": {
-            "CharacteristicMeasurements": [_measurement(ids, found, result) for result in found.results]
+            "CharacteristicMeasurements": [_measurement(ids, run_results, result) for result in run_results.results]
         },
         "InspectionStatus": {"InspectionStatusEnum": "NOT_CALCULATED"},
     }
     return element("MeasurementResults", content, id=number)
 
 
-def _measurement(ids: Ids, found: RunResults, result: ExpectedResult) -> Element:
-    kind = characteristic(found.task, found.task.measurements[result.measurement])
+def _measurement(ids: Ids, run_results: RunResults, result: ExpectedResult) -> Element:
+    kind = characteristic(run_results.task, run_results.task.measurements[result.measurement])
     numbers = {
         "bias": result.bias,
         "bias_uncertainty": result.bias_uncertainty,
@@ -226,9 +230,9 @@ def _measurement(ids: Ids, found: RunResults, result: ExpectedResult) -> Element
         "trials": result.trials,
         "without_value": float(result.without_value),
     }
-    known: dict[str, str | float | int] = {name: value for name, value in numbers.items() if value is not None}
+    values: dict[str, str | float | int] = {name: value for name, value in numbers.items() if value is not None}
     content = {
-        "Attributes": attributes(known | {"verdict": result.verdict, "errors_of": result.errors_of}),
+        "Attributes": attributes(values | {"verdict": result.verdict, "errors_of": result.errors_of}),
         "Status": {"CharacteristicStatusEnum": "NOT_ANALYZED"},
         "CharacteristicItemId": ids.of("characteristic", result.measurement),
         "MeasurementDeviceIds": references([ids.of("device")]),

@@ -178,12 +178,12 @@ def characteristic(task: Task, asked: Measurement) -> str:
 
 def tolerance(name: str, asked: Measurement) -> dict[str, Any]:
     """Return the content for the tolerance of a dimension, or that it is only measured."""
-    what = {"WhatToMeasure": asked.kind} if name.startswith("UserDefined") else {}
+    dimension = {"WhatToMeasure": asked.kind} if name.startswith("UserDefined") else {}
     if asked.deviations is None:
-        return {"NonTolerance": "MEASURED"} | what
+        return {"NonTolerance": "MEASURED"} | dimension
     (lower, upper), is_zone = asked.deviations, DEFINITIONS[asked.kind].zone
     limits = {"MaxValue": upper, "MinValue": None if is_zone else lower, "DefinedAsLimit": is_zone}
-    return {"Tolerance": limits} | what
+    return {"Tolerance": limits} | dimension
 
 
 def zone(name: str, task: Task, asked: Measurement, frame: str | None) -> dict[str, Any]:

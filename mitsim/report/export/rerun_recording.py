@@ -58,9 +58,9 @@ def write_rrd(scene: RunScene, path: str | Path, recording: str) -> None:
 
 
 def _log_view(rerun: Any, stream: Any, scene: RunScene, view: ShownView) -> None:
-    place, pose = f"views/{view.name}", view.part_from_sensor
+    entity, pose = f"views/{view.name}", view.part_from_sensor
     stream.log(
-        place,
+        entity,
         rerun.Transform3D(translation=pose.translation, mat3x3=pose.rotation),
         rerun.AnyValues(best_of=list(view.best_of) or [""]),
         static=True,
@@ -76,13 +76,13 @@ def _log_view(rerun: Any, stream: Any, scene: RunScene, view: ShownView) -> None
             image_plane_distance=FRUSTUM_MM,
         )
         stream.log(
-            f"{place}/grid", rerun.Transform3D(translation=grid.origin, mat3x3=grid.rotation), pinhole, static=True
+            f"{entity}/grid", rerun.Transform3D(translation=grid.origin, mat3x3=grid.rotation), pinhole, static=True
         )
     for kind, cloud in view.clouds.items():
-        stream.log(f"{place}/grid/{kind}_status", rerun.SegmentationImage(cloud.status), static=True)
+        stream.log(f"{entity}/grid/{kind}_status", rerun.SegmentationImage(cloud.status), static=True)
         points = cloud_points(cloud)
         stream.log(
-            f"{place}/{kind}",
+            f"{entity}/{kind}",
             rerun.Points3D(points.points, colors=_colours(points.sigma), radii=-1.5),
             rerun.AnyValues(
                 sigma=points.sigma.astype(np.float32), covariance=points.covariance.astype(np.float32).ravel()
@@ -94,10 +94,10 @@ def _log_view(rerun: Any, stream: Any, scene: RunScene, view: ShownView) -> None
 def _colours(sigma: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Return colours (n, 3) by ln sigma from its 2nd to its 98th percentile; grey where it is unknown."""
     out = np.tile(np.array(_UNKNOWN, np.uint8), (len(sigma), 1))
-    known = np.isfinite(sigma) & (sigma > 0)
-    if known.any():
-        level = np.log(sigma[known])
+    positive = np.isfinite(sigma) & (sigma > 0)
+    if positive.any():
+        level = np.log(sigma[positive])
         low, high = np.percentile(level, [2, 98])
         share = np.clip((level - low) / max(high - low, 1e-9), 0, 1)
-        out[known] = (255 * matplotlib.colormaps["viridis"](share)[:, :3]).astype(np.uint8)
+        out[positive] = (255 * matplotlib.colormaps["viridis"](share)[:, :3]).astype(np.uint8)
     return out

@@ -108,10 +108,10 @@ def read_results(folder: str | Path, task_file: str | Path | None = None) -> Run
     return RunResults(results, task, run.about.sensor, run.about.study, run.statement.measured_by, plan)
 
 
-def write_results_csv(found: RunResults, path: str | Path) -> None:
+def write_results_csv(run_results: RunResults, path: str | Path) -> None:
     """Write one row for every measurement; missing numbers are empty fields."""
     out = io.StringIO()
-    rows = [asdict(result) | {"features": " ".join(result.features)} for result in found.results]
+    rows = [asdict(result) | {"features": " ".join(result.features)} for result in run_results.results]
     for row in rows:  # lower and upper deviation have a space between
         if isinstance(row["tolerance"], tuple):
             row["tolerance"] = " ".join(map(repr, row["tolerance"]))
@@ -121,21 +121,21 @@ def write_results_csv(found: RunResults, path: str | Path) -> None:
     write_text(path, out.getvalue())
 
 
-def write_results_json(found: RunResults, path: str | Path) -> None:
+def write_results_json(run_results: RunResults, path: str | Path) -> None:
     """Write the results and the plan as JSON."""
     plan: list[dict[str, Any]] = [
         {"view": number, "part_from_sensor": pose.matrix().tolist(), "measurements": list(names)}
-        for number, pose, names in found.plan
+        for number, pose, names in run_results.plan
     ]
-    results = [asdict(result) for result in found.results]
+    results = [asdict(result) for result in run_results.results]
     write_json(
         path,
         {
             "schema_version": 1,
             "software": f"mitsim {__version__}",
-            "sensor": found.sensor,
-            "study": found.study,
-            "measured_by": found.source,
+            "sensor": run_results.sensor,
+            "study": run_results.study,
+            "measured_by": run_results.source,
             "coverage_probability": 0.95,
             "results": results,
             "plan": plan,

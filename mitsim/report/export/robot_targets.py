@@ -53,7 +53,7 @@ class RobotTarget:
 class RobotFormat:
     """A controller's file: its description, its suffix, and the function that writes targets for a tool."""
 
-    what: str
+    description: str
     suffix: str
     write: Callable[[Sequence[RobotTarget], str], str]
 
@@ -77,9 +77,9 @@ def read_targets(folder: str | Path, views: str = "best") -> tuple[list[RobotTar
     path = Path(folder) / "poses" / "poses.json"
     try:
         document = read_json_object(path, "a folder made by mitsim run or mitsim study score")
-        known = {int(one["view"]): one for one in document["views"]}
+        entries = {int(entry["view"]): entry for entry in document["views"]}
         tool = "flange" if "flange_from_sensor" in document else "sensor"
-        poses = {number: Transform.from_matrix(one[f"part_from_{tool}"]) for number, one in known.items()}
+        poses = {number: Transform.from_matrix(entry[f"part_from_{tool}"]) for number, entry in entries.items()}
     except InputError:
         raise
     except (ValueError, KeyError, TypeError, IndexError) as error:
@@ -91,7 +91,7 @@ def read_targets(folder: str | Path, views: str = "best") -> tuple[list[RobotTar
         if stated is not None:
             chosen.sort(key=lambda number: number != stated.view)  # stable: the others stay ascending
     else:
-        chosen = numbers_of(views, list(known))
+        chosen = numbers_of(views, list(entries))
     return [RobotTarget(f"view_{number:04d}", poses[number]) for number in chosen], tool
 
 
@@ -174,9 +174,9 @@ ROBOT_FORMATS = {
 }
 
 
-def _number(value: float, places: int) -> str:
-    return f"{round(float(value), places) + 0.0:.{places}f}"
+def _number(value: float, decimals: int) -> str:
+    return f"{round(float(value), decimals) + 0.0:.{decimals}f}"
 
 
-def _listed(values: Iterable[float], places: int) -> str:
-    return ", ".join(_number(value, places) for value in values)
+def _listed(values: Iterable[float], decimals: int) -> str:
+    return ", ".join(_number(value, decimals) for value in values)

@@ -52,9 +52,9 @@ def write_mcap(clouds: Sequence[Stamped], path: str | Path) -> None:
                 channel = writer.add_connection(topic, kind, typestore=store, offered_qos_profiles=quality)
                 writer.write(channel, second * _SECOND, store.serialize_cdr(message, kind))
 
-            known = {cloud.frame: cloud.pose for cloud in clouds if cloud.pose is not None}
-            if known:
-                transforms = [_transform(store, name, pose) for name, pose in known.items()]
+            poses = {cloud.frame: cloud.pose for cloud in clouds if cloud.pose is not None}
+            if poses:
+                transforms = [_transform(store, name, pose) for name, pose in poses.items()]
                 write("/tf_static", _message(store, "tf2_msgs/msg/TFMessage", transforms), 1, _latched(interfaces))
             for second, cloud in enumerate(clouds, 1):
                 write(cloud.topic, cloud_message(store, cloud.points.in_metres(), cloud.frame, second), second)

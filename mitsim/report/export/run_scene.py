@@ -79,14 +79,14 @@ def view_pose(run: Run, number: int) -> Transform:
 
 def chosen_views(run: Run, views: str) -> list[int]:
     """Return the view numbers selected by ``best``, or as in :func:`numbers_of`, ascending."""
-    known = [int(number) for number in run.scores["view"].values]
+    numbers = [int(number) for number in run.scores["view"].values]
     if views == "best":
-        with_cloud = [number for number in known if any(run.has(_cloud_name(kind, number)) for kind in KINDS)]
+        with_cloud = [number for number in numbers if any(run.has(_cloud_name(kind, number)) for kind in KINDS)]
         return sorted({*with_cloud, *run.about.leaders.values()})
-    return numbers_of(views, known)
+    return numbers_of(views, numbers)
 
 
-def numbers_of(views: str, known: Sequence[int]) -> list[int]:
+def numbers_of(views: str, available: Sequence[int]) -> list[int]:
     """Return the view numbers selected by ``all`` or a comma-separated list, ascending.
 
     Raises
@@ -95,13 +95,13 @@ def numbers_of(views: str, known: Sequence[int]) -> list[int]:
         If the selection is neither, or a view does not exist.
     """
     if views == "all":
-        return sorted(known)
-    allowed = f"best, all, or comma-separated numbers of views from {min(known)} to {max(known)}"
+        return sorted(available)
+    allowed = f"best, all, or comma-separated numbers of views from {min(available)} to {max(available)}"
     try:
         chosen = sorted({int(word) for word in views.split(",")})
     except ValueError:
         raise InputError("--views", "", repr(views), allowed) from None
-    if unknown := [number for number in chosen if number not in known]:
+    if unknown := [number for number in chosen if number not in available]:
         raise InputError("--views", "", unknown[0], allowed)
     return chosen
 
@@ -114,8 +114,8 @@ def frustum(grid: ViewGrid, depth: float) -> tuple[NDArray[np.float64], list[tup
     x = (np.array([-0.5, grid.width - 0.5]) - grid.cx) / grid.fx
     y = (np.array([-0.5, grid.height - 0.5]) - grid.cy) / grid.fy
     corners = [(x[0], y[0], 1.0), (x[1], y[0], 1.0), (x[1], y[1], 1.0), (x[0], y[1], 1.0)]
-    places = depth * np.array([(0.0, 0.0, 0.0), *corners])
-    return places, [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)]
+    vertices = depth * np.array([(0.0, 0.0, 0.0), *corners])
+    return vertices, [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)]
 
 
 def quaternion(pose: Transform) -> tuple[float, float, float, float]:

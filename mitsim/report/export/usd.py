@@ -44,9 +44,9 @@ def write_usd(scene: RunScene, path: str | Path) -> None:
             mesh.CreateDoubleSidedAttr(True)
             mesh.CreateExtentAttr(np.asarray(scene.part.bounds, np.float32))
         for view in scene.views:
-            place = geometry.Xform.Define(stage, f"/part_frame/{view.name}")
-            place.AddTransformOp().Set(_matrix(values, view.part_from_sensor))
-            prim = place.GetPrim()
+            xform = geometry.Xform.Define(stage, f"/part_frame/{view.name}")
+            xform.AddTransformOp().Set(_matrix(values, view.part_from_sensor))
+            prim = xform.GetPrim()
             prim.SetCustomDataByKey("mitsim:view", view.number)
             prim.SetCustomDataByKey("mitsim:sensor", scene.sensor)
             prim.SetCustomDataByKey("mitsim:best_of", ", ".join(view.best_of))
