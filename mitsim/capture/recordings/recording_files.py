@@ -50,7 +50,7 @@ _DAMAGED = (
 
 
 def recorded_names(path: Path, expected: str) -> list[str]:
-    """List the files in a folder or zip down to the third level, with ``/`` between; messages say what was ``expected``.
+    """List the files in a folder or zip down to the third level, with ``/`` between; ``expected`` is for messages.
 
     Raises
     ------
