@@ -130,7 +130,9 @@ def calibration_table(rig: Rig) -> dict[str, Any]:
     return {
         "cameras": [_camera_table(name, camera) for name, camera in rig.cameras.items()],
         "projector": None if rig.projector is None else _camera_table("projector", rig.projector),
-        "rectification": None if pair is None else {key: np.asarray(each).tolist() for key, each in vars(pair).items()},
+        "rectification": None
+        if pair is None
+        else {key: np.asarray(value).tolist() for key, value in vars(pair).items()},
     }
 
 

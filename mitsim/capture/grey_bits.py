@@ -21,10 +21,10 @@ _LEAST_EMPTY = 2
 
 def bits_of(images: Iterable[Image]) -> int:
     """Return the bits of a camera from its images: 8 for 8-bit images, else the fewest that hold all levels."""
-    every = list(images)
-    if all(each.dtype == np.uint8 for each in every):
+    arrays = list(images)
+    if all(array.dtype == np.uint8 for array in arrays):
         return 8
-    largest = max(int(each.max()) for each in every)
+    largest = max(int(array.max()) for array in arrays)
     return next(bits for bits in (10, 12, 14, 16) if largest < 2**bits)
 
 
@@ -40,11 +40,11 @@ def from_bit_0(images: dict[str, Image], bits: int | None = None) -> tuple[dict[
         become uint8.
     """
     used = 0
-    for each in images.values():
-        used |= int(np.bitwise_or.reduce(each, axis=None))
+    for image in images.values():
+        used |= int(np.bitwise_or.reduce(image, axis=None))
     empty = (used & -used).bit_length() - 1 if used else 0
     removed = empty if bits is None else 16 - bits
-    if not _LEAST_EMPTY <= removed <= empty or any(each.dtype == np.uint8 for each in images.values()):
+    if not _LEAST_EMPTY <= removed <= empty or any(image.dtype == np.uint8 for image in images.values()):
         return images, 0
     levels = np.uint8 if bits is None and used >> removed < 256 else np.uint16
-    return {name: (each >> removed).astype(levels) for name, each in images.items()}, removed
+    return {name: (image >> removed).astype(levels) for name, image in images.items()}, removed

@@ -81,8 +81,8 @@ def read_pages(path: Path, *, channel: int | None = None) -> Iterator[Image]:
     """
     data = _bytes_of(path)
     pages = _pages(data, path)
-    for place, label in zip(pages, page_labels(path, len(pages)), strict=True):
-        yield _checked(_decoded(data, label, channel, place), label)
+    for page, label in zip(pages, page_labels(path, len(pages)), strict=True):
+        yield _checked(_decoded(data, label, channel, page), label)
 
 
 def page_labels(path: str | Path, count: int) -> list[str]:
@@ -152,14 +152,14 @@ def decode_grey(data: bytes, where: str | Path, *, channel: int | None = None) -
 
 
 def _decoded(data: bytes, where: str | Path, channel: int | None, page: int | None = None) -> NDArray[Any]:
-    """Return the numbers (H, W) of an image: its only channel, or the one that is asked for.
+    """Return the numbers (H, W) of an image: its only channel, or the requested ``channel``.
 
     ``page`` is its number in the file; by default the file has one.
     """
     if page is None:
-        page, *others = _pages(data, where)
-        if others:
-            found, hint = f"{1 + len(others)} pages", "save the page that is meant as a file of its own"
+        page, *other_pages = _pages(data, where)
+        if other_pages:
+            found, hint = f"{1 + len(other_pages)} pages", "save the page that is meant as a file of its own"
             raise InputError(where, "pages", found, "one image", hint)
     if data.startswith(PNG_SIGNATURE):
         check_png(data, where)  # OpenCV would decode the undamaged part of a damaged PNG

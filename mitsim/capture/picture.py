@@ -81,8 +81,13 @@ def draw_images(
                 mask = np.ma.masked_equal(saturated, False)
                 axes.imshow(mask, cmap=ListedColormap([VERMILION]), interpolation="nearest")
                 label = f"saturated, {full_scale} DN: {100 * saturated.mean():.2g} % of the pixels"
-                place = {"loc": "upper left", "bbox_to_anchor": (0.0, -0.02), "borderaxespad": 0.0, "handlelength": 1.1}
-                axes.legend(handles=[Patch(facecolor=VERMILION, label=label)], **place)
+                layout = {
+                    "loc": "upper left",
+                    "bbox_to_anchor": (0.0, -0.02),
+                    "borderaxespad": 0.0,
+                    "handlelength": 1.1,
+                }
+                axes.legend(handles=[Patch(facecolor=VERMILION, label=label)], **layout)
             number = f", image {image % count + 1} of {count}" if count > 1 else ""
             _title(axes, f"{name}{number}: {caption}")
         side_bar(grid[0, -1], shown, f"grey level [DN], exponent {STRETCH_EXPONENT}")

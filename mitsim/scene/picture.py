@@ -71,7 +71,7 @@ def draw_scene(scene: Any, names: tuple[str, ...], bounds: Floats, ax: Any, pose
         axes.set_aspect("equal")
         axes.set_axis_off()
         low_corner, high_corner = np.array(extent).reshape(2, 2).T
-        label_columns(axes, _label_places(names, shape, x, y), low_corner, high_corner, longest=24)
+        label_columns(axes, _label_points(names, shape, x, y), low_corner, high_corner, longest=24)
         length = round_length(0.3 * (extent[1] - extent[0]))
         bottom = min(axes.get_ylim()[0], extent[2] - 0.15 * (extent[1] - extent[0]))
         axes.set_ylim(bottom, None)
@@ -96,7 +96,7 @@ def _shaded(hits: Hits, shape: NDArray[np.int16], frame: Floats) -> Floats:
     return np.asarray(image)
 
 
-def _label_places(names: tuple[str, ...], shape: NDArray[np.int16], x: Floats, y: Floats) -> dict[str, Floats]:
+def _label_points(names: tuple[str, ...], shape: NDArray[np.int16], x: Floats, y: Floats) -> dict[str, Floats]:
     """Return the point of each visible shape that is farthest from its edges, largest shapes first."""
     numbers, counts = np.unique(shape[shape >= 0], return_counts=True)
     points = {}

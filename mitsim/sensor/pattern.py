@@ -178,8 +178,8 @@ def _spots(
     steps = np.arange(-reach, reach + 1)
     inside = (near_row <= height) & (near_column <= width)
     near_row, near_column, rows, columns = (array[inside] for array in (near_row, near_column, rows, columns))
-    places_taken = near_row * field.shape[1] + near_column
-    apart = len(np.unique(places_taken)) == len(places_taken)  # then indices do not repeat, which is faster
+    pixels = near_row * field.shape[1] + near_column
+    apart = len(np.unique(pixels)) == len(pixels)  # then indices do not repeat, which is faster
     falls = [np.exp(-0.5 * ((near_column + j - columns) / spot_px) ** 2) for j in steps]
     for i in steps:
         fall = np.exp(-0.5 * ((near_row + i - rows) / spot_px) ** 2)

@@ -73,12 +73,12 @@ def is_rotation(matrix: NDArray[np.floating], tolerance: float) -> bool:
 
 
 def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike, roll_deg: float = 0.0) -> Transform:
-    """Return ``world_from_sensor`` of a sensor at one place that looks at another.
+    """Return ``world_from_sensor`` of a sensor at a position that looks at a target.
 
     Parameters
     ----------
     position, target
-        The two places (3,) [mm].
+        The two points (3,) [mm].
     up
         Direction to which the image's up direction (minus y) is as close as possible.
     roll_deg

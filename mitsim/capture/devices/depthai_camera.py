@@ -140,14 +140,14 @@ class DepthaiCamera:
                 )
 
     @contextmanager
-    def _light_off_on_error(self, what: str) -> Iterator[None]:
-        check_open(self.where, what, self._closed, self._fault)
+    def _light_off_on_error(self, operation: str) -> Iterator[None]:
+        check_open(self.where, operation, self._closed, self._fault)
         try:
             yield
         except BaseException as error:  # Ctrl-C as well
-            self._fault = what
+            self._fault = operation
             self.close()
-            fault = fault_of(error, self._dai, self.where, what)
+            fault = fault_of(error, self._dai, self.where, operation)
             if fault is error:
                 raise
             raise fault from error
@@ -275,7 +275,7 @@ def aligned(
     return newest
 
 
-def fault_of(error: BaseException, dai: Any, where: str, what: str) -> BaseException:
+def fault_of(error: BaseException, dai: Any, where: str, operation: str) -> BaseException:
     """Return the error to raise instead of an error: a DeviceError for errors of the package, else the error itself.
 
     Parameters
@@ -286,7 +286,7 @@ def fault_of(error: BaseException, dai: Any, where: str, what: str) -> BaseExcep
         The package ``depthai``.
     where
         Name of the camera in messages.
-    what
+    operation
         Operation that failed.
     """
     if isinstance(error, DeviceError) or not isinstance(error, RuntimeError):
@@ -300,24 +300,26 @@ def fault_of(error: BaseException, dai: Any, where: str, what: str) -> BaseExcep
     if "no available devices" in lowered or "cannot find any device" in lowered or "failed to find device" in lowered:
         return DeviceError(
             where,
-            what,
+            operation,
             f"no such camera ({message})",
             "one that answers",
             f"{there}. Check the cable. On Linux its udev rule is needed: docs.luxonis.com",
         )
     if "already_in_use" in lowered or "already used" in lowered:
-        return DeviceError(where, what, f"the camera in use ({message})", "a free camera", "Close the other program")
+        return DeviceError(
+            where, operation, f"the camera in use ({message})", "a free camera", "Close the other program"
+        )
     if "permission" in lowered:
         return DeviceError(
             where,
-            what,
+            operation,
             f"permission denied ({message})",
             "a camera that you may open",
             "On Linux its udev rule is needed: docs.luxonis.com",
         )
     return DeviceError(
         where,
-        what,
+        operation,
         f"the camera disconnected or failed ({message})",
         "a connected camera",
         "Check the cable and the power, then open it again",

@@ -14,7 +14,7 @@ class DeviceError(MissingEnvironmentError):
     ----------
     where
         The device, its port and, if it applies, the axis.
-    what
+    operation
         The request to the device.
     found
         The reaction of the device.
@@ -24,23 +24,23 @@ class DeviceError(MissingEnvironmentError):
         What to do about it.
     """
 
-    def __init__(self, where: str, what: str, found: str, expected: str, hint: str = "") -> None:
-        self.where, self.what, self.found, self.expected, self.hint = where, what, found, expected, hint
-        super().__init__(f"{where}: {what}: found {found}; expected: {expected}" + (f". {hint}" if hint else ""))
+    def __init__(self, where: str, operation: str, found: str, expected: str, hint: str = "") -> None:
+        self.where, self.operation, self.found, self.expected, self.hint = where, operation, found, expected, hint
+        super().__init__(f"{where}: {operation}: found {found}; expected: {expected}" + (f". {hint}" if hint else ""))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Support pickling between processes."""
-        return type(self), (self.where, self.what, self.found, self.expected, self.hint)
+        return type(self), (self.where, self.operation, self.found, self.expected, self.hint)
 
 
-def check_open(where: str, what: str, closed: bool, fault: str) -> None:
+def check_open(where: str, operation: str, closed: bool, fault: str) -> None:
     """Reject a camera that was closed, or that failed.
 
     Parameters
     ----------
     where
         Name of the camera in messages.
-    what
+    operation
         Operation that is requested.
     closed
         Whether the camera was closed.
@@ -54,4 +54,4 @@ def check_open(where: str, what: str, closed: bool, fault: str) -> None:
     """
     if closed or fault:
         found = "a camera that was closed" if not fault else f"a camera that has failed, at {fault}"
-        raise DeviceError(where, what, found, "an open camera", "Open it again")
+        raise DeviceError(where, operation, found, "an open camera", "Open it again")

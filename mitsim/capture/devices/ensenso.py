@@ -203,12 +203,12 @@ class EnsensoCamera:
             item = self._item(f"Parameters/{path}")
             if not item.exists():
                 continue
-            found = item.value()
-            near = READ_BACK_SHARE * abs(value) if isinstance(value, float) else 0
-            numbers = isinstance(found, int | float) and isinstance(value, int | float)
-            if not (abs(found - value) <= near if numbers else found == value):
+            reading = item.value()
+            tolerance = READ_BACK_SHARE * abs(value) if isinstance(value, float) else 0
+            numbers = isinstance(reading, int | float) and isinstance(value, int | float)
+            if not (abs(reading - value) <= tolerance if numbers else reading == value):
                 hint = "Set a value within the camera's range, which NxView shows"
-                raise DeviceError(self.where, f"set {path}", f"{found}, read back", f"{value}", hint)
+                raise DeviceError(self.where, f"set {path}", f"{reading}, read back", f"{value}", hint)
 
     def _command(self, name: str) -> None:
         command = self._nxlib.NxLibCommand(name)
@@ -244,21 +244,21 @@ class EnsensoCamera:
         self._link = None
 
     @contextmanager
-    def _left_as_found(self, what: str) -> Iterator[None]:
+    def _left_as_found(self, operation: str) -> Iterator[None]:
         """Run a block with a working camera; on any error restore and close it before the error is raised."""
-        check_open(self.where, what, self._closed, self._fault)
+        check_open(self.where, operation, self._closed, self._fault)
         try:
             yield
         except BaseException as error:  # Ctrl-C as well
-            self._fault = what
+            self._fault = operation
             # needs the library, so before closing
-            fault = fault_of(error, self._nxlib, self.where, what, self._known())
+            fault = fault_of(error, self._nxlib, self.where, operation, self._serials())
             self.close()
             if fault is error:
                 raise
             raise fault from error
 
-    def _known(self) -> list[str]:
+    def _serials(self) -> list[str]:
         """Return the serial numbers of the stereo cameras that NxLib lists."""
         with suppress(Exception):
             cameras = self._nxlib.NxLibItem()["Cameras"].value()

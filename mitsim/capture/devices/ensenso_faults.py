@@ -83,7 +83,7 @@ def no_library(where: str, error: Exception) -> DeviceError:
     )
 
 
-def fault_of(error: BaseException, nxlib: Any, where: str, what: str, known: list[str]) -> BaseException:
+def fault_of(error: BaseException, nxlib: Any, where: str, operation: str, serials: list[str]) -> BaseException:
     """Return the error to raise instead of an error: a DeviceError for errors of NxLib, else the error itself.
 
     Parameters
@@ -94,40 +94,46 @@ def fault_of(error: BaseException, nxlib: Any, where: str, what: str, known: lis
         The package ``ensenso_nxlib``.
     where
         Name of the camera in messages.
-    what
+    operation
         Operation that failed.
-    known
+    serials
         Serial numbers of the cameras that NxLib lists.
     """
     if isinstance(error, nxlib.NxLibException):
-        words, detail = _command_words(error, what) if error.get_error_code() == _Code.EXECUTION_FAILED else (None, "")
+        words, detail = (
+            _command_words(error, operation) if error.get_error_code() == _Code.EXECUTION_FAILED else (None, "")
+        )
         words = words or _CODES.get(error.get_error_code())
         detail = detail or f"{error.get_error_text()} at {error.get_item_path()}"
         if words is None:
             return DeviceError(
-                where, what, f"an error of NxLib: {detail}", "none", "Check whether NxView can take such a capture"
+                where, operation, f"an error of NxLib: {detail}", "none", "Check whether NxView can take such a capture"
             )
-        return DeviceError(where, what, f"{words.found} ({detail})", words.expected, words.hint)
+        return DeviceError(where, operation, f"{words.found} ({detail})", words.expected, words.hint)
     match type(error).__name__:  # nxlib.context's own, which the package does not export
         case "CameraNotFoundError":
-            listed = f"NxLib lists {', '.join(known) or 'none'}"
-            return DeviceError(where, what, _UNKNOWN.found, _UNKNOWN.expected, f"{listed}. Check its power and cable")
+            listed = f"NxLib lists {', '.join(serials) or 'none'}"
+            return DeviceError(
+                where, operation, _UNKNOWN.found, _UNKNOWN.expected, f"{listed}. Check its power and cable"
+            )
         case "CameraOpenError":
-            return DeviceError(where, what, _BUSY.found, _BUSY.expected, _BUSY.hint)
+            return DeviceError(where, operation, _BUSY.found, _BUSY.expected, _BUSY.hint)
         case "CameraTypeError":
             expected = "a stereo camera: N, X and similar series"
-            return DeviceError(where, what, f"another kind of camera ({error})", expected, "Check the serial number")
+            return DeviceError(
+                where, operation, f"another kind of camera ({error})", expected, "Check the serial number"
+            )
     if isinstance(error, nxlib.NxLibError):
-        return DeviceError(where, what, f"an error of NxLib: {error}", "none")
+        return DeviceError(where, operation, f"an error of NxLib: {error}", "none")
     if isinstance(error, AttributeError) and "nxLib" in str(error):  # a function missing in the library
         return no_library(where, error)
     return error
 
 
-def _command_words(error: Any, what: str) -> tuple[_Words | None, str]:
+def _command_words(error: Any, operation: str) -> tuple[_Words | None, str]:
     """Return the words for the symbol of a failed command, and NxLib's own text."""
     with suppress(Exception):  # the library may fail as well
         symbol = str(error.get_command_error_symbol())
-        words = _UNKNOWN if symbol == "CameraNotFound" and what == "open" else _SYMBOLS.get(symbol)
+        words = _UNKNOWN if symbol == "CameraNotFound" and operation == "open" else _SYMBOLS.get(symbol)
         return words, f"{symbol}: {error.get_command_error_text()}"
     return None, ""

@@ -101,10 +101,10 @@ class Grbl:
 
     def start(self, targets: Sequence[float]) -> float:
         """Jog to machine coordinates, all axes together."""
-        state, own = self._place()
-        if state.state != "Idle":
-            raise self._fault("move", f"state {state.state}", "Idle")
-        distances = [abs(target - at) for target, at in zip(targets, own, strict=True)]
+        status, positions = self._place()
+        if status.state != "Idle":
+            raise self._fault("move", f"state {status.state}", "Idle")
+        distances = [abs(target - position) for target, position in zip(targets, positions, strict=True)]
         pairs = zip(distances, self._rates, strict=True)
         seconds = max(distance / rate for distance, rate in pairs)
         # the feed is that of the combined motion, a vector length
@@ -121,8 +121,8 @@ class Grbl:
 
     def report(self) -> tuple[tuple[float, ...], bool | None]:
         """Return the positions of the axes, and whether they move."""
-        status, own = self._place()
-        return own, status.state != "Idle"
+        status, positions = self._place()
+        return positions, status.state != "Idle"
 
     def halt(self) -> bool:
         """Cancel the jog; if that has no effect, reset."""
@@ -279,23 +279,23 @@ class Grbl:
                 self._passing(line, command, "ok")
         return lines
 
-    def _passing(self, line: str, what: str, expected: str) -> None:
+    def _passing(self, line: str, operation: str, expected: str) -> None:
         """Ignore a message that is not a reply, and raise an error for an unexpected one."""
         if refusal := parse_refusal(line):
-            raise self._fault(what, refusal, expected)
+            raise self._fault(operation, refusal, expected)
         if is_welcome(line):
             raise self._fault(
-                what,
+                operation,
                 f"a board that has restarted, {shown(line)}",
                 expected,
                 "Its position is lost. Check its power and its reset line",
             )
         message = line.startswith(("[MSG:", ">")) or parse_status(line) is not None
         if not message:
-            raise self._fault(what, shown(line), expected, "Check that this is GRBL, and the baud rate")
+            raise self._fault(operation, shown(line), expected, "Check that this is GRBL, and the baud rate")
 
-    def _setting(self, number: int, found: float, allowed: str) -> InputError:
-        return InputError(self._connection.where, f"GRBL setting ${number}", f"{found:g}", allowed, _REFUSED)
+    def _setting(self, number: int, value: float, allowed: str) -> InputError:
+        return InputError(self._connection.where, f"GRBL setting ${number}", f"{value:g}", allowed, _REFUSED)
 
-    def _fault(self, what: str, found: str, expected: str, hint: str = "") -> DeviceError:
-        return DeviceError(self._connection.where, what, found, expected, hint)
+    def _fault(self, operation: str, found: str, expected: str, hint: str = "") -> DeviceError:
+        return DeviceError(self._connection.where, operation, found, expected, hint)

@@ -98,16 +98,16 @@ def parse_status(line: str) -> StatusReport | None:
     name, _, detail = state.partition(":")
     if not name.isalpha():
         return None
-    known: dict[str, tuple[float, ...] | None] = {"MPos": None, "WPos": None, "WCO": None}
+    coordinates: dict[str, tuple[float, ...] | None] = {"MPos": None, "WPos": None, "WCO": None}
     for field in fields:
         key, _, text = field.partition(":")
-        if key in known:
-            known[key] = _numbers(text)
-            if known[key] is None:
+        if key in coordinates:
+            coordinates[key] = _numbers(text)
+            if coordinates[key] is None:
                 return None
-    if (known["MPos"] is None) == (known["WPos"] is None):
+    if (coordinates["MPos"] is None) == (coordinates["WPos"] is None):
         return None
-    return StatusReport(name, detail, known["MPos"], known["WPos"], known["WCO"])
+    return StatusReport(name, detail, coordinates["MPos"], coordinates["WPos"], coordinates["WCO"])
 
 
 def parse_setting(line: str) -> tuple[int, float] | None:

@@ -85,19 +85,19 @@ class PanTiltUnit:
                 raise self._fault("reset (R)", shown(answer), "*", "Check for a heavy load or a blocked axis")
         self._make_terse()
         for channel, step in self._by_channel():
-            if abs(own := self._count(f"{channel}P") * step) > step:
-                raise self._fault(f"reset (R), channel {channel}", f"{own:.3f} deg", "0 deg after a reset")
+            if abs(position := self._count(f"{channel}P") * step) > step:
+                raise self._fault(f"reset (R), channel {channel}", f"{position:.3f} deg", "0 deg after a reset")
 
     def start(self, targets: Sequence[float]) -> float:
         """Start both axes, immediately and independently (``I``)."""
         seconds = []
         for index, target in enumerate(targets):
             channel, step = self._channels[index], self.resolution[index]
-            own = self._count(f"{channel}P") * step
+            position = self._count(f"{channel}P") * step
             low, high = self.travel[index]
             self._order(f"{channel}P{round(min(max(target, low), high) / step)}")
             speed, acceleration = self._paces[index]
-            seconds.append(abs(target - own) / speed + speed / acceleration)
+            seconds.append(abs(target - position) / speed + speed / acceleration)
         return max(seconds)
 
     def report(self) -> tuple[tuple[float, ...], bool | None]:
@@ -232,5 +232,5 @@ class PanTiltUnit:
             return self._fault(command, f"verbose replies again, {shown(answer)}", expected, hint)
         return self._fault(command, shown(answer), expected, "Check that this is a PTU, and the baud rate")
 
-    def _fault(self, what: str, found: str, expected: str, hint: str = "") -> DeviceError:
-        return DeviceError(self._connection.where, what, found, expected, hint)
+    def _fault(self, operation: str, found: str, expected: str, hint: str = "") -> DeviceError:
+        return DeviceError(self._connection.where, operation, found, expected, hint)

@@ -93,14 +93,14 @@ class SerialLine:
         with self._port_there("send"):
             self._port.write(data)
 
-    def receive(self, deadline: float, what: str, expected: str) -> str:
+    def receive(self, deadline: float, operation: str, expected: str) -> str:
         """Return the next line with text, without its line end.
 
         Raises
         ------
         DeviceError
             If no line or only a part of one arrives by the deadline, or the port failed. It states the request
-            ``what`` and the ``expected`` reply.
+            ``operation`` and the ``expected`` reply.
         """
         began = self.clock.now()
         waited = f"within {max(deadline - began, 0):.2g} s"
@@ -111,14 +111,14 @@ class SerialLine:
             if len(self._buffer) > LONGEST_LINE and not line_ends(self._buffer):
                 found = f"{len(self._buffer)} bytes without the end of a line, {shown(text_of(self._buffer))}"
                 self._buffer.clear()
-                raise DeviceError(self.where, what, found, expected, "Check the baud rate")
+                raise DeviceError(self.where, operation, found, expected, "Check the baud rate")
         if began >= deadline:  # lines arrived all the time, but no reply
-            raise DeviceError(self.where, what, "other lines until the time-out", expected, SILENT)
+            raise DeviceError(self.where, operation, "other lines until the time-out", expected, SILENT)
         if line := self._cut():
             return line
-        if rest := text_of(self._buffer).strip():
-            raise DeviceError(self.where, what, f"a partial line {waited}, {shown(rest)}", expected, SILENT)
-        raise DeviceError(self.where, what, f"no reply {waited}", expected, SILENT)
+        if fragment := text_of(self._buffer).strip():
+            raise DeviceError(self.where, operation, f"a partial line {waited}, {shown(fragment)}", expected, SILENT)
+        raise DeviceError(self.where, operation, f"no reply {waited}", expected, SILENT)
 
     def unread(self) -> str:
         """Return the data that have arrived and were not read yet, without waiting."""
@@ -166,13 +166,13 @@ class SerialLine:
         return ""
 
     @contextmanager
-    def _port_there(self, what: str) -> Iterator[None]:
+    def _port_there(self, operation: str) -> Iterator[None]:
         try:
             yield
         except OSError as error:  # includes pyserial's SerialException
             raise PortGoneError(
                 self.where,
-                what,
+                operation,
                 f"the port disconnected ({error})",
                 "a connected port",
                 "Check the cable and the device's power, then open it again",

@@ -190,11 +190,11 @@ class LiveStage:
                 raise InputError("stage", name, f"{angle:g} deg", f"{low:g} to {high:g} deg", "nothing was moved")
         return [float(angle) for angle in angles]
 
-    def _check_homed(self, what: str) -> None:
+    def _check_homed(self, operation: str) -> None:
         if not self._homed and not self._fault and not self._closed:
             raise DeviceError(
                 self.connection.where,
-                what,
+                operation,
                 "a stage that has not been homed",
                 "home() first",
                 "Its zero is unknown after power-up and after every fault",
@@ -253,26 +253,26 @@ class LiveStage:
             self._clock.sleep(POLL_S)
 
     def _check_arrival(self, requested: Sequence[float], position: Angles) -> None:
-        for name, wanted, found in zip(self.axes, requested, position, strict=True):
-            if not abs(found - wanted) <= self.connection.tolerance_deg:
+        for name, target, angle in zip(self.axes, requested, position, strict=True):
+            if not abs(angle - target) <= self.connection.tolerance_deg:
                 raise DeviceError(
                     f"{self.connection.where}, axis {name}",
                     "move",
-                    f"an axis that stands at {found:.3f} deg",
-                    f"{wanted:.3f} deg within {self.connection.tolerance_deg:g}",
+                    f"an axis that stands at {angle:.3f} deg",
+                    f"{target:.3f} deg within {self.connection.tolerance_deg:g}",
                     "Check for a blocked axis, or a manual stop",
                 )
 
     @contextmanager
-    def _stopped_on_error(self, what: str) -> Iterator[None]:
+    def _stopped_on_error(self, operation: str) -> Iterator[None]:
         """Run a block with a working stage; on any error stop the axes before the error is raised."""
         if self._closed or self._fault:
             found = "a stage that was closed" if self._closed else f"a stage that failed before, at {self._fault}"
-            raise DeviceError(self.connection.where, what, found, "an open stage", _AGAIN.capitalize())
+            raise DeviceError(self.connection.where, operation, found, "an open stage", _AGAIN.capitalize())
         try:
             yield
         except BaseException as error:  # Ctrl-C as well
-            self._fault, self._halted = what, False
+            self._fault, self._halted = operation, False
             try:
                 end = _STOPPED if self._halt() else _DEAF
             except DeviceError:
@@ -281,7 +281,7 @@ class LiveStage:
                 raise
             hint = error.hint + ("" if error.hint[-1:] in ("", "?") else ".")
             raise DeviceError(
-                error.where, error.what, error.found, error.expected, f"{hint} {end}. To go on, {_AGAIN}".lstrip()
+                error.where, error.operation, error.found, error.expected, f"{hint} {end}. To go on, {_AGAIN}".lstrip()
             ) from error
 
 

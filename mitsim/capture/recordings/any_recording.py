@@ -171,7 +171,7 @@ def _read_array(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, by
 
 def _organised(cloud: Path | StoredCloud, options: ReadOptions) -> Capture:
     """Read an organised cloud with the options of all clouds."""
-    axes = next((known for known in AXES if known == (options.axes or AXES[0])), None)
+    axes = next((name for name in AXES if name == (options.axes or AXES[0])), None)
     if axes is None:
         raise InputError("--axes", "", repr(options.axes), " | ".join(AXES))
     if options.unit is not None and options.unit not in LENGTHS_MM:
@@ -205,9 +205,9 @@ def _read_ros(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, byte
     bag = ros_bag.open_bag(path)
     chosen = ros_recording.chosen_topics(bag, options.topic or ())
     frame = frame_of(options.frame, path)
-    if chosen.what == "cloud":
+    if chosen.content == "cloud":
         capture = _organised(ros_recording.read_ros_cloud(chosen, frame), options)
-    elif chosen.what == "pair":
+    elif chosen.content == "pair":
         capture = ros_recording.read_ros_pair(
             chosen,
             frame,
@@ -232,13 +232,13 @@ def _read_ros(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, byte
 
 
 @contextmanager
-def _needs_recordings(path: Path, what: str) -> Iterator[None]:
+def _needs_recordings(path: Path, kind: str) -> Iterator[None]:
     """Say which packages a recording needs if they are not installed."""
     try:
         yield
     except ModuleNotFoundError as error:
         raise MissingEnvironmentError(
-            f"{path}: {what} needs packages that are not installed ({error.name}): pip install 'mitsim[recordings]'"
+            f"{path}: {kind} needs packages that are not installed ({error.name}): pip install 'mitsim[recordings]'"
         ) from None
 
 
@@ -281,7 +281,7 @@ def read_recording(path: str | Path, options: ReadOptions, kind: str | None = No
     kind = kind or kind_of(path, sensor=options.sensor, calibration=options.calibration)
     for name in ReadOptions.__dataclass_fields__:
         if getattr(options, name) is not None and name not in FOR_ALL and name not in KINDS[kind].options:
-            used = ", ".join(_option(each) for each in (*sorted(KINDS[kind].options), *FOR_ALL))
+            used = ", ".join(_option(option) for option in (*sorted(KINDS[kind].options), *FOR_ALL))
             raise InputError(path, "", f"{_option(name)} for {NAMES[kind]}", used)
     decoding, records = _options_for_all(options)
     capture, originals = KINDS[kind].read(path, options)
@@ -325,9 +325,9 @@ def _options_for_all(options: ReadOptions) -> tuple[dict[str, Any], dict[str, An
     return decoding, records
 
 
-def _cameras(path: Path, options: ReadOptions, what: str) -> str:
+def _cameras(path: Path, options: ReadOptions, kind: str) -> str:
     if options.cameras is None:
-        raise InputError(path, "", f"{what} alone", "the camera that took it: --calibration FILE, or --sensor")
+        raise InputError(path, "", f"{kind} alone", "the camera that took it: --calibration FILE, or --sensor")
     return options.cameras
 
 

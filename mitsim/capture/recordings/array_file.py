@@ -98,11 +98,11 @@ def map_in(data: bytes, where: Path, frame: int | None = None) -> NDArray[Any]:
     if points is not None and points.ndim == 3 and min(points.shape[:2]) > 1:
         return points
     flat = {name: array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array for name, array in arrays.items()}
-    depths = {name: one for name, one in flat.items() if one.ndim in (2, 3) and one.dtype.kind in "fiu"}
+    depths = {name: array for name, array in flat.items() if array.ndim in (2, 3) and array.dtype.kind in "fiu"}
     if depths and all(map(is_disparity, depths)):
         raise disparities(where)
-    depths = {name: one for name, one in depths.items() if not is_disparity(name)}
-    named = {name: one for name, one in depths.items() if "depth" in name.lower()} or depths
+    depths = {name: array for name, array in depths.items() if not is_disparity(name)}
+    named = {name: array for name, array in depths.items() if "depth" in name.lower()} or depths
     if len(named) != 1 or points is not None:
         shapes = ", ".join(f"{name} {' x '.join(map(str, array.shape))}".strip() for name, array in arrays.items())[
             :300
@@ -136,18 +136,18 @@ def points_among(arrays: dict[str, NDArray[Any]]) -> NDArray[Any] | None:
         for name in array.dtype.names
         if name in "xyzXYZ"
     }
-    real = {name: one for name, one in (arrays | fields).items() if one.dtype.kind in "fiu"}
-    named = [next((one for name, one in real.items() if name.lower() == axis), None) for axis in "xyz"]
+    real = {name: array for name, array in (arrays | fields).items() if array.dtype.kind in "fiu"}
+    named = [next((array for name, array in real.items() if name.lower() == axis), None) for axis in "xyz"]
     first = named[0]
-    if first is not None and all(one is not None and one.shape == first.shape for one in named):
-        joined = np.stack([np.asarray(one, np.float64) for one in named], axis=-1)
+    if first is not None and all(array is not None and array.shape == first.shape for array in named):
+        joined = np.stack([np.asarray(array, np.float64) for array in named], axis=-1)
         return joined.reshape(-1, 3) if joined.ndim == 2 or 1 in joined.shape[:-1] else joined
     turned = [
         (_POINTS.search(name) is not None, points.size, points)
-        for name, one in real.items()
-        if (_POINTS.search(name) or not _NO_POINTS.search(name)) and (points := _with_points_last(one)) is not None
+        for name, array in real.items()
+        if (_POINTS.search(name) or not _NO_POINTS.search(name)) and (points := _with_points_last(array)) is not None
     ]
-    return max(turned, key=lambda one: one[:2], default=(False, 0, None))[2]
+    return max(turned, key=lambda candidate: candidate[:2], default=(False, 0, None))[2]
 
 
 def _with_points_last(array: NDArray[Any]) -> NDArray[Any] | None:

@@ -92,9 +92,9 @@ def _read(source: str | Path, size: tuple[int, int] | None) -> Calibrated:
     if path.suffix.lower() in (".yml", ".yaml", ".xml", ".mat", ".npz"):
         return _of_opencv(path, size)
     if path.suffix.lower() != ".json":
-        known = f".toml, .json, .yml, .yaml, .xml, .mat or .npz, or a preset: {', '.join(presets())}"
+        formats = f".toml, .json, .yml, .yaml, .xml, .mat or .npz, or a preset: {', '.join(presets())}"
         hint = "ROS's calibrator saves the same numbers as .yaml" if path.suffix.lower() in (".ini", ".txt") else ""
-        raise InputError(path, "", f"the ending {path.suffix!r}", known, hint)
+        raise InputError(path, "", f"the ending {path.suffix!r}", formats, hint)
     table = parsed_json(read_bounded(path, "a calibration"), path, "a calibration in JSON")
     if is_depthai_calibration(table):
         read = read_depthai_calibration(path)
@@ -110,7 +110,7 @@ def _read(source: str | Path, size: tuple[int, int] | None) -> Calibrated:
 def _is_of_capture(cameras: Any) -> bool:
     """Return whether a value is the list of cameras of a capture folder, which another program may have, too."""
     return isinstance(cameras, list) and all(
-        isinstance(each, dict) and "sensor_from_camera" in each for each in cameras
+        isinstance(camera, dict) and "sensor_from_camera" in camera for camera in cameras
     )
 
 
@@ -138,7 +138,7 @@ def calibrated_by(tables: dict[str, dict[str, Any]], where: Path, size: tuple[in
     cameras = ["camera"] if len(tables) == 1 else ["left", "right"]
     asked = {"file": list(tables), "projector": False, "cameras": cameras}
     table, notes = with_calibration(where, {"calibration": asked}, size, tree_of(tables))
-    rig = Rig({name: each.camera() for name, each in validate(where, table, RigFile).cameras.items()})
+    rig = Rig({name: optics.camera() for name, optics in validate(where, table, RigFile).cameras.items()})
     for name, camera in rig.cameras.items():
         check_camera(camera, where, f"cameras.{name}")
     return Calibrated(rig, "", notes=tuple(notes))
@@ -170,9 +170,9 @@ def camera_of(calibrated: Calibrated, name: str | None, size: tuple[int, int], w
     cameras = calibrated.rig.cameras
     if name is not None and name not in cameras:
         raise InputError("--camera", "", repr(name), ", ".join(cameras))
-    fitting = [each for each, camera in cameras.items() if (camera.width, camera.height) == size]
+    fitting = [label for label, camera in cameras.items() if (camera.width, camera.height) == size]
     if name is None and calibrated.unrelated and len(fitting) != 1:
-        found = ", ".join(f"{each} {camera.width} x {camera.height} px" for each, camera in cameras.items())
+        found = ", ".join(f"{label} {camera.width} x {camera.height} px" for label, camera in cameras.items())
         raise InputError(where, "--camera", f"{len(cameras)} cameras: {found}", "the one of these images", "name it")
     name = fitting[0] if name is None and calibrated.unrelated else name
     camera = calibrated.rig.reference if name is None else cameras[name]
@@ -191,8 +191,8 @@ def _scaled_hint(camera: Camera, size: tuple[int, int]) -> str:
     if abs(scale * camera.height - size[1]) > 1:
         return ""
     (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
-    centre = [round((place + 0.5) * scale - 0.5, 3) for place in (cx, cy)]
-    focal = [round(each * scale, 3) for each in (fx, fy)]
+    centre = [round((coordinate + 0.5) * scale - 0.5, 3) for coordinate in (cx, cy)]
+    focal = [round(length * scale, 3) for length in (fx, fy)]
     return (
         f"if the images are scaled by {scale:g}, give a TOML with [cameras.NAME]: width = {size[0]}, "
         f"height = {size[1]}, focal_px = {focal}, principal_px = {centre}, and the same distortion"
@@ -224,9 +224,9 @@ def _of_toml(path: Path, size: tuple[int, int] | None) -> Calibrated:
     if path.suffix.lower() == ".toml":
         written = read_toml_table(path)
         if "technology" not in written:
-            optics, notes = with_calibration(path, written, size)
-            table = validate(path, optics, RigFile)
-            rig = Rig({name: each.camera() for name, each in table.cameras.items()})
+            content, notes = with_calibration(path, written, size)
+            table = validate(path, content, RigFile)
+            rig = Rig({name: optics.camera() for name, optics in table.cameras.items()})
             return Calibrated(rig, table.name, notes=tuple(notes))
     sensor = load_sensor(path, "decoding", size)
     return Calibrated(sensor.rig, sensor.name, sensor.range_mm, sensor.notes, nominal=str(path) in presets())
@@ -239,18 +239,18 @@ def _of_opencv(path: Path, size: tuple[int, int] | None) -> Calibrated:
     sensor = stated if isinstance(stated, str) else ""
     eyes, _ = cameras_of(tree.eyes())
     if has_pair(tree) or len(eyes) < 2:
-        cameras = ["left", "right"] if has_pair(tree) else ["camera"]
-        rig, notes = _rig_of(path, tree, size, cameras, {})
+        names = ["left", "right"] if has_pair(tree) else ["camera"]
+        rig, notes = _rig_of(path, tree, size, names, {})
         return Calibrated(rig, sensor, notes=tuple(notes))
-    found: dict[str, Camera] = {}
+    cameras: dict[str, Camera] = {}
     told: list[str] = []
     for eye in [*eyes, *eyes]:  # only at the second time the tree knows that the others are read
         name = plain_name(eye.name.rpartition(".")[2])
         rig, notes = _rig_of(path, tree, size, [name], {name: {"matrix": eye.matrix_map}})
-        if not any(_sees_alike(rig.reference, other) for other in found.values()):
-            found[name if name not in found else plain_name(eye.name)] = rig.reference
+        if not any(_sees_alike(rig.reference, other) for other in cameras.values()):
+            cameras[name if name not in cameras else plain_name(eye.name)] = rig.reference
         told = notes if eye is eyes[0] else [*told, *(note for note in notes if note not in told)]
-    return Calibrated(Rig(found), sensor, notes=tuple(told), unrelated=len(found) > 1)
+    return Calibrated(Rig(cameras), sensor, notes=tuple(told), unrelated=len(cameras) > 1)
 
 
 def _sees_alike(camera: Camera, other: Camera) -> bool:
@@ -266,4 +266,4 @@ def _rig_of(
     asked = {"file": path.name, "projector": False, "cameras": cameras, "keys": keys}
     table, notes = with_calibration(path, {"calibration": asked}, size, tree)
     read = validate(path, table, RigFile)
-    return Rig({name: each.camera() for name, each in read.cameras.items()}), notes
+    return Rig({name: optics.camera() for name, optics in read.cameras.items()}), notes

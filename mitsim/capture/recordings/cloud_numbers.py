@@ -55,7 +55,7 @@ def unit_in(lines: Iterable[str]) -> str | None:
 def unit_named(word: str) -> str:
     """Return the name of a unit of length in :data:`~mitsim.sensor.calibration_qualifiers.LENGTHS_MM`."""
     size = UNITS_MM[word]
-    return next(name for name, each in LENGTHS_MM.items() if each == size)
+    return next(name for name, length in LENGTHS_MM.items() if length == size)
 
 
 def leave_out_marks(points: NDArray[np.floating]) -> str:
@@ -65,11 +65,11 @@ def leave_out_marks(points: NDArray[np.floating]) -> str:
     """
     missing = _without_place(points)
     points[missing] = np.nan
-    places = np.flatnonzero(~missing)
-    if len(places) < _LEAST_REPEATS:
+    indices = np.flatnonzero(~missing)
+    if len(indices) < _LEAST_REPEATS:
         return ""
     flat = points.reshape(-1, 3)
-    chosen = places[np.linspace(0, len(places) - 1, min(_SAMPLE, len(places))).astype(np.intp)]
+    chosen = indices[np.linspace(0, len(indices) - 1, min(_SAMPLE, len(indices))).astype(np.intp)]
     values, counts = np.unique(flat[chosen], axis=0, return_counts=True)
     order = np.argsort(counts)
     most, second = counts[order[-1]], counts[order[-2]] if len(counts) > 1 else counts[order[-1]]
@@ -81,7 +81,7 @@ def leave_out_marks(points: NDArray[np.floating]) -> str:
     if count < _LEAST_REPEATS:
         return ""
     points[marked] = np.nan
-    shown = ", ".join(f"{each:g}" for each in mark)
+    shown = ", ".join(f"{coordinate:g}" for coordinate in mark)
     return f"{count} points are all ({shown}): left out, since measured points do not repeat"
 
 

@@ -64,7 +64,7 @@ def points_of_text(data: bytes, path: Path) -> tuple[NDArray[np.float64], str | 
     """
     if len(data) > _LARGEST:
         raise InputError(path, "", f"{len(data):,} bytes of text", f"at most {_LARGEST:,}", "save it as PLY")
-    encoding = next((one for mark, one in _MARKS.items() if data.startswith(mark)), None)
+    encoding = next((name for mark, name in _MARKS.items() if data.startswith(mark)), None)
     if encoding is not None:
         data = data.decode(encoding, "replace").encode()
     lines = [line.strip(b" \r\n") for line in data.replace(b'"', b"").splitlines()]
@@ -84,7 +84,7 @@ def points_of_text(data: bytes, path: Path) -> tuple[NDArray[np.float64], str | 
         raise InputError(
             path, "", f"text that is no cloud ({reason})", "lines of x, y and z, and equal columns"
         ) from None
-    names = next((found for line in heads if (found := _names(line, columns))), [])
+    names = next((titles for line in heads if (titles := _names(line, columns))), [])
     unit = _unit(heads, path)
     if not names:
         _check_no_counters(table, path)
@@ -112,10 +112,10 @@ def _names(line: str, columns: int) -> list[str]:
     words = _words(text)
     if comment and len(words) != columns:
         words = _words(_BEFORE_NAMES.sub("", text))
-    names = [found[1] if (found := _NAME.fullmatch(each)) else each for each in words]
+    names = [match[1] if (match := _NAME.fullmatch(word)) else word for word in words]
     if len(set("xyz") & set(names)) < 2:
         return []
-    at = [place for place, name in enumerate(names) if name in "xyz"]
+    at = [index for index, name in enumerate(names) if name in "xyz"]
     sentence = comment and len(names) != columns and at[-1] - at[0] >= len(at)
     return [] if sentence else names
 
@@ -135,13 +135,15 @@ def _unit(heads: list[str], path: Path) -> str | None:
     for line in heads:
         below = [word.strip("[]()") for word in _words(line.lower())]
         stated = (
-            below if set(below) <= set(UNITS_MM) else [one or other for one, other in _OF_AXIS.findall(line.lower())]
+            below
+            if set(below) <= set(UNITS_MM)
+            else [remark or suffix for remark, suffix in _OF_AXIS.findall(line.lower())]
         )
-        found = {unit_named(word) for word in stated if word in UNITS_MM}
-        if len(found) > 1:
-            raise InputError(path, "", f"coordinates in {' and '.join(sorted(found))}", "one unit of length")
-        if found:
-            return found.pop()
+        units = {unit_named(word) for word in stated if word in UNITS_MM}
+        if len(units) > 1:
+            raise InputError(path, "", f"coordinates in {' and '.join(sorted(units))}", "one unit of length")
+        if units:
+            return units.pop()
     return unit_in(heads)
 
 
@@ -156,14 +158,16 @@ def _check_no_counters(table: NDArray[np.float64], path: Path) -> None:
     InputError
         If the first one or two columns count, or the first three are colours.
     """
-    some = table[np.linspace(0, len(table) - 1, min(1000, len(table))).astype(np.intp)]
-    some = some[np.isfinite(some).all(axis=1)]
-    whole = (some % 1 == 0).all(axis=0) if len(some) else np.ones(table.shape[1], bool)
-    varies = (some != some[:1]).any(axis=0) if len(some) else ~whole
+    sample = table[np.linspace(0, len(table) - 1, min(1000, len(table))).astype(np.intp)]
+    sample = sample[np.isfinite(sample).all(axis=1)]
+    whole = (sample % 1 == 0).all(axis=0) if len(sample) else np.ones(table.shape[1], bool)
+    varies = (sample != sample[:1]).any(axis=0) if len(sample) else ~whole
     for count in (1, 2, 3):
         if table.shape[1] < count + 3:
             continue
-        if count == 3 and not (((some[:, :3] >= 0) & (some[:, :3] <= 255)).all() and np.abs(some[:, 3:6]).max() > 1):
+        if count == 3 and not (
+            ((sample[:, :3] >= 0) & (sample[:, :3] <= 255)).all() and np.abs(sample[:, 3:6]).max() > 1
+        ):
             continue  # whole coordinates, or normals after them
         lengths = (~whole)[count : count + 3].sum() >= 2 and not (whole & varies)[count : count + 3].any()
         if whole[:count].all() and varies[:count].any() and lengths:
@@ -177,11 +181,15 @@ def _with_points(rows: list[bytes]) -> list[bytes]:
     sample = rows[:_SAMPLE]
     if _has_decimal_commas(sample):
         rows = [row.replace(b",", b".") for row in rows]
-    mark = next((each for each in (b";", b",", b"\t") if any(each in row for row in rows[:_SAMPLE])), None)
+    mark = next(
+        (separator for separator in (b";", b",", b"\t") if any(separator in row for row in rows[:_SAMPLE])), None
+    )
     if mark is None or not any(mark + mark in row or row.startswith(mark) or row.endswith(mark) for row in rows):
         return rows
     count = max(row.rstrip(mark).count(mark) for row in sample)
-    return [mark.join(one.strip() or b"nan" for one in (row.split(mark) + [b""] * count)[: count + 1]) for row in rows]
+    return [
+        mark.join(field.strip() or b"nan" for field in (row.split(mark) + [b""] * count)[: count + 1]) for row in rows
+    ]
 
 
 def _has_decimal_commas(rows: list[bytes]) -> bool:
@@ -189,5 +197,5 @@ def _has_decimal_commas(rows: list[bytes]) -> bool:
     if not any(b"," in row for row in rows) or any(b"." in row for row in rows):
         return False
     fields = [[word for word in re.split(rb"[;\t ]+", row) if word] for row in rows]
-    inside = all(re.fullmatch(rb"[^,]+(?:,[^,]+)?", one) for each in fields for one in each)
+    inside = all(re.fullmatch(rb"[^,]+(?:,[^,]+)?", field) for row in fields for field in row)
     return inside and max(map(len, fields)) >= 3

@@ -116,11 +116,11 @@ def _missing(image: NDArray[Any], invalid: int) -> tuple[NDArray[np.bool_], list
     missing = (image == invalid) | (image == 0) | ~np.isfinite(image)
     warnings: list[str] = []
 
-    def leave_out(more: NDArray[np.bool_], which: str) -> None:
-        if more.any():
-            share = 100 * float(np.mean(more))
-            warnings.append(f"{share:.2g} % of the pixels have {which}: left out")
-            missing[more] = True
+    def leave_out(pixels: NDArray[np.bool_], reason: str) -> None:
+        if pixels.any():
+            share = 100 * float(np.mean(pixels))
+            warnings.append(f"{share:.2g} % of the pixels have {reason}: left out")
+            missing[pixels] = True
 
     full = np.iinfo(np.uint16).max
     if image.dtype == np.uint16 and invalid != full:
@@ -134,11 +134,11 @@ def _missing(image: NDArray[Any], invalid: int) -> tuple[NDArray[np.bool_], list
         seen = image[~missing]
         farthest = seen.max()
         same = (image == farthest) & ~missing
-        rest = seen[seen < farthest]
+        nearer_depths = seen[seen < farthest]
         if (
-            rest.size
+            nearer_depths.size
             and same.sum() >= _MARKED * image.size
-            and float(farthest) > _FAR_BEYOND * float(np.median(rest)) > 0
+            and float(farthest) > _FAR_BEYOND * float(np.median(nearer_depths)) > 0
         ):
             leave_out(same, f"the same depth of {farthest:g}, far beyond all others")
     return missing, warnings

@@ -105,14 +105,14 @@ def _calibration(fields: JsonFields, path: Path) -> DepthaiCalibration:
     cameras: dict[int, Camera] = {}
     steps: dict[int, tuple[int, Transform, NDArray[np.float64] | None]] = {}
     for socket, table in entries:
-        each = JsonFields(table, path, f"cameraData.{socket}.")
-        if not each.get("width") and not each.get("height"):
+        camera_fields = JsonFields(table, path, f"cameraData.{socket}.")
+        if not camera_fields.get("width") and not camera_fields.get("height"):
             continue  # a socket without a camera
-        cameras[socket] = _camera(each)
+        cameras[socket] = _camera(camera_fields)
         check_camera(cameras[socket], path, f"cameraData.{socket}.intrinsicMatrix")
-        to = each.integer("extrinsics.toCameraSocket", -1, 100)
-        if to >= 0 and each.get("extrinsics.rotationMatrix"):
-            steps[socket] = (to, _extrinsics(each), _translation(each, "extrinsics.specTranslation"))
+        to = camera_fields.integer("extrinsics.toCameraSocket", -1, 100)
+        if to >= 0 and camera_fields.get("extrinsics.rotationMatrix"):
+            steps[socket] = (to, _extrinsics(camera_fields), _translation(camera_fields, "extrinsics.specTranslation"))
     if not cameras:
         hint = "the device was not calibrated, or another file of it has the calibration of the factory"
         raise InputError(path, "cameraData", "no cameras in this calibration", "the cameras of a pair", hint)
@@ -120,44 +120,44 @@ def _calibration(fields: JsonFields, path: Path) -> DepthaiCalibration:
     right = fields.integer("stereoRectificationData.rightCameraSocket", -1, _NO_SOCKET)
     for side, socket in (("left", left), ("right", right)):
         if socket not in cameras:
-            known = ", ".join(map(str, cameras)) or "none"
+            sockets = ", ".join(map(str, cameras)) or "none"
             field = f"stereoRectificationData.{side}CameraSocket"
             found = f"{socket}: no pair of cameras" if socket in (-1, _NO_SOCKET) else socket
-            raise InputError(path, field, found, f"one of cameraData: {known}")
+            raise InputError(path, field, found, f"one of cameraData: {sockets}")
     motion, spec = _between(left, right, steps, path)
     name = fields.get("productName") or fields.get("boardName")
     return DepthaiCalibration(cameras, left, right, motion, spec, name if isinstance(name, str) and name else "depthai")
 
 
-def _camera(each: JsonFields) -> Camera:
-    width, height = (each.integer(side, 1, LONGEST_SIDE_PX) for side in ("width", "height"))
-    matrix = each.numbers("intrinsicMatrix", (3, 3))
+def _camera(fields: JsonFields) -> Camera:
+    width, height = (fields.integer(side, 1, LONGEST_SIDE_PX) for side in ("width", "height"))
+    matrix = fields.numbers("intrinsicMatrix", (3, 3))
     if matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or matrix[1, 0] != 0 or np.any(matrix[2] != [0, 0, 1]):
-        raise each.fault("intrinsicMatrix", "fx 0 cx, 0 fy cy, 0 0 1, by rows")
-    distortion = each.numbers("distortionCoeff", (None,))
-    kind = each.integer("cameraType", 0, 100)
+        raise fields.fault("intrinsicMatrix", "fx 0 cx, 0 fy cy, 0 0 1, by rows")
+    distortion = fields.numbers("distortionCoeff", (None,))
+    kind = fields.integer("cameraType", 0, 100)
     if kind not in (_FISHEYE, _PERSPECTIVE):
-        raise each.fault("cameraType", "0 (perspective) or 1 (fisheye)")
+        raise fields.fault("cameraType", "0 (perspective) or 1 (fisheye)")
     if kind == _FISHEYE and len(distortion) >= 4:
         return Camera(matrix, distortion[:4], width, height, model="fisheye")
     if kind == _PERSPECTIVE and len(distortion) in (0, 4, 5, 8, 12, 14):
         return Camera(matrix, distortion if len(distortion) else np.zeros(5), width, height)
-    raise each.fault("distortionCoeff", "4 or more for a fisheye; 0, 4, 5, 8, 12 or 14 for a perspective lens")
+    raise fields.fault("distortionCoeff", "4 or more for a fisheye; 0, 4, 5, 8, 12 or 14 for a perspective lens")
 
 
-def _extrinsics(each: JsonFields) -> Transform:
-    rotation = each.rotation("extrinsics.rotationMatrix", 1e-3)
-    translation = _translation(each, "extrinsics.translation")
+def _extrinsics(fields: JsonFields) -> Transform:
+    rotation = fields.rotation("extrinsics.rotationMatrix", 1e-3)
+    translation = _translation(fields, "extrinsics.translation")
     if translation is None:
-        raise each.fault("extrinsics.translation", "x, y and z [cm]")
+        raise fields.fault("extrinsics.translation", "x, y and z [cm]")
     return Transform(rotation, translation)
 
 
-def _translation(each: JsonFields, field: str) -> NDArray[np.float64] | None:
+def _translation(fields: JsonFields, field: str) -> NDArray[np.float64] | None:
     """Return a translation [mm]; None if absent."""
-    if not isinstance(each.get(field), dict):
+    if not isinstance(fields.get(field), dict):
         return None
-    return np.array([float(each.numbers(f"{field}.{axis}", ())) for axis in "xyz"]) * _CM
+    return np.array([float(fields.numbers(f"{field}.{axis}", ())) for axis in "xyz"]) * _CM
 
 
 def _between(

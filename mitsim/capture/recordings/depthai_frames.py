@@ -66,8 +66,8 @@ def read_frames(files: dict[str, Path], frame: int | None) -> dict[str, Recorded
         If a file is damaged, has no uncompressed frames, or lacks the frame; or if it has several and none was chosen.
     """
     sequences = {name: _sequences(file) for name, file in files.items()}
-    places, count = _chosen(sequences, frame, next(iter(files.values())))
-    return {name: _frame(file, places[name], count) for name, file in files.items()}
+    positions, count = _chosen(sequences, frame, next(iter(files.values())))
+    return {name: _frame(file, positions[name], count) for name, file in files.items()}
 
 
 def _messages(file: Path) -> Iterator[Any]:
@@ -101,20 +101,22 @@ def _sequences(file: Path) -> list[int]:
 
 def _chosen(sequences: dict[str, list[int]], frame: int | None, where: Path) -> tuple[dict[str, int], int]:
     """Return the position of the chosen frame in each stream, and the number of common frames."""
-    first, *others = ({number: place for place, number in enumerate(numbers)} for numbers in sequences.values())
+    first_stream, *other_streams = (
+        {number: position for position, number in enumerate(numbers)} for numbers in sequences.values()
+    )
     if all(len(set(numbers)) == len(numbers) for numbers in sequences.values()):
-        common = [number for number in first if all(number in other for other in others)]
-        places = [[each[number] for each in (first, *others)] for number in common]
+        common = [number for number in first_stream if all(number in stream for stream in other_streams)]
+        positions = [[stream[number] for stream in (first_stream, *other_streams)] for number in common]
     else:
-        places = [[place] * len(sequences) for place in range(min(map(len, sequences.values())))]
-    if not places:
+        positions = [[position] * len(sequences) for position in range(min(map(len, sequences.values())))]
+    if not positions:
         raise InputError(where, "", "streams without a frame in common", "streams that were recorded together")
-    number = chosen_frame(frame, len(places), where, "frames")
-    return dict(zip(sequences, places[number], strict=True)), len(places)
+    number = chosen_frame(frame, len(positions), where, "frames")
+    return dict(zip(sequences, positions[number], strict=True)), len(positions)
 
 
-def _frame(file: Path, place: int, count: int) -> RecordedFrame:
-    message: Any = next(islice(_messages(file), place, None), None)  # None if the file has changed meanwhile
+def _frame(file: Path, position: int, count: int) -> RecordedFrame:
+    message: Any = next(islice(_messages(file), position, None), None)  # None if the file has changed meanwhile
     with _in_words(file):
         matrix = _matrix(message.transformation)
         exposure_s, iso = float(message.cam.exposureTimeUs) * 1e-6, int(message.cam.sensitivityIso)
@@ -144,7 +146,7 @@ def _matrix(transformation: Any) -> NDArray[np.float64] | None:
     if any(len(rows) != 3 or any(len(row.values) != 3 for row in rows) for rows in tables):
         return None
     frame_from_sensor, sensor = (np.array([list(row.values) for row in rows], float) for rows in tables)
-    if not all(np.abs(each).max() < _LARGEST_ENTRY for each in (frame_from_sensor, sensor)):  # NaN fails too
+    if not all(np.abs(entries).max() < _LARGEST_ENTRY for entries in (frame_from_sensor, sensor)):  # NaN fails too
         return None
     matrix = frame_from_sensor @ sensor
     is_known = matrix[0, 0] > 1 and matrix[1, 1] > 1  # an unknown matrix is the identity

@@ -56,13 +56,13 @@ def recorded_streams(path: str | Path) -> dict[str, Path]:
     """
     path = Path(path)
     if path.is_file():
-        found = [path]
+        files = [path]
     elif path.is_dir():
-        found = sorted(file for file in path.glob("*.mcap") if file.is_file() and is_inside(file, path))
+        files = sorted(file for file in path.glob("*.mcap") if file.is_file() and is_inside(file, path))
     else:
         raise InputError(path, "", "no such file or folder", "an .mcap file, or a folder of them")
     streams: dict[str, Path] = {}
-    for file in found:
+    for file in files:
         stream = _stream_of(file.stem)
         if stream is None:
             continue
@@ -79,7 +79,7 @@ def recorded_streams(path: str | Path) -> dict[str, Path]:
             "video is compressed with loss, which adds noise: record the streams themselves",
         )
     if not streams:
-        names = ", ".join(file.name for file in found[:6]) or "no .mcap"
+        names = ", ".join(file.name for file in files[:6]) or "no .mcap"
         raise InputError(path, "", names, "files whose names say left, right, disparity or depth")
     return streams
 
@@ -120,7 +120,7 @@ def read_depthai_recording(
     """
     path = Path(path)
     streams = recorded_streams(path)
-    known = read_depthai_calibration(calibration or calibration_beside(path))
+    device_calibration = read_depthai_calibration(calibration or calibration_beside(path))
     frames = _read_frames(streams, frame)
     first = frames.get("left", next(iter(frames.values())))
     settings: dict[str, Any] = {
@@ -128,27 +128,27 @@ def read_depthai_recording(
         "maker": "Luxonis",
         "streams": {name: file.name for name, file in streams.items()},
         "sequence": first.sequence,
-        "baseline_mm": float(np.linalg.norm(known.right_from_left.translation)),
-        "spec_baseline_mm": known.spec_baseline_mm,
+        "baseline_mm": float(np.linalg.norm(device_calibration.right_from_left.translation)),
+        "spec_baseline_mm": device_calibration.spec_baseline_mm,
     }
     if first.exposure_s > 0:
         settings["sensitivity_iso"] = first.sensitivity_iso
-    derived = _derived(frames, known, subpixel_bits, settings)
+    derived = _derived(frames, device_calibration, subpixel_bits, settings)
     images: dict[str, NDArray[Any]] = {}
     if {"left", "right"} <= set(frames):
         technology, settings["measured_from"] = "active_stereo", "raw pair"
         images = {side: frames[side].image[None] for side in ("left", "right")}
-        rig = _pair(frames["left"], frames["right"], known, streams["right"])
+        rig = _pair(frames["left"], frames["right"], device_calibration, streams["right"])
     elif "disparity" in frames:
         technology, settings["measured_from"] = "disparity_map", "disparity"
-        rig = _disparity_rig(frames["disparity"], known)
+        rig = _disparity_rig(frames["disparity"], device_calibration)
     elif "depth" in frames:
         technology, settings["measured_from"] = "depth_map", "device depth"
-        rig = _depth_rig(frames["depth"], known)
+        rig = _depth_rig(frames["depth"], device_calibration)
     else:
         raise InputError(path, ", ".join(streams), "a single image", "left and right, disparity, or depth")
     return Capture(
-        sensor=sensor or known.name,
+        sensor=sensor or device_calibration.name,
         technology=technology,
         source="replay",
         rig=rig,
@@ -183,11 +183,11 @@ def calibration_beside(path: Path) -> Path:
     folder = path if path.is_dir() else path.parent
     if (folder / "calibration.json").is_file():
         return folder / "calibration.json"
-    found = sorted(folder.glob("*calib*.json"))
-    if len(found) != 1:
-        names = ", ".join(file.name for file in found[:4]) or "no such file"
+    files = sorted(folder.glob("*calib*.json"))
+    if len(files) != 1:
+        names = ", ".join(file.name for file in files[:4]) or "no such file"
         raise InputError(folder, "*calib*.json", names, "one calibration beside the recording", "or --calibration FILE")
-    return found[0]
+    return files[0]
 
 
 def _stream_of(name: str) -> str | None:
@@ -207,7 +207,7 @@ def _stream_of(name: str) -> str | None:
 
 
 def _derived(
-    frames: dict[str, RecordedFrame], known: DepthaiCalibration, bits: int | None, settings: dict[str, Any]
+    frames: dict[str, RecordedFrame], calibration: DepthaiCalibration, bits: int | None, settings: dict[str, Any]
 ) -> dict[str, NDArray[np.float32]]:
     """Return the device's own maps, NaN where it has no value."""
     derived = {}
@@ -216,17 +216,21 @@ def _derived(
         derived["depth"] = np.where(depth > 0, depth, np.float32(np.nan))
     if "disparity" in frames:
         frame = frames["disparity"]
-        found = _subpixel_bits(frame, frames.get("depth"), known)
-        settings["subpixel_bits_from"] = "option" if bits is not None else "depth" if found is not None else "default"
+        depth_bits = _subpixel_bits(frame, frames.get("depth"), calibration)
+        settings["subpixel_bits_from"] = (
+            "option" if bits is not None else "depth" if depth_bits is not None else "default"
+        )
         if bits is None:
-            bits = found if found is not None else DEFAULT_SUBPIXEL_BITS if frame.image.dtype == np.uint16 else 0
+            bits = (
+                depth_bits if depth_bits is not None else DEFAULT_SUBPIXEL_BITS if frame.image.dtype == np.uint16 else 0
+            )
         settings["subpixel_bits"] = bits
         disparity = frame.image.astype(np.float32) / np.float32(2**bits)
         derived["disparity"] = np.where(disparity > 0, disparity, np.float32(np.nan))
     return derived
 
 
-def _subpixel_bits(frame: RecordedFrame, depth: RecordedFrame | None, known: DepthaiCalibration) -> int | None:
+def _subpixel_bits(frame: RecordedFrame, depth: RecordedFrame | None, calibration: DepthaiCalibration) -> int | None:
     """Return n for which Z d = f B; None without a depth map of the same pixels, or if no n fits."""
     if depth is None or depth.image.shape != frame.image.shape:
         return None
@@ -234,39 +238,41 @@ def _subpixel_bits(frame: RecordedFrame, depth: RecordedFrame | None, known: Dep
     if not both.any():
         return None
     product = float(np.median(depth.image[both].astype(float) * frame.image[both]))
-    steps = np.log2(product / (_matrix(frame, known)[0, 0] * float(np.linalg.norm(known.right_from_left.translation))))
+    steps = np.log2(
+        product / (_matrix(frame, calibration)[0, 0] * float(np.linalg.norm(calibration.right_from_left.translation)))
+    )
     nearest = round(steps)
     return nearest if 0 <= nearest <= 8 and abs(steps - nearest) < np.log2(1 + _LOOSE) else None
 
 
-def _matrix(frame: RecordedFrame, known: DepthaiCalibration) -> NDArray[np.float64]:
+def _matrix(frame: RecordedFrame, calibration: DepthaiCalibration) -> NDArray[np.float64]:
     """Return K of a map's pixels: the frame's own, or that of the left camera at the frame's size."""
     height, width = frame.image.shape
-    return frame.matrix if frame.matrix is not None else known.rig(width, height).reference.matrix
+    return frame.matrix if frame.matrix is not None else calibration.rig(width, height).reference.matrix
 
 
-def _pair(left: RecordedFrame, right: RecordedFrame, known: DepthaiCalibration, where: Path) -> Rig:
+def _pair(left: RecordedFrame, right: RecordedFrame, calibration: DepthaiCalibration, where: Path) -> Rig:
     height, width = left.image.shape
     if right.image.shape != (height, width) or right.image.dtype != left.image.dtype:
         found = f"{right.image.shape[1]} x {right.image.shape[0]} px of {right.image.dtype}"
         raise InputError(where, "size", found, f"{width} x {height} px of {left.image.dtype}, as the left image")
-    return known.rig(width, height)
+    return calibration.rig(width, height)
 
 
-def _disparity_rig(frame: RecordedFrame, known: DepthaiCalibration) -> Rig:
+def _disparity_rig(frame: RecordedFrame, calibration: DepthaiCalibration) -> Rig:
     """Return the calibrated pair, rectified as by the device: its rotations, and one K for both."""
     height, width = frame.image.shape
-    rig = known.rig(width, height)
+    rig = calibration.rig(width, height)
     left, right = rig.cameras.values()
     pair = stereo_rectification(left, right)
-    K = _matrix(frame, known).copy()
+    K = _matrix(frame, calibration).copy()
     K[0, 1] = K[1, 0] = 0.0
     return replace(rig, rectification=replace(pair, matrix_left=K, matrix_right=K))
 
 
-def _depth_rig(frame: RecordedFrame, known: DepthaiCalibration) -> Rig:
+def _depth_rig(frame: RecordedFrame, calibration: DepthaiCalibration) -> Rig:
     """Return the rectified camera of the device's depth map; it has no distortion."""
     height, width = frame.image.shape
-    K = _matrix(frame, known).copy()
+    K = _matrix(frame, calibration).copy()
     K[0, 1] = K[1, 0] = 0.0
     return Rig({"depth": Camera(K, np.zeros(5), width, height)})

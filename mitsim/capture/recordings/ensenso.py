@@ -32,7 +32,7 @@ from mitsim.capture.recordings.nxlib_calibration import NxLibTree, nxlib_rig, se
 from mitsim.capture.recordings.recording_files import chosen_frame, plain_name, recorded_files, recorded_names
 
 _CALIB = "_calib.json"
-_WHAT = "an Ensenso recording: a zip, an .enscam or a folder"
+_EXPECTED = "an Ensenso recording: a zip, an .enscam or a folder"
 
 
 @dataclass(frozen=True)
@@ -115,13 +115,13 @@ def ensenso_originals(path: str | Path, frame: int | None = None) -> dict[str, b
 
 def image_sets(path: str | Path) -> list[str]:
     """Return the names of the image sets of a recording, in order."""
-    names = recorded_names(Path(path), _WHAT)
+    names = recorded_names(Path(path), _EXPECTED)
     return [PurePosixPath(name[: -len(_CALIB)]).name for name in names if name.lower().endswith(_CALIB)]
 
 
 def _image_set(path: Path, frame: int | None) -> _ImageSet:
     """Select the files of an image set."""
-    names = recorded_names(path, _WHAT)
+    names = recorded_names(path, _EXPECTED)
     hint = "a stereo recording has <base>_left.png, <base>_right.png and <base>_calib.json"
     bases = [name[: -len(_CALIB)] for name in names if name.lower().endswith(_CALIB)]
     for side in ("left", "right"):
@@ -155,12 +155,12 @@ def _image_set(path: Path, frame: int | None) -> _ImageSet:
 def _of_side(path: Path, base: str, side: str, names: list[str], hint: str) -> tuple[str, ...]:
     """Return the image of one side, or the images of a FlexView series in order."""
     pattern = _side_pattern(base, side)
-    found = sorted((match.group(1) or "", name) for name in names if (match := pattern.fullmatch(name)))
-    numbers = [number for number, _ in found]
-    if numbers not in ([""], [f"{index:02d}" for index in range(max(len(found), 1))]):
-        shown = ", ".join(PurePosixPath(name).name for _, name in found[:4]) or "no such file"
+    series = sorted((match.group(1) or "", name) for name in names if (match := pattern.fullmatch(name)))
+    numbers = [number for number, _ in series]
+    if numbers not in ([""], [f"{index:02d}" for index in range(max(len(series), 1))]):
+        shown = ", ".join(PurePosixPath(name).name for _, name in series[:4]) or "no such file"
         raise InputError(path, f"*_{side}.png", shown, f"one for {base}, or a series from _00_{side}.png on", hint)
-    return tuple(name for _, name in found)
+    return tuple(name for _, name in series)
 
 
 def _side_pattern(base: str, side: str) -> re.Pattern[str]:

@@ -69,21 +69,21 @@ def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNEL
     files: dict[str, list[str]] = {}
     names, colour = {}, False
     for name in used:
-        found = _files(folder, sensor, name, len(used))
-        counts = [page_count(path) for path in found]
+        paths = _files(folder, sensor, name, len(used))
+        counts = [page_count(path) for path in paths]
         if sum(counts) != count:
             raise InputError(
                 folder,
                 f"images of {name}",
-                f"{sum(counts)}{_ends(found)}",
+                f"{sum(counts)}{_ends(paths)}",
                 f"{count}, as the pattern of {sensor.name}",
-                advice(found, name, count, sensor.ambient_image) if found else _content(folder, used),
+                advice(paths, name, count, sensor.ambient_image) if paths else _content(folder, used),
             )
-        files[name] = _labels(found, counts)
-        images[name] = _stack(found, counts, rig.cameras[name], channel)
-        colour |= is_colour(found[0])
-        names[name] = _labels([path.relative_to(folder).as_posix() for path in found], counts)
-    too_large = sensor.bits is not None and any(int(each.max()) >= 2**sensor.bits for each in images.values())
+        files[name] = _labels(paths, counts)
+        images[name] = _stack(paths, counts, rig.cameras[name], channel)
+        colour |= is_colour(paths[0])
+        names[name] = _labels([path.relative_to(folder).as_posix() for path in paths], counts)
+    too_large = sensor.bits is not None and any(int(stack.max()) >= 2**sensor.bits for stack in images.values())
     empty = 0
     if sensor.bits is None or too_large:
         images, empty = from_bit_0(images, sensor.bits)
@@ -138,25 +138,25 @@ def size_of_images(folder: Path) -> tuple[int, int] | None:
 
 def _files(folder: Path, sensor: Sensor, camera: str, cameras: int) -> list[Path]:
     """Return the image files of one camera, in order."""
-    given = (sensor.images or {}).get(camera)
-    if isinstance(given, list):
-        missing = [name for name in given if not (folder / name).is_file()]
+    entry = (sensor.images or {}).get(camera)
+    if isinstance(entry, list):
+        missing = [name for name in entry if not (folder / name).is_file()]
         if missing:
             raise InputError(folder, missing[0], "no such file", f"the images listed in [images] of {sensor.name}")
-        return [folder / name for name in given]
-    if given is not None:
-        if Path(given).is_absolute() or ".." in Path(given).parts:
-            raise InputError(f"sensor {sensor.name}", f"images.{camera}", repr(given), "a pattern inside the folder")
-        found = [path for path in folder.glob(given) if path.is_file()]
-        if not found:
+        return [folder / name for name in entry]
+    if entry is not None:
+        if Path(entry).is_absolute() or ".." in Path(entry).parts:
+            raise InputError(f"sensor {sensor.name}", f"images.{camera}", repr(entry), "a pattern inside the folder")
+        paths = [path for path in folder.glob(entry) if path.is_file()]
+        if not paths:
             hint = f"the folder has: {', '.join(sorted(path.name for path in folder.iterdir())[:6])}"
-            raise InputError(folder, f"images.{camera}", f"no file that matches {given!r}", "images", hint)
-        return sorted(found, key=counted)
+            raise InputError(folder, f"images.{camera}", f"no file that matches {entry!r}", "images", hint)
+        return sorted(paths, key=counted)
     inside = folder / camera if cameras > 1 and (folder / camera).is_dir() else folder
-    own = [path for path in inside.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file()]
+    paths = [path for path in inside.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file()]
     if cameras > 1 and inside == folder:
-        own = [path for path in own if path.name.startswith(camera)]
-    return sorted(own, key=counted)
+        paths = [path for path in paths if path.name.startswith(camera)]
+    return sorted(paths, key=counted)
 
 
 def _labels(files: Sequence[Path | str], counts: list[int]) -> list[str]:
@@ -201,12 +201,12 @@ def _check_levels(stack: Image, files: list[str], bits: int) -> None:
         raise InputError(files[0], "depth", "8 bits", f"more: imager.bits is {bits}", hint)
 
 
-def advice(found: list[Path], camera: str, count: int, ambient_image: bool) -> str:
+def advice(files: list[Path], camera: str, count: int, ambient_image: bool) -> str:
     """Return advice on images of a camera that are not ``count``: by their names, else on the pattern.
 
     Parameters
     ----------
-    found
+    files
         Files of the images.
     camera
         Name of the camera, as in the sensor file.
@@ -215,29 +215,29 @@ def advice(found: list[Path], camera: str, count: int, ambient_image: bool) -> s
     ambient_image
         Whether the last of these is without the projector.
     """
-    matches = [re.search(r"(\d+)(?=\D*$)", path.name) for path in found]
+    matches = [re.search(r"(\d+)(?=\D*$)", path.name) for path in files]
     numbers = sorted({int(match.group(1)) for match in matches if match})
     gaps = sorted(set(range(numbers[0], numbers[-1] + 1)) - set(numbers)) if numbers else []
-    if gaps and len(numbers) == len(found):
+    if gaps and len(numbers) == len(files):
         return f"number {', '.join(map(str, gaps[:5]))} is missing"
-    shapes = Counter(re.sub(r"\d+", "*", path.name) for path in found)
+    shapes = Counter(re.sub(r"\d+", "*", path.name) for path in files)
     for shape, number in shapes.items():
-        if number == count < len(found) and "*" in shape:
-            others = [path.name for path in found if re.sub(r"\d+", "*", path.name) != shape]
+        if number == count < len(files) and "*" in shape:
+            strays = [path.name for path in files if re.sub(r"\d+", "*", path.name) != shape]
             return (
-                f"{', '.join(others[:4])} differs in name from the {count} images needed: write "
+                f"{', '.join(strays[:4])} differs in name from the {count} images needed: write "
                 f"{camera} = {shape!r} in [images] of the sensor file, or --images {camera}={shape!r}"
             )
     last = (
-        "" if ambient_image or len(found) != count + 1 else "write ambient_image = true, if the last has no light; or "
+        "" if ambient_image or len(files) != count + 1 else "write ambient_image = true, if the last has no light; or "
     )
     return (
         f"{last}correct [pattern], or name the files in [images] of the sensor file, or by --images {camera}='PATTERN'"
     )
 
 
-def _ends(found: list[Path]) -> str:
-    return "" if not found else f", {found[0].name} to {found[-1].name}"
+def _ends(files: list[Path]) -> str:
+    return "" if not files else f", {files[0].name} to {files[-1].name}"
 
 
 def _content(folder: Path, cameras: list[str]) -> str:

@@ -14,8 +14,8 @@ from characterisation.files.errors import InputError
 from mitsim.sensor.transforms import is_rotation
 
 
-def parsed_json(data: bytes, where: str | Path, what: str) -> Any:
-    """Return the value of a JSON text in UTF-8, in which NaN and infinity are null; ``what`` names the expectation.
+def parsed_json(data: bytes, where: str | Path, expected: str) -> Any:
+    """Return the value of a JSON text in UTF-8, in which NaN and infinity are null; messages say what is ``expected``.
 
     Raises
     ------
@@ -25,7 +25,7 @@ def parsed_json(data: bytes, where: str | Path, what: str) -> Any:
     try:
         return json.loads(data.decode("utf-8-sig"), parse_constant=lambda _: None)
     except (ValueError, RecursionError) as error:
-        raise InputError(where, "", f"text that is not JSON ({error})", what) from None
+        raise InputError(where, "", f"text that is not JSON ({error})", expected) from None
 
 
 class JsonFields:

@@ -179,12 +179,12 @@ def _stream(body: memoryview) -> ReadDataStream:
     return ReadDataStream(BytesIO(body))
 
 
-def _bounded(number: int, most: int, what: str) -> int:
+def _bounded(number: int, most: int, quantity: str) -> int:
     if number > most:
-        raise ValueError(f"{number} {what}, over {most}")
+        raise ValueError(f"{number} {quantity}, over {most}")
     return number
 
 
-def _check_crc(data: memoryview, crc: int, what: str) -> None:
+def _check_crc(data: memoryview, crc: int, part: str) -> None:
     if crc != 0 and zlib.crc32(data) != crc:  # 0 means not computed
-        raise ValueError(f"checksum of the {what}")
+        raise ValueError(f"checksum of the {part}")

@@ -39,10 +39,10 @@ class NxLibTree(JsonFields):
     """A node of the NxLib tree, read by paths such as ``Calibration/Stereo/Baseline``."""
 
     def __init__(self, text: bytes, where: str) -> None:
-        what = "the camera's node as NxLib saves it"
-        root = parsed_json(text, where, what)
+        expected = "the camera's node as NxLib saves it"
+        root = parsed_json(text, where, expected)
         if not isinstance(root, dict):
-            raise InputError(where, "", type(root).__name__, f"a JSON object: {what}")
+            raise InputError(where, "", type(root).__name__, f"a JSON object: {expected}")
         super().__init__(root, where, separator="/")
 
     def is_virtual(self) -> bool:
@@ -105,9 +105,9 @@ def nxlib_rig(tree: NxLibTree, size: tuple[int, int] | None = None, *, dynamic: 
             distortion=_distortion(tree, f"Calibration/Monocular/{side}/Distortion"),
             width=width,
             height=height,
-            sensor_from_camera=place,
+            sensor_from_camera=pose,
         )
-        for side, place in (("Left", Transform.identity()), ("Right", left_from_right))
+        for side, pose in (("Left", Transform.identity()), ("Right", left_from_right))
     }
     for side, camera in cameras.items():
         check_camera(camera, tree.where, f"Calibration/Monocular/{side.capitalize()}/Camera")

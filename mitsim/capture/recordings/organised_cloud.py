@@ -99,8 +99,8 @@ def read_stored_cloud(path: Path) -> StoredCloud:
             raise InputError(path, "", "a cloud written by mitsim", "a cloud of another program", "it needs no import")
         note = leave_out_marks(read.points)
         size = read.size or grid_of(read.points)
-        found = {} if read.size or size is None else {"grid_from": "the points"}
-        return StoredCloud(path, read.points, size, found, unit=read.unit, note=note)
+        records = {} if read.size or size is None else {"grid_from": "the points"}
+        return StoredCloud(path, read.points, size, records, unit=read.unit, note=note)
     if data.startswith(NPY_MAGIC) or path.suffix.lower() == ".npz":
         return _of_npy(path, data)
     if path.suffix.lower() == ".ply" and b"FIELDS" not in data[:4096]:
@@ -184,12 +184,12 @@ def read_organised_cloud(
     """
     stored = path if isinstance(path, StoredCloud) else read_stored_cloud(Path(path))
     path = stored.path
-    points, given = _on_grid(stored, calibration, camera)
+    points, calibrated = _on_grid(stored, calibration, camera)
     settings: dict[str, Any] = {"imported_from": path.name, "axes_of_file": axes} | stored.records
     points[points[..., 2] == 0] = np.nan  # in the plane of the optical centre
     settings["unit_of_file"], _ = scale_to_mm(points, path, unit or stored.unit, "check --unit")
     count = int(np.isfinite(points[..., 0]).sum())
-    if count < LEAST_POINTS and given is None:
+    if count < LEAST_POINTS and calibrated is None:
         raise InputError(path, "", f"{count} points", f"{LEAST_POINTS} or more")
     if axes == "opengl":
         points *= np.array([1, -1, -1], np.float32)
@@ -201,16 +201,16 @@ def read_organised_cloud(
             points = rectified_from_workspace.points(points).astype(np.float32)
             settings["link_target"] = str(tree.get("Link/Target") or "")
             settings["sensor_from_workspace"] = (turn @ rectified_from_workspace).matrix().tolist()
-    rig, found = _seen_by(points, path, given, camera, turn)
-    settings |= found
+    rig, records = _seen_by(points, path, calibrated, camera, turn)
+    settings |= records
     images = {} if stored.grey is None else {next(iter(rig.cameras)): stored.grey[None]}
     points = rig.reference.sensor_from_camera.points(points).astype(np.float32)
-    notes = given.notes if given is not None and "off_the_rays_px" in found else ()
-    if warnings := [each for each in (stored.note, *notes) if each]:
+    notes = calibrated.notes if calibrated is not None and "off_the_rays_px" in records else ()
+    if warnings := [note for note in (stored.note, *notes) if note]:
         settings["warnings"] = warnings
-    near, far = (given.range_mm if given else None) or (None, None)
+    near, far = (calibrated.range_mm if calibrated else None) or (None, None)
     return Capture(
-        sensor=sensor or (given.sensor if given else "") or "point-cloud",
+        sensor=sensor or (calibrated.sensor if calibrated else "") or "point-cloud",
         technology="point_map",
         source="device",
         rig=rig,
@@ -227,11 +227,13 @@ def _on_grid(
 ) -> tuple[Points, Calibrated | None]:
     """Return the points (H, W, 3) as in the file, and the given calibration."""
     size, count = stored.size, stored.points.size // 3
-    given = None if calibration is None else read_calibration(calibration, size)
-    if size is None and given is not None:
-        eye = given.rig.reference if camera is None else given.rig.cameras.get(camera, given.rig.reference)
+    calibrated = None if calibration is None else read_calibration(calibration, size)
+    if size is None and calibrated is not None:
+        eye = (
+            calibrated.rig.reference if camera is None else calibrated.rig.cameras.get(camera, calibrated.rig.reference)
+        )
         size = eye.width, eye.height
-    given = given or stored.camera
+    calibrated = calibrated or stored.camera
     hint = "save it organised, a point or NaN for each pixel, or give the camera of its pixels: --calibration"
     if size is None:
         of_pcd = stored.points.ndim == 3
@@ -242,11 +244,11 @@ def _on_grid(
     if size[0] * size[1] != count:
         allowed = f"{size[0]} x {size[1]}, one for each pixel"
         raise InputError(stored.path, "", f"{count} points", allowed, hint)
-    return stored.points.reshape(size[1], size[0], 3).copy(), given
+    return stored.points.reshape(size[1], size[0], 3).copy(), calibrated
 
 
 def _seen_by(
-    points: Points, path: Path, given: Calibrated | None, name: str | None, turn: Transform
+    points: Points, path: Path, calibrated: Calibrated | None, name: str | None, turn: Transform
 ) -> tuple[Rig, dict[str, Any]]:
     """Return the rig of the camera in whose frame, and on whose view rays, the points (H, W, 3) [mm] lie.
 
@@ -266,14 +268,14 @@ def _seen_by(
             "z forward, y down",
             "if y is up and z backward, use --axes opengl",
         )
-    if given is not None:
-        eyes = _possible_cameras(given, name, (width, height), path, turn)
+    if calibrated is not None:
+        eyes = _possible_cameras(calibrated, name, (width, height), path, turn)
         measured = [(off_the_rays(eye.sensor_from_camera.points(points), eye), eye) for eye in eyes]
-        off, best = min(measured, key=lambda each: each[0], default=(math.inf, None))
+        off, best = min(measured, key=lambda candidate: candidate[0], default=(math.inf, None))
         if best is not None and off <= CAMERA_OFF_PX:
-            alone = Rig({name or next(iter(given.rig.cameras)): best}, given.rig.projector)
+            alone = Rig({name or next(iter(calibrated.rig.cameras)): best}, calibrated.rig.projector)
             return alone, {"off_the_rays_px": round(off, 6)}
-        if not given.nominal:
+        if not calibrated.nominal:
             found = f"points {off:.3g} px from the view rays of their pixels (median)"
             allowed = f"up to {CAMERA_OFF_PX:g} px: points in the frame of the calibrated camera"
             raise InputError(path, "", found, allowed, hint)
@@ -287,24 +289,24 @@ def _seen_by(
 
 
 def _possible_cameras(
-    given: Calibrated, name: str | None, size: tuple[int, int], path: Path, turn: Transform
+    calibrated: Calibrated, name: str | None, size: tuple[int, int], path: Path, turn: Transform
 ) -> list[Camera]:
     """Return the cameras of a calibration that may own a grid of ``size`` (width, height), in the sensor frame.
 
     These are the camera itself and, for the first camera of a pair with a rectification, its rectified camera. The
     latter may be scaled as a device scales its maps: fx, fy, cx and cy by the same factor.
     """
-    eyes, pair = [], given.rig.rectification
-    left = given.rig.reference
-    if pair is not None and (name is None or given.rig.cameras.get(name) is left):
+    eyes, pair = [], calibrated.rig.rectification
+    left = calibrated.rig.reference
+    if pair is not None and (name is None or calibrated.rig.cameras.get(name) is left):
         scale = size[0] / pair.width
         if abs(scale * pair.height - size[1]) < 1:  # a side may be rounded
-            place = left.sensor_from_camera @ Transform(pair.rotation_left.T, np.zeros(3))
+            pose = left.sensor_from_camera @ Transform(pair.rotation_left.T, np.zeros(3))
             matrix = np.diag([scale, scale, 1.0]) @ pair.matrix_left
-            eyes.append(Camera(matrix, np.zeros(5), *size, sensor_from_camera=place))
+            eyes.append(Camera(matrix, np.zeros(5), *size, sensor_from_camera=pose))
     if not eyes or size == (left.width, left.height):
-        if given.nominal and size != (left.width, left.height):
+        if calibrated.nominal and size != (left.width, left.height):
             return eyes
-        eye = camera_of(given, name, size, path)
+        eye = camera_of(calibrated, name, size, path)
         eyes.append(replace(eye, sensor_from_camera=eye.sensor_from_camera @ turn))
     return eyes

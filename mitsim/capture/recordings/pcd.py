@@ -105,11 +105,11 @@ def _numbers(
     with np.errstate(over="ignore", invalid="ignore"):
         if kind == "ascii":
             words = number_words(body)
-            each = sum(int(np.prod(dtype[name].shape)) for name in names)
-            if len(words) != count * each:
-                raise ValueError(f"{len(words)} numbers, {count * each} expected")
+            stride = sum(int(np.prod(dtype[name].shape)) for name in names)
+            if len(words) != count * stride:
+                raise ValueError(f"{len(words)} numbers, {count * stride} expected")
             first = np.cumsum([0, *(int(np.prod(dtype[name].shape)) for name in names)])
-            return {axis: np.array(words[first[names.index(axis)] :: each], np.float32) for axis in "xyz"}
+            return {axis: np.array(words[first[names.index(axis)] :: stride], np.float32) for axis in "xyz"}
         if kind == "binary":
             if len(body) < count * dtype.itemsize:
                 raise ValueError(f"{len(body)} bytes, {count * dtype.itemsize} expected")

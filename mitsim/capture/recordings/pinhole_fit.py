@@ -50,16 +50,16 @@ def fit_pinhole(points: NDArray[np.floating]) -> tuple[Camera, float] | None:
     It has a distortion only if it would not fit without one, and fits with it. None if
     :func:`characterisation.pinhole_grid.pinhole_of` finds none.
     """
-    found = pinhole_of(points)
-    if found is None:
+    pinhole = pinhole_of(points)
+    if pinhole is None:
         return None
     height, width = points.shape[:2]
-    if PINHOLE_RMS_PX < found.rms < _BENT_SHARE * max(height, width):
-        bent = _with_lens(points, (found.fx, found.fy, found.cx, found.cy))
+    if PINHOLE_RMS_PX < pinhole.rms < _BENT_SHARE * max(height, width):
+        bent = _with_lens(points, (pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy))
         if bent is not None and bent[1] <= PINHOLE_RMS_PX:
             return bent
-    matrix = np.array([[found.fx, 0.0, found.cx], [0.0, found.fy, found.cy], [0.0, 0.0, 1.0]])
-    return Camera(matrix, np.zeros(5), width, height), found.rms
+    matrix = np.array([[pinhole.fx, 0.0, pinhole.cx], [0.0, pinhole.fy, pinhole.cy], [0.0, 0.0, 1.0]])
+    return Camera(matrix, np.zeros(5), width, height), pinhole.rms
 
 
 def _with_lens(points: NDArray[np.floating], start: tuple[float, float, float, float]) -> tuple[Camera, float] | None:
@@ -108,10 +108,10 @@ def grid_of(points: NDArray[np.floating]) -> tuple[int, int] | None:
     """
     count = len(points)
     seen = np.isfinite(points).all(axis=-1) & (points[:, 2] != 0)
-    places = np.flatnonzero(seen)
-    if len(places) < LEAST_POINTS:
+    indices = np.flatnonzero(seen)
+    if len(indices) < LEAST_POINTS:
         return None
-    used = places[np.linspace(0, len(places) - 1, min(_POINTS_USED, len(places))).astype(int)]
+    used = indices[np.linspace(0, len(indices) - 1, min(_POINTS_USED, len(indices))).astype(int)]
     x, y, z = points[used].astype(np.float64).T
     if not ((z > 0).all() or (z < 0).all()):
         return None
@@ -125,7 +125,9 @@ def grid_of(points: NDArray[np.floating]) -> tuple[int, int] | None:
     for width in range(_NARROWEST, min(count // _NARROWEST, LONGEST_SIDE_PX) + 1):
         if count % width or count // width > LONGEST_SIDE_PX:
             continue
-        off = [_residual(design, place) for design, place in ((across, used % width), (down, used // width))]
+        off = [
+            _residual(design, coordinates) for design, coordinates in ((across, used % width), (down, used // width))
+        ]
         if best is None or max(off) < best[0]:
             best = max(off), (width, count // width)
     return best[1] if best is not None and best[0] <= _LOOSE_PX else None
@@ -135,10 +137,10 @@ def grid_of(points: NDArray[np.floating]) -> tuple[int, int] | None:
 _LOOSE_PX = 1.0
 
 
-def _residual(design: NDArray[np.float64], place: NDArray[np.intp]) -> float:
-    """Return the rms [px] of places as a combination of the columns of a design."""
-    weights, *_ = np.linalg.lstsq(design, place.astype(float), rcond=None)
-    return float(np.sqrt(np.mean((design @ weights - place) ** 2)))
+def _residual(design: NDArray[np.float64], coordinates: NDArray[np.intp]) -> float:
+    """Return the rms [px] of coordinates as a combination of the columns of a design."""
+    weights, *_ = np.linalg.lstsq(design, coordinates.astype(float), rcond=None)
+    return float(np.sqrt(np.mean((design @ weights - coordinates) ** 2)))
 
 
 def off_the_rays(points: NDArray[np.floating], camera: Camera) -> float:

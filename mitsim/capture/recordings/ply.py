@@ -3,7 +3,7 @@
 Signal chain: header -> elements and their properties -> x, y, z of every vertex -> rows and columns, if stated.
 
 PLY has no grid of its own. Two kinds of file state one. Range grids of Stanford's scans have ``obj_info num_cols`` and
-``num_rows``, and lists ``range_grid`` for the filled places. PCL has ``viewportx`` and ``viewporty`` of an element
+``num_rows``, and lists ``range_grid`` for the filled pixels. PCL has ``viewportx`` and ``viewporty`` of an element
 ``camera``.
 """
 
@@ -51,7 +51,7 @@ class Ply:
     ``size`` (width, height) of the grid and ``unit`` of length are None if the file does not state them.
 
     Points are in row order, missing ones as NaN or zeros. Points of a range grid, which omits missing ones, have been
-    put in their places.
+    put on their pixels.
     """
 
     points: NDArray[np.float32]
@@ -78,11 +78,11 @@ class _Element:
     @property
     def lists(self) -> bool:
         """Return whether a property is a list."""
-        return any(one.count for one in self.properties)
+        return any(entry.count for entry in self.properties)
 
     def with_property(self, name: str, kind: str, count: str = "") -> _Element:
         """Return the element with another property; a name that is there gets a number."""
-        taken = {one.name for one in self.properties}
+        taken = {entry.name for entry in self.properties}
         name = name.lower() if name in "XYZ" else name
         unique = name if name not in taken else f"{name} {len(taken)}"
         return replace(self, properties=(*self.properties, _Property(unique, kind, count)))
@@ -123,27 +123,27 @@ def decode_ply(data: bytes, where: str | Path) -> Ply:
 
 def _elements(lines: tuple[str, ...], where: str | Path) -> tuple[str, list[_Element]]:
     order: str | None = None
-    found: list[_Element] = []
+    elements: list[_Element] = []
     for line in lines[1:]:
         words = line.split()
         match words:
             case ["format", kind, _] if kind in _ORDERS:
                 order = _ORDERS[kind]
             case ["element", name, count] if count.isascii() and count.isdigit() and len(count) <= 9:
-                found.append(_Element(name, int(count)))
-            case ["property", kind, name] if kind in _TYPES and found:
-                found[-1] = found[-1].with_property(name, _TYPES[kind])
-            case ["property", "list", count, kind, name] if count in _TYPES and kind in _TYPES and found:
+                elements.append(_Element(name, int(count)))
+            case ["property", kind, name] if kind in _TYPES and elements:
+                elements[-1] = elements[-1].with_property(name, _TYPES[kind])
+            case ["property", "list", count, kind, name] if count in _TYPES and kind in _TYPES and elements:
                 if _TYPES[count][0] == "f":
-                    raise InputError(where, f"element {found[-1].name}", line, "a whole number of items")
-                found[-1] = found[-1].with_property(name, _TYPES[kind], _TYPES[count])
+                    raise InputError(where, f"element {elements[-1].name}", line, "a whole number of items")
+                elements[-1] = elements[-1].with_property(name, _TYPES[kind], _TYPES[count])
             case ["comment" | "obj_info", *_] | []:
                 continue
             case _:
                 raise InputError(where, "", f"the line {line[:60]!r}", "the header of a PLY 1.0")
     if order is None:
         raise InputError(where, "format", "nothing", " | ".join(_ORDERS))
-    return order, found
+    return order, elements
 
 
 #: elements that are used
@@ -163,7 +163,7 @@ def _tables(body: bytes, order: str, elements: list[_Element]) -> dict[str, Tabl
     if order == "" and len(body) > _LARGEST_TEXT:
         raise ValueError(f"{len(body):,} bytes of text, at most {_LARGEST_TEXT:,}: save it as binary PLY")
     words = number_words(body) if order == "" else []
-    last = max((number for number, one in enumerate(elements) if one.name in _USEFUL), default=-1)
+    last = max((number for number, entry in enumerate(elements) if entry.name in _USEFUL), default=-1)
     out: dict[str, Table] = {}
     at = 0
     for element in elements[: last + 1]:
@@ -178,14 +178,14 @@ def _tables(body: bytes, order: str, elements: list[_Element]) -> dict[str, Tabl
             if len(part) < columns * element.count:
                 raise ValueError(f"{len(part)} numbers of {element.name}, {columns * element.count} expected")
             table = np.array(part, np.float64).reshape(element.count, columns)
-            out[element.name] = {one.name: table[:, column] for column, one in enumerate(element.properties)}
+            out[element.name] = {entry.name: table[:, column] for column, entry in enumerate(element.properties)}
             at += columns * element.count
         else:
-            dtype = np.dtype([(one.name, order + one.kind) for one in element.properties])
+            dtype = np.dtype([(entry.name, order + entry.kind) for entry in element.properties])
             if len(body) - at < dtype.itemsize * element.count:
                 raise ValueError(f"{len(body) - at} bytes of {element.name}, {dtype.itemsize * element.count} expected")
             packed = np.frombuffer(body, dtype, element.count, at)
-            out[element.name] = {one.name: packed[one.name] for one in element.properties}
+            out[element.name] = {entry.name: packed[entry.name] for entry in element.properties}
             at += dtype.itemsize * element.count
     return out
 
@@ -194,9 +194,9 @@ def _rows(
     body: bytes, words: list[str], at: int, order: str, element: _Element
 ) -> tuple[dict[str, NDArray[np.generic]], list[list[float]], int]:
     """Read an element with lists: its numbers by name, the items of its first list, and the position after it."""
-    plain = [one for one in element.properties if not one.count]
-    first = next(one for one in element.properties if one.count)
-    numbers: dict[str, list[float]] = {one.name: [] for one in plain}
+    plain = [entry for entry in element.properties if not entry.count]
+    first = next(entry for entry in element.properties if entry.count)
+    numbers: dict[str, list[float]] = {entry.name: [] for entry in plain}
     rows: list[list[float]] = []
 
     def items(kind: str, length: int) -> list[float]:
@@ -214,15 +214,15 @@ def _rows(
         return row
 
     for _ in range(element.count):
-        for one in element.properties:
-            if not one.count:
-                numbers[one.name] += items(one.kind, 1)
+        for entry in element.properties:
+            if not entry.count:
+                numbers[entry.name] += items(entry.kind, 1)
                 continue
-            length = items(one.count, 1)[0]
+            length = items(entry.count, 1)[0]
             if not (length.is_integer() and 0 <= length <= len(body)):
                 raise ValueError(f"a list of {length:g} in {element.name}")
-            row = items(one.kind, int(length))
-            if one is first:
+            row = items(entry.kind, int(length))
+            if entry is first:
                 rows.append(row)
     return {name: np.array(values) for name, values in numbers.items()}, rows, at
 
@@ -242,10 +242,10 @@ def _stated_size(lines: tuple[str, ...]) -> tuple[int, int] | None:
 def _placed(
     points: NDArray[np.float32], grid: list[list[float]], size: tuple[int, int], where: str | Path
 ) -> NDArray[np.float32]:
-    """Return the points (width * height, 3) of a range grid; each place has an empty list or one vertex number."""
+    """Return the points (width * height, 3) of a range grid; each pixel has an empty list or the number of a vertex."""
     if len(grid) != size[0] * size[1]:
         raise InputError(where, "element range_grid", len(grid), f"{size[0] * size[1]}, num_cols times num_rows")
-    filled = np.array([place for place, row in enumerate(grid) if row], np.intp)
+    filled = np.array([index for index, row in enumerate(grid) if row], np.intp)
     numbers = np.array([row[0] for row in grid if row], float)
     if len(numbers) and not (numbers.min() >= 0 and numbers.max() < len(points)):
         raise InputError(where, "element range_grid", "a vertex number out of range", f"0 to {len(points) - 1}")

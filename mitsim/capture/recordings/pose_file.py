@@ -1,8 +1,8 @@
 """Read the pose of a sensor, ``world_from_sensor``, 4 x 4 [mm], from a file.
 
 The file is JSON, as ``pose.json`` of a capture, optionally with the covariance, or a list of rows; or text, four rows
-of four numbers, as NumPy, MATLAB and robots write them; or JSON or YAML with a place and a quaternion of known order,
-such as a pose or a transform of ROS, which are in metres.
+of four numbers, as NumPy, MATLAB and robots write them; or JSON or YAML with a position and a quaternion of known
+order, such as a pose or a transform of ROS, which are in metres.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _WANTED = (
 _MESSAGES = ("pose", "transform")
 
 #: names of a position
-_PLACES = ("position", "translation")
+_POSITIONS = ("position", "translation")
 #: endings of the names of an orientation
 _TURNS = ("orientation", "rotation", "quaternion", "xyzw", "wxyz")
 
@@ -83,13 +83,13 @@ def read_pose(file: str | Path) -> tuple[Transform, NDArray[np.float64] | None]:
 
 def _rows_of(file: Path, table: dict[str, Any]) -> list[list[float]]:
     """Return the rows (4, 4) [mm] of a map with the position and the orientation of the sensor in the world."""
-    while (name := next((each for each in _MESSAGES if isinstance(table.get(each), dict)), None)) is not None:
+    while (name := next((key for key in _MESSAGES if isinstance(table.get(key), dict)), None)) is not None:
         table = table[name]
     table = with_rotations(table)
     names = [name for name in table if name not in UNIT_NAMES]
-    places = [name for name in names if name in _PLACES]
+    positions = [name for name in names if name in _POSITIONS]
     turns = [name for name in names if name.lower().endswith(_TURNS)]
-    T, R = (vector(table[each[0]]) if len(each) == 1 else None for each in (places, turns))
+    T, R = (vector(table[keys[0]]) if len(keys) == 1 else None for keys in (positions, turns))
     if T is None or R is None or len(names) > 2 or len(T) != 3 or len(R) != 9:
         order = " of unknown order or length" if R is not None and len(R) == 4 else ""
         raise InputError(file, "", f"{', '.join(map(str, table))}{order}", _WANTED)

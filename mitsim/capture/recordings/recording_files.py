@@ -49,8 +49,8 @@ _DAMAGED = (
 )
 
 
-def recorded_names(path: Path, what: str) -> list[str]:
-    """List the files in a folder or zip, down to the third level, with ``/`` between; ``what`` names the expectation.
+def recorded_names(path: Path, expected: str) -> list[str]:
+    """List the files in a folder or zip down to the third level, with ``/`` between; ``expected`` is for messages.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def recorded_names(path: Path, what: str) -> list[str]:
             if file.is_file() and is_inside(file, path)
         ]
     else:
-        names = _zipped_names(path, what)
+        names = _zipped_names(path, expected)
     if len(names) > MOST_FILES:
         raise InputError(path, "", f"{len(names)} files", f"up to {MOST_FILES} files")
     kept = [name for name in names if len(PurePosixPath(name).parts) <= _DEEPEST]
@@ -106,9 +106,9 @@ def plain_name(name: str) -> str:
     return plain if re.match("[A-Za-z0-9]", plain) else f"x{plain[1:]}"
 
 
-def _zipped_names(path: Path, what: str) -> list[str]:
+def _zipped_names(path: Path, expected: str) -> list[str]:
     if not path.is_file():
-        raise InputError(path, "", "no such file or folder", what)
+        raise InputError(path, "", "no such file or folder", expected)
     try:
         with zipfile.ZipFile(path) as archive:
             return archive.namelist()
@@ -128,7 +128,7 @@ def _damaged(path: Path, error: BaseException) -> InputError:
     return InputError(path, "", f"a file that cannot be unpacked ({error})", "an undamaged zip without password")
 
 
-def frame_of(given: int | str | None, path: Path, names: list[str] | None = None) -> int | None:
+def frame_of(frame: int | str | None, path: Path, names: list[str] | None = None) -> int | None:
     """Return the number of a frame given by its number, counted from 0, or by its name.
 
     ``names`` of the frames in order, if they have any.
@@ -138,16 +138,16 @@ def frame_of(given: int | str | None, path: Path, names: list[str] | None = None
     InputError
         If it is neither; the error lists the readable frames.
     """
-    if given is None or isinstance(given, int) or (given.isascii() and given.isdigit()):
-        if given is not None and names is not None and not int(given) < len(names):
-            raise InputError(path, "--frame", given, _readable(names))
-        return None if given is None else int(given)
-    if names and given in names:
-        return names.index(given)
-    raise InputError(path, "--frame", repr(given), _readable(names) if names else "a number, from 0")
+    if frame is None or isinstance(frame, int) or (frame.isascii() and frame.isdigit()):
+        if frame is not None and names is not None and not int(frame) < len(names):
+            raise InputError(path, "--frame", frame, _readable(names))
+        return None if frame is None else int(frame)
+    if names and frame in names:
+        return names.index(frame)
+    raise InputError(path, "--frame", repr(frame), _readable(names) if names else "a number, from 0")
 
 
-def chosen_frame(frame: int | None, count: int, where: Path, what: str) -> int:
+def chosen_frame(frame: int | None, count: int, where: Path, label: str) -> int:
     """Return the number of the chosen frame, from 0; a single frame need not be chosen.
 
     Parameters
@@ -158,7 +158,7 @@ def chosen_frame(frame: int | None, count: int, where: Path, what: str) -> int:
         Number of frames.
     where
         File that messages name.
-    what
+    label
         Name of the frames in messages, in the plural.
 
     Raises
@@ -172,9 +172,9 @@ def chosen_frame(frame: int | None, count: int, where: Path, what: str) -> int:
     """
     if frame is None and count > 1:
         allowed, hint = "one in a capture", f"choose with --frame 0 to {count - 1}"
-        raise InputError(where, "--frame", f"{count} {what}", allowed, hint)
+        raise InputError(where, "--frame", f"{count} {label}", allowed, hint)
     if frame is not None and not 0 <= frame < count:
-        raise InputError(where, "--frame", frame, f"0 to {count - 1}: {what}, in their order")
+        raise InputError(where, "--frame", frame, f"0 to {count - 1}: {label}, in their order")
     return frame or 0
 
 

@@ -101,9 +101,9 @@ def read_robi(
         "projector_on": True,
         "disparity_shift_px": numbers["depth"].get("disparity_shift", 0.0),
     }
-    known, decoding = depth[np.isfinite(depth)], Decoding()
-    if len(known):
-        near, far = np.percentile(known, _PERCENTILES)
+    depths, decoding = depth[np.isfinite(depth)], Decoding()
+    if len(depths):
+        near, far = np.percentile(depths, _PERCENTILES)
         decoding = Decoding(near_mm=float(near) * (1 - _WIDER), far_mm=float(far) * (1 + _WIDER))
     pose_file = folder / "Depth" / f"DEPTH_{view}.json"
     capture = Capture(
@@ -120,20 +120,20 @@ def read_robi(
     return capture, [*files.values(), *tables.values(), *([pose_file] if pose_file.is_file() else [])]
 
 
-def _calibrations(folder: Path, given: str | Path | None) -> Path:
+def _calibrations(folder: Path, calibration: str | Path | None) -> Path:
     """Return the folder of the camera files: the given one, else ``cam`` in a parent folder."""
-    if given is not None:
-        return Path(given)
+    if calibration is not None:
+        return Path(calibration)
     above = [parent / "cam" for parent in folder.resolve().parents]
-    found = next((path for path in above if (path / f"{folder.name}_LEFT.yml").is_file()), None)
-    if found is None:
+    camera_folder = next((path for path in above if (path / f"{folder.name}_LEFT.yml").is_file()), None)
+    if camera_folder is None:
         raise InputError(
             folder,
             "calibration",
             f"no cam/{folder.name}_LEFT.yml in a parent folder",
             "the folder cam of the data set's toolkit: --calibration ROBI_Toolkit/cam",
         )
-    return found
+    return camera_folder
 
 
 def _numbers(path: Path) -> dict[str, float]:

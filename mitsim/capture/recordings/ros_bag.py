@@ -84,12 +84,12 @@ def open_bag(path: Path) -> RosBag:
     if not path.is_dir():
         return _opened(path)
     files = [file for file in islice(path.iterdir(), MOST_FILES) if file.is_file() and not file.is_symlink()]
-    found = sorted((file for file in files if file.suffix.lower() in ROS2_SUFFIXES), key=_numbered)
-    if not found:
+    bag_files = sorted((file for file in files if file.suffix.lower() in ROS2_SUFFIXES), key=_numbered)
+    if not bag_files:
         packed = next((file.name for file in files if file.name.endswith(".zstd")), None)
         hint = "" if packed is None else f"unpack it: zstd -d {packed}"
         raise InputError(path, "", packed or "no .db3 and no .mcap", "the folder of a ROS 2 bag", hint)
-    bags = [_opened(file) for file in found]
+    bags = [_opened(file) for file in bag_files]
     return bags[0] if len(bags) == 1 else _joined(path, bags)
 
 
@@ -145,21 +145,21 @@ def _of_ros1(path: Path) -> RosBag:
     def message(name: str, number: int) -> bytes:
         with _in_words(path), Reader(path) as reader:
             reader.chunks = {
-                place: chunk._replace(decompressor=_bounded_by(chunk.decompressor))
-                for place, chunk in reader.chunks.items()
+                position: chunk._replace(decompressor=_bounded_by(chunk.decompressor))
+                for position, chunk in reader.chunks.items()
             }
             chosen = [connection for connection in reader.connections if connection.topic == name]
-            times = sorted(entry.time for one in chosen for entry in reader.indexes[one.id])
+            times = sorted(entry.time for connection in chosen for entry in reader.indexes[connection.id])
             start = times[number]
-            found = reader.messages(chosen, start=start, stop=start + 1)
-            return next(islice(found, number - times.index(start), None))[2]
+            messages = reader.messages(chosen, start=start, stop=start + 1)
+            return next(islice(messages, number - times.index(start), None))[2]
 
     return RosBag(path, {name: _counted(topic, counts[name]) for name, topic in topics.items()}, message)
 
 
 def _bounded_by(decompressor: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
     """Return the decompressor of a chunk of ROS 1, which stops beyond :data:`LARGEST_CHUNK`."""
-    name = next(name for name, one in decompressors.items() if one is decompressor)
+    name = next(name for name, candidate in decompressors.items() if candidate is decompressor)
     if name == "none":
         return decompressor
 
@@ -220,9 +220,9 @@ def _of_mcap(path: Path) -> RosBag:
         topics.setdefault(name, Topic(name, re.sub(r"^(\w+)/(\w+)$", r"\1/msg/\2", kind), 0, encoding == "ros1"))
 
     def message(name: str, number: int) -> bytes:
-        found = (data for topic, _, _, data in _mcap(path) if topic == name)
+        messages = (data for topic, _, _, data in _mcap(path) if topic == name)
         with _in_words(path):
-            return _unpacked(next(islice(found, number, None)))
+            return _unpacked(next(islice(messages, number, None)))
 
     return RosBag(path, {name: _counted(topic, counts[name]) for name, topic in topics.items()}, message)
 

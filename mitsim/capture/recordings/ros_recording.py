@@ -47,11 +47,11 @@ from mitsim.sensor.camera import Rig
 
 @dataclass(frozen=True)
 class Chosen:
-    """The topics of a ``bag`` that are read, and what they are: ``depth``, ``cloud`` or ``pair``."""
+    """The topics of a ``bag`` that are read, and their ``content``: ``depth``, ``cloud`` or ``pair``."""
 
     bag: RosBag
     topics: tuple[Topic, ...]
-    what: str
+    content: str
 
 
 def chosen_topics(bag: RosBag, names: Sequence[str]) -> Chosen:
@@ -62,37 +62,37 @@ def chosen_topics(bag: RosBag, names: Sequence[str]) -> Chosen:
     InputError
         If there is no such topic, or it has nothing that is read, or there are several; the error lists the topics.
     """
-    known = {topic.name: what for topic in bag.topics.values() if (what := _what(bag, topic))}
-    usable = {name: what for name, what in known.items() if what != "image"}
+    contents = {topic.name: content for topic in bag.topics.values() if (content := _content(bag, topic))}
+    usable = {name: content for name, content in contents.items() if content != "image"}
     for name in names:
         if name not in bag.topics:
             hint = nearest(name, list(bag.topics))
-            raise InputError("--topic", "", repr(name), _listed(bag, known) or "a topic of the bag", hint)
-        if name not in known:
+            raise InputError("--topic", "", repr(name), _listed(bag, contents) or "a topic of the bag", hint)
+        if name not in contents:
             kind = f"{bag.topics[name].kind}, {bag.topics[name].count} messages"
-            raise InputError("--topic", "", f"{name}, {kind}", _listed(bag, known) or "images or clouds")
-    if len(names) == 2 and {known[name] for name in names} == {"image"}:
+            raise InputError("--topic", "", f"{name}, {kind}", _listed(bag, contents) or "images or clouds")
+    if len(names) == 2 and {contents[name] for name in names} == {"image"}:
         return Chosen(bag, (bag.topics[names[0]], bag.topics[names[1]]), "pair")
     if len(names) == 1 and names[0] in usable:
         return Chosen(bag, (bag.topics[names[0]],), usable[names[0]])
     if names:
         allowed = "one topic of depths or of a cloud, or the left and the right images of a pair"
-        raise InputError("--topic", "", " and ".join(names), allowed, _listed(bag, known))
+        raise InputError("--topic", "", " and ".join(names), allowed, _listed(bag, contents))
     if len(usable) == 1:
-        name, what = next(iter(usable.items()))
-        return Chosen(bag, (bag.topics[name],), what)
+        name, content = next(iter(usable.items()))
+        return Chosen(bag, (bag.topics[name],), content)
     if usable:
-        hint = f"choose with --topic: {_listed(bag, known)}"
+        hint = f"choose with --topic: {_listed(bag, contents)}"
         raise InputError(bag.path, "--topic", f"{len(usable)} topics with depths or clouds", "one of them", hint)
-    if len(known) >= 2:
-        hint = f"choose a pair with --topic LEFT --topic RIGHT: {_listed(bag, known)}"
+    if len(contents) >= 2:
+        hint = f"choose a pair with --topic LEFT --topic RIGHT: {_listed(bag, contents)}"
         raise InputError(bag.path, "--topic", "images without depth", "depths, a cloud, or a pair", hint)
     there = ", ".join(_described(bag, topic) for topic in list(bag.topics.values())[:6]) or "nothing"
     raise InputError(bag.path, "", f"a bag with {there}", "depth images, organised clouds, or a pair of images")
 
 
-def _what(bag: RosBag, topic: Topic) -> str:
-    """Return what a topic holds: ``depth``, ``image`` or ``cloud``; empty for others."""
+def _content(bag: RosBag, topic: Topic) -> str:
+    """Return the content of a topic: ``depth``, ``image`` or ``cloud``; empty for others."""
     if topic.count < 1:
         return ""
     if topic.kind == CLOUD:
@@ -116,9 +116,9 @@ def _described(bag: RosBag, topic: Topic) -> str:
     return f"{topic.name} ({topic.kind}{encoding})"
 
 
-def _listed(bag: RosBag, known: dict[str, str]) -> str:
-    counts = {name: bag.topics[name].count for name in known}
-    return ", ".join(f"{name} ({what}, {counts[name]})" for name, what in list(known.items())[:12])
+def _listed(bag: RosBag, contents: dict[str, str]) -> str:
+    counts = {name: bag.topics[name].count for name in contents}
+    return ", ".join(f"{name} ({content}, {counts[name]})" for name, content in list(contents.items())[:12])
 
 
 def read_ros_cloud(chosen: Chosen, frame: int | None) -> StoredCloud:
@@ -272,23 +272,23 @@ def _of_same_time(bag: RosBag, topic: Topic, first: Any, number: int) -> Any:
     InputError
         If none of them is of the same time.
     """
-    near = [each for each in range(number - 2, number + 3) if 0 <= each < topic.count]
-    found = [read_message(bag, topic, each) for each in near]
-    apart = [abs(_seconds(message) - _seconds(first)) for message in found]
+    near = [index for index in range(number - 2, number + 3) if 0 <= index < topic.count]
+    messages = [read_message(bag, topic, index) for index in near]
+    apart = [abs(_seconds(message) - _seconds(first)) for message in messages]
     if not apart or min(apart) > _SAME_TIME_S:
         nearest_one = f"{min(apart):.3g} s from the left image" if apart else "no message"
         where = label_of(topic, bag.path)
         raise InputError(where, "stamp", nearest_one, f"an image within {_SAME_TIME_S:g} s", "choose another --frame")
-    return found[int(np.argmin(apart))]
+    return messages[int(np.argmin(apart))]
 
 
 #: largest difference in time of the two images of a pair; assumed: under a quarter of a frame at 60 Hz
 _SAME_TIME_S = 0.004
 
 
-def _calibrated(chosen: Chosen, size: tuple[int, int], given: str | Path | None) -> Calibrated:
-    if given is not None:
-        return read_calibration(given, size)
+def _calibrated(chosen: Chosen, size: tuple[int, int], calibration: str | Path | None) -> Calibrated:
+    if calibration is not None:
+        return read_calibration(calibration, size)
     bag, tables = chosen.bag, {}
     for topic in chosen.topics:
         info = _info_of(bag, topic)
@@ -317,7 +317,7 @@ def _info_of(bag: RosBag, topic: Topic) -> Topic:
             if f"{topic.name}/".startswith(f"{space}/"):
                 spaces[space] = info
     if not spaces:
-        there = ", ".join(one.name for one in bag.topics.values() if one.kind == CAMERA_INFO)[:200]
+        there = ", ".join(info.name for info in bag.topics.values() if info.kind == CAMERA_INFO)[:200]
         raise InputError(
             bag.path, topic.name, there or "no camera_info", "a camera_info of this topic", "or --calibration FILE"
         )

@@ -67,22 +67,22 @@ def read_stereo_pair(
     pair_files : the images of one camera
     """
     folder = Path(folder)
-    known = read_calibration(calibration, size_of_images(folder))
-    names = list(known.rig.cameras)[:2]
-    if len(names) < 2 or known.unrelated:
-        stated = f"{', '.join(names)}{', without the pose of the second' if known.unrelated else ''}"
-        hint = "; ".join([*known.notes, _POSE])
+    calibrated = read_calibration(calibration, size_of_images(folder))
+    names = list(calibrated.rig.cameras)[:2]
+    if len(names) < 2 or calibrated.unrelated:
+        stated = f"{', '.join(names)}{', without the pose of the second' if calibrated.unrelated else ''}"
+        hint = "; ".join([*calibrated.notes, _POSE])
         raise InputError(calibration, "cameras", stated, "two cameras with R and T: a stereo pair", hint)
     files = {name: pair_files(folder, name, (images or {}).get(name)) for name in names}
-    counts = [len(found) for found in files.values()]
+    counts = [len(paths) for paths in files.values()]
     if counts[0] != counts[1] or counts[0] == 0:
-        found = " and ".join(f"{len(each)} of {name}" for name, each in files.items())
+        found = " and ".join(f"{len(paths)} of {name}" for name, paths in files.items())
         hint = f"or name them: --images {names[0]}='cam0_*.png' --images {names[1]}='cam1_*.png'"
         allowed = "as many of each, named after the camera: left_0.png, right_0.png"
         raise InputError(folder, "images", found, allowed, hint)
     stems = [file.stem for file in files[names[0]]]
     number = chosen_frame(frame_of(frame, folder, stems), counts[0], folder, f"pairs, {stems[0]} to {stems[-1]}")
-    chosen = {name: each[number] for name, each in files.items()}
+    chosen = {name: paths[number] for name, paths in files.items()}
     levels = {name: read_grey(file, channel=channel) for name, file in chosen.items()}
     first = levels[names[0]]
     size = (first.shape[1], first.shape[0])
@@ -120,9 +120,9 @@ def pair_files(folder: Path, camera: str, pattern: str | None = None) -> list[Pa
         if Path(pattern).is_absolute() or ".." in Path(pattern).parts:
             raise InputError("--images", "", repr(pattern), "a pattern inside the folder")
         return sorted((path for path in folder.glob(pattern) if path.is_file()), key=counted)
-    own = [
+    files = [
         path
         for path in folder.iterdir()
         if path.is_file() and path.suffix.lower() in SUFFIXES and path.name.lower().startswith(camera.lower())
     ]
-    return sorted(own, key=counted)
+    return sorted(files, key=counted)

@@ -106,18 +106,18 @@ def read_zdf(path: Path) -> Zdf:
     expected = "a .zdf file of Zivid"
     if read_bounded(path, expected, first=len(HDF5_MAGIC)) != HDF5_MAGIC:
         raise InputError(path, "", "a file that is not netCDF-4", expected, "save it again in Zivid Studio")
-    found = _arrays(path, expected)
-    points = found.get("pointcloud", found.get("xyz"))
-    if points is None and {"x", "y", "z"} <= set(found):
-        axes = [found[axis] for axis in "xyz"]
-        points = np.stack(axes, axis=-1) if len({one.shape for one in axes}) == 1 else None
+    arrays = _arrays(path, expected)
+    points = arrays.get("pointcloud", arrays.get("xyz"))
+    if points is None and {"x", "y", "z"} <= set(arrays):
+        axes = [arrays[axis] for axis in "xyz"]
+        points = np.stack(axes, axis=-1) if len({array.shape for array in axes}) == 1 else None
     if points is None or points.ndim != 3 or points.shape[2] != 3 or points.dtype.kind != "f":
-        shapes = ", ".join(f"{name} {' x '.join(map(str, one.shape))}" for name, one in found.items())
+        shapes = ", ".join(f"{name} {' x '.join(map(str, array.shape))}" for name, array in arrays.items())
         raise InputError(path, "data/pointcloud", shapes or "nothing", "points of rows x columns x 3")
     size = points.shape[:2]
-    colour = found.get("rgba_image", found.get("rgb_image"))
-    snr = found.get("snr", found.get("contrast"))
-    matrix, lens = found.get("matrix"), found.get("distortion")
+    colour = arrays.get("rgba_image", arrays.get("rgb_image"))
+    snr = arrays.get("snr", arrays.get("contrast"))
+    matrix, lens = arrays.get("matrix"), arrays.get("distortion")
     with np.errstate(over="ignore", invalid="ignore"):
         return Zdf(
             points.astype(np.float32),

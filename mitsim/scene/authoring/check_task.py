@@ -159,7 +159,7 @@ def _outline(shape: ShapeFacts, feature: Feature) -> Iterator[SceneFinding]:
 
 
 def _corners(shape: ShapeFacts) -> Floats:
-    """Return places (n, 3) [mm] on a shape: the vertices of a mesh."""
+    """Return points (n, 3) [mm] on a shape: the vertices of a mesh."""
     return shape.points if shape.mesh is None else shape.mesh.vertices
 
 

@@ -168,7 +168,7 @@ def _frame(tolerance: GeometricTolerance, datums: Sequence[Side | None]) -> tupl
 
 
 def middle_outline(side: Side, spread: np.ndarray) -> np.ndarray:
-    """Project places (k, 3) [mm] of a side's outline onto its mid-plane."""
+    """Project points (k, 3) [mm] of a side's outline onto its mid-plane."""
     surface = side.surface
     assert isinstance(surface, Plane)
     return np.asarray(spread - np.outer((spread - surface.point) @ surface.normal, surface.normal))

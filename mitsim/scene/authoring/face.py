@@ -100,7 +100,7 @@ class Face:
         return outward_normals(self.surface, corners) * (1.0 if self.convex else -1.0)
 
     def corner_places(self) -> Floats | None:
-        """Return places (m, 3, 2) [mm] on the developed surface, u and v; None for other surfaces.
+        """Return the triangles (m, 3, 2) [mm], u and v, on the developed surface; None for other surfaces.
 
         On a plane they are along the two :func:`~characterisation.features.surfaces.tangents` of the normal. On a
         cylinder u is circumferential and v axial. Each triangle is developed separately, so none crosses a seam.

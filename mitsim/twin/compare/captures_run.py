@@ -110,15 +110,18 @@ def validate_captures(
             "name SIMULATED to compare two simulations",
         )
         raise InputError(real, "source", "a simulation of mitsim", allowed, hint)
-    own = None if simulated is not None else sensor_of(recorded, sensor, real)
-    if own is not None:
-        check_technology(recorded, own, str(real))  # before the capture is decoded
+    twin_sensor = None if simulated is not None else sensor_of(recorded, sensor, real)
+    if twin_sensor is not None:
+        check_technology(recorded, twin_sensor, str(real))  # before the capture is decoded
     settings, _ = decoder_settings(recorded)
     place = specimen_place(recorded, settings, roi, str(real))
     on = projector_was_on(recorded, cast(Literal["on", "off"] | None, projector), str(real))
     say(f"specimen: a plane at {_distance(place):.0f} mm, with {place.off_plane:.2g} mm rms deviation")
-    if own is not None:
-        other, where = rebuild(recorded, own, place, str(real), projector_on=on, seed=seed), str(output / "simulated")
+    if twin_sensor is not None:
+        other, where = (
+            rebuild(recorded, twin_sensor, place, str(real), projector_on=on, seed=seed),
+            str(output / "simulated"),
+        )
         write_capture(other, output / "simulated", overwrite=True)
         say(f"rebuilt: {where}")
     else:
@@ -152,19 +155,19 @@ def comparison_table(rows: tuple[ComparedRow, ...], first: str = "real") -> str:
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for row in rows:
-        places = _places(row)
-        difference = rounded(row.difference, places)
+        decimals = _decimals(row)
+        difference = rounded(row.difference, decimals)
         if row.difference > 0 and difference != NONE:
             difference = f"+{difference}"
         word = f"**{row.verdict}**" if row.verdict == "differs" else row.verdict
         lines.append(
-            f"| {row.quantity} | {row.unit} | {rounded(row.real, places)} | {rounded(row.simulated, places)} "
+            f"| {row.quantity} | {row.unit} | {rounded(row.real, decimals)} | {rounded(row.simulated, decimals)} "
             f"| {difference} | {two_digits(row.uncertainty)} | {two_digits(row.margin)} | {word}: {row.why} |"
         )
     return "\n".join(lines) + "\n"
 
 
-def _places(row: ComparedRow) -> int:
+def _decimals(row: ComparedRow) -> int:
     """Return the number of decimals that shows two digits of the uncertainty, 1 to 4."""
     if not row.uncertainty > 0:
         return 3

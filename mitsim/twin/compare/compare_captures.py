@@ -144,7 +144,7 @@ def compare_captures(
     Raises
     ------
     InputError
-        If the simulated capture has another camera, or its specimen is at another place, or the specimen is too small.
+        If the simulated capture has another camera, its specimen is at another distance, or the specimen is too small.
     """
     _check(real, simulated, where)
     window = contrast_window(real, place)
@@ -182,19 +182,19 @@ def _known_in_both(
     changes: list[dict[str, Floats]] = [{}, {}]
     for name in ("sigma", "sigma_px", "distance", "row_error"):
         values = getattr(real_patches, name), getattr(simulated_patches, name)
-        known = np.isfinite(values[0]) & np.isfinite(values[1])
-        for change, own in zip(changes, values, strict=True):
-            change[name] = np.where(known, own, np.nan)
+        finite = np.isfinite(values[0]) & np.isfinite(values[1])
+        for change, array in zip(changes, values, strict=True):
+            change[name] = np.where(finite, array, np.nan)
     return replace(real_patches, **changes[0]), replace(simulated_patches, **changes[1])  # type: ignore[arg-type]
 
 
 def _check(real: Capture, simulated: Capture, where: str) -> None:
     if simulated.source != "simulated":
         raise InputError(where, "source", simulated.source, "simulated", "give the real capture first")
-    ours, others = simulated.rig.reference, real.rig.reference
-    if (ours.width, ours.height) != (others.width, others.height) or simulated.bits != real.bits:
-        found = f"{ours.width} x {ours.height} pixels of {simulated.bits} bits"
-        allowed = f"{others.width} x {others.height} of {real.bits} bits, as REAL"
+    camera, real_camera = simulated.rig.reference, real.rig.reference
+    if (camera.width, camera.height) != (real_camera.width, real_camera.height) or simulated.bits != real.bits:
+        found = f"{camera.width} x {camera.height} pixels of {simulated.bits} bits"
+        allowed = f"{real_camera.width} x {real_camera.height} of {real.bits} bits, as REAL"
         raise InputError(where, "camera", found, allowed, "leave SIMULATED out: mitsim then simulates it")
     if simulated.technology != real.technology:
         raise InputError(where, "technology", simulated.technology, f"{real.technology}, as REAL")
@@ -297,6 +297,6 @@ def _histogram_row(
     return ComparedRow(HISTOGRAMS, "DN", float("nan"), float("nan"), distance, uncertainty, margin, verdict, why)
 
 
-def _distance(one: Floats, other: Floats) -> float:
-    levels = np.arange(len(one))
-    return float(wasserstein_distance(levels, levels, one, other))
+def _distance(histogram: Floats, other_histogram: Floats) -> float:
+    levels = np.arange(len(histogram))
+    return float(wasserstein_distance(levels, levels, histogram, other_histogram))

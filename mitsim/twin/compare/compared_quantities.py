@@ -44,17 +44,17 @@ class Quantity:
 
 def _quantile(values: Floats, share: float) -> Floats:
     """Return the quantile of the known values along the last axis, linearly interpolated; NaN if there are none."""
-    ordered, known = np.sort(values, axis=-1), np.isfinite(values).sum(axis=-1)
-    at = share * np.maximum(known - 1, 0)
+    ordered, counts = np.sort(values, axis=-1), np.isfinite(values).sum(axis=-1)
+    at = share * np.maximum(counts - 1, 0)
     low = np.floor(at).astype(int)
-    high = np.minimum(low + 1, np.maximum(known - 1, 0))
+    high = np.minimum(low + 1, np.maximum(counts - 1, 0))
     below, above = (np.take_along_axis(ordered, index[..., None], -1)[..., 0] for index in (low, high))
-    return np.where(known > 0, below + (at - low) * (above - below), np.nan)
+    return np.where(counts > 0, below + (at - low) * (above - below), np.nan)
 
 
 def _sums(values: Floats, picked: Picked) -> Floats:
     """Return sums (D, ...) of values (P, ...) over the drawn patches (D, P)."""
-    times = np.stack([np.bincount(own, minlength=len(values)) for own in picked]).astype(float)
+    times = np.stack([np.bincount(draw, minlength=len(values)) for draw in picked]).astype(float)
     return np.asarray((times @ values.reshape(len(values), -1)).reshape(len(picked), *values.shape[1:]))
 
 

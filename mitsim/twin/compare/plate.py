@@ -74,7 +74,7 @@ def _sheet(place: Place, bend: Bend) -> trimesh.Trimesh:
     vertices = np.concatenate([xy, bend.heights(xy)[..., None]], axis=-1).reshape(-1, 3)
     number = np.arange(len(vertices)).reshape(_MESH + 1, _MESH + 1)
     a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
-    faces = np.concatenate([np.stack(each, axis=-1).reshape(-1, 3) for each in ((a, b, c), (b, d, c))])
+    faces = np.concatenate([np.stack(corners, axis=-1).reshape(-1, 3) for corners in ((a, b, c), (b, d, c))])
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh.vertex_normals  # noqa: B018 - computed here, so that they are written, and the mesh is shaded as smooth
     return mesh

@@ -94,27 +94,29 @@ def rebuild(
         If the sensor has another technology, or takes other images than the recording.
     """
     check_technology(real, sensor, where)
-    own = like(real, sensor, where)
+    twin_sensor = like(real, sensor, where)
     if not projector_on and real.technology == "structured_light":
         allowed = f"on: {where} is structured light, which has no code without it"
         raise InputError("--projector", "", "off", allowed)
     name, plain = next(iter(real.rig.cameras)), plain_image(real)
     chip = chip_of(real, sensor.imager, where)  # rejects another number of bits
     if not projector_on:  # the texture contains room light and lens blur of the recording
-        own = replace(own, room=None, imager=replace(own.imager, blur_px=0.0, corner_blur_px=None))
-    simulated = SimulatedSensor(own)
+        twin_sensor = replace(
+            twin_sensor, room=None, imager=replace(twin_sensor.imager, blur_px=0.0, corner_blur_px=None)
+        )
+    simulated = SimulatedSensor(twin_sensor)
     if not projector_on:
-        size = own.projector.optics.height, own.projector.optics.width
-        simulated.patterns = ProjectedPatterns(np.ones((1, *size), np.float32), own.projector)
+        size = twin_sensor.projector.optics.height, twin_sensor.projector.optics.width
+        simulated.patterns = ProjectedPatterns(np.ones((1, *size), np.float32), twin_sensor.projector)
     pose, around = place.world_from_sensor, place.corners()
     noise = Noise() if projector_on else Noise.without("speckle")  # room light has no speckle
 
     def lit(texture: Floats | None) -> LightOnImagers:
-        scene = plate(place, own, texture)
+        scene = plate(place, twin_sensor, texture)
         return simulated.light(scene, pose, rendering=Rendering(samples=SAMPLES), seed=seed, around=around, noise=noise)
 
     light, with_print = lit(None), projector_on and not plain.has_dots and len(real.rig.cameras) == 1
-    with_print &= not isinstance(own.pattern, AmplitudeModulation)
+    with_print &= not isinstance(twin_sensor.pattern, AmplitudeModulation)
     electrons = linearised(plain.of(real.images[name]), chip)
     if with_print:
         light = printed(light, place, real.rig.cameras[name], electrons, name, plain)
@@ -193,8 +195,8 @@ def _scale(
         needed = list(range(len(light.radiance[name])))
 
     def too_bright(scale: float) -> bool:
-        some = light.radiance[name][needed] * np.float32(scale)
-        seen = simulated.expose(replace(light, radiance={name: some}, rois={name: roi}), seed).images[name]
+        radiance = light.radiance[name][needed] * np.float32(scale)
+        seen = simulated.expose(replace(light, radiance={name: radiance}, rois={name: roi}), seed).images[name]
         seen = seen[[needed.index(number) for number in plain.images]].max(axis=0)
         return median_level(np.bincount(seen[there])) > wanted
 
@@ -218,19 +220,19 @@ def median_level(counts: NDArray[Any]) -> float:
     return float(level - 0.5 + (total[-1] / 2 - below) / counts[level])
 
 
-def projector_was_on(real: Capture, given: Literal["on", "off"] | None, where: str) -> bool:
-    """Return whether the projector was on: as ``given``, else as in the settings; codes and simulations need it on.
+def projector_was_on(real: Capture, state: Literal["on", "off"] | None, where: str) -> bool:
+    """Return whether the projector was on: as ``state``, else as in the settings; codes and simulations need it on.
 
     Raises
     ------
     InputError
         If the state is unknown for a pair that is matched by its texture.
     """
-    if given is not None:
-        return given == "on"
-    known = real.settings.get("projector_on")
-    if isinstance(known, bool):
-        return known
+    if state is not None:
+        return state == "on"
+    setting = real.settings.get("projector_on")
+    if isinstance(setting, bool):
+        return setting
     if real.technology != "active_stereo" or real.source == "simulated":
         return True
     hint = "give --projector on or off, here or for mitsim import"

@@ -123,19 +123,19 @@ def specimen_patches(
 
     crossings = of_image(np.pad(across.astype(float), ((0, 0), (1, 0))))
     grid = geometry.grid
-    cloud, on_grid, places = _cloud_patches(capture, settings, geometry, place)
-    status = _tiles(np.where(on_grid, cloud.status.astype(float), np.nan), places)
-    recovered = _tiles(np.where(on_grid, points_on_specimen(cloud, place), np.nan), places)
+    cloud, on_grid, grid_corners = _cloud_patches(capture, settings, geometry, place)
+    status = _tiles(np.where(on_grid, cloud.status.astype(float), np.nan), grid_corners)
+    recovered = _tiles(np.where(on_grid, points_on_specimen(cloud, place), np.nan), grid_corners)
     points = np.where(on_grid[..., None], cloud.points, np.nan).astype(float) - grid.origin
-    tiles = np.stack([_tiles(points[..., axis], places) for axis in range(3)], axis=-1)
+    tiles = np.stack([_tiles(points[..., axis], grid_corners) for axis in range(3)], axis=-1)
     noise = ray_noise_std(tiles)
-    known = noise.count >= LEAST_POINTS * np.isfinite(status).sum(axis=-1)
-    sigma = np.where(known, noise.sigma, np.nan)
-    residual = np.where(known[:, None], noise.inlier_residual, np.nan)
+    usable = noise.count >= LEAST_POINTS * np.isfinite(status).sum(axis=-1)
+    sigma = np.where(usable, noise.sigma, np.nan)
+    residual = np.where(usable[:, None], noise.inlier_residual, np.nan)
     products, pairs = _products(residual)
     field_ = np.full(on_grid.shape, np.nan)
-    for (row, column), own in zip(places, residual, strict=True):
-        field_[row : row + PATCH_PX, column : column + PATCH_PX] = own.reshape(PATCH_PX, PATCH_PX)
+    for (row, column), tile in zip(grid_corners, residual, strict=True):
+        field_[row : row + PATCH_PX, column : column + PATCH_PX] = tile.reshape(PATCH_PX, PATCH_PX)
     return SpecimenPatches(
         levels=_histograms(of_image(image), 2**capture.bits),
         contrast=np.nanmean(of_image(deviation / np.maximum(mean, 1.0)), axis=-1),
@@ -146,10 +146,10 @@ def specimen_patches(
         recovered=np.nansum(recovered, axis=-1),
         sigma=sigma,
         sigma_px=_in_disparity(noise, sigma, tiles, geometry),
-        distance=np.where(known, noise.distance, np.nan),
+        distance=np.where(usable, noise.distance, np.nan),
         products=products,
         pairs=pairs,
-        row_error=_row_errors(capture, geometry, cloud, places, known),
+        row_error=_row_errors(capture, geometry, cloud, grid_corners, usable),
         cloud=cloud,
         on_grid=on_grid,
         residual=field_,
@@ -178,14 +178,14 @@ def patch_rows(
     --------
     specimen_patches : all quantities of the patches
     """
-    cloud, on_grid, places = _cloud_patches(capture, settings, geometry, place)
-    valid = _tiles(np.where(on_grid, cloud.valid.astype(float), np.nan), places)
-    known = np.nansum(valid, axis=-1) >= _LEAST_FOR_ROWS * np.isfinite(valid).sum(axis=-1)
-    off = _tiles(np.where(cloud.valid, _disparity(cloud, geometry), np.nan), places)
-    disparity = np.full(len(places), np.nan)
-    disparity[known] = np.nanmedian(off[known], axis=-1)
-    middles = np.array(places, float).reshape(-1, 2) + (PATCH_PX - 1) / 2
-    errors = _row_errors(capture, geometry, cloud, places, known)
+    cloud, on_grid, corners = _cloud_patches(capture, settings, geometry, place)
+    valid = _tiles(np.where(on_grid, cloud.valid.astype(float), np.nan), corners)
+    usable = np.nansum(valid, axis=-1) >= _LEAST_FOR_ROWS * np.isfinite(valid).sum(axis=-1)
+    off = _tiles(np.where(cloud.valid, _disparity(cloud, geometry), np.nan), corners)
+    disparity = np.full(len(corners), np.nan)
+    disparity[usable] = np.nanmedian(off[usable], axis=-1)
+    middles = np.array(corners, float).reshape(-1, 2) + (PATCH_PX - 1) / 2
+    errors = _row_errors(capture, geometry, cloud, corners, usable)
     return errors, middles[:, 1] - disparity, middles[:, 0]
 
 
@@ -253,7 +253,7 @@ def _tiles(values: Floats, corners: list[tuple[int, int]]) -> Floats:
 
 
 def _histograms(levels: Floats, count: int) -> Floats:
-    tiles = [np.bincount(own[np.isfinite(own)].astype(int), minlength=count) for own in levels]
+    tiles = [np.bincount(tile[np.isfinite(tile)].astype(int), minlength=count) for tile in levels]
     return np.stack(tiles).astype(float) if tiles else np.empty((0, count))
 
 
@@ -261,11 +261,11 @@ def _products(residual: Floats) -> tuple[Floats, Floats]:
     """Return sums of the products of residuals (Q, n) at every lag, and numbers of pairs; 0 without points."""
     side = 2 * LARGEST_LAG + 1
     products, pairs = np.zeros((2, len(residual), side, side))
-    for index, own in enumerate(residual):
-        if np.isfinite(own).sum() < 2 or not np.nanvar(own) > 0:
+    for index, tile in enumerate(residual):
+        if np.isfinite(tile).sum() < 2 or not np.nanvar(tile) > 0:
             continue
-        rho = autocorrelation(own.reshape(PATCH_PX, PATCH_PX))
-        products[index] = np.nan_to_num(rho.values) * rho.pairs * np.nanvar(own)
+        rho = autocorrelation(tile.reshape(PATCH_PX, PATCH_PX))
+        products[index] = np.nan_to_num(rho.values) * rho.pairs * np.nanvar(tile)
         pairs[index] = rho.pairs
     return products, pairs
 
@@ -274,25 +274,25 @@ def _in_disparity(noise: RayNoise, sigma: Floats, tiles: Floats, geometry: Geome
     """Return sigma of patches as disparity [px], NaN without stereo: Z^2 sigma_d = f B sigma_Z, Z = V cos(off axis)."""
     if not isinstance(geometry, StereoGeometry):
         return np.full(len(sigma), np.nan)
-    some = np.isfinite(tiles[..., 2]).any(axis=-1)
+    filled = np.isfinite(tiles[..., 2]).any(axis=-1)
     ray = np.full((len(tiles), 3), np.nan)
-    ray[some] = np.nanmean(tiles[some], axis=1)
+    ray[filled] = np.nanmean(tiles[filled], axis=1)
     cosine = geometry.grid.cos_off_axis(ray)
     focal_baseline = geometry.rectification.matrix_left[0, 0] * geometry.rectification.baseline
     return np.asarray(sigma * focal_baseline / (noise.distance**2 * cosine))
 
 
 def _row_errors(
-    capture: Capture, geometry: Geometry, cloud: PointCloud, places: list[tuple[int, int]], known: NDArray[np.bool_]
+    capture: Capture, geometry: Geometry, cloud: PointCloud, corners: list[tuple[int, int]], usable: NDArray[np.bool_]
 ) -> Floats:
     """Return the shift [rows] of the right image that fits best (:mod:`mitsim.decoding.matching.row_error`)."""
-    out = np.full(len(places), np.nan)
+    out = np.full(len(corners), np.nan)
     if capture.technology == "structured_light" or not isinstance(geometry, StereoGeometry):
         return out  # stripes along the rows do not identify a row
     left, right = (stack[0].astype(float) for stack in list(capture.images.values())[:2])
     disparity = _disparity(cloud, geometry)
-    for index in np.flatnonzero(known):
-        row, column = places[index]
+    for index in np.flatnonzero(usable):
+        row, column = corners[index]
         rows, columns = np.nonzero(cloud.valid[row : row + PATCH_PX, column : column + PATCH_PX])
         rows, columns = rows + row, columns + column
         out[index] = row_error(left, right, geometry, rows, columns, disparity[rows, columns])

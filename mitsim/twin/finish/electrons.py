@@ -78,9 +78,9 @@ def linearised(levels: NDArray[np.unsignedinteger[Any]] | Floats, chip: Imager) 
     """Return the photo-electrons [e-] of grey levels [DN], by the inverse of the imager's response curve."""
     values = np.asarray(levels, np.float64)
     if chip.companding:
-        known = np.array([(0.0, 0.0), *chip.companding])
+        knees = np.array([(0.0, 0.0), *chip.companding])
         # a level represents all levels of the converter that the curve rounds down to it
-        inner = np.interp(values + 0.5, known[:, 1], known[:, 0]) - 0.5
+        inner = np.interp(values + 0.5, knees[:, 1], knees[:, 0]) - 0.5
         return np.asarray((inner - chip.converter_black) / chip.gain)
     if chip.gamma == 1.0:
         return np.asarray((values - chip.black_level) / chip.gain)
@@ -99,7 +99,7 @@ def sensor_of(capture: Capture, name: str | None, where: str | Path) -> Sensor:
     if name is None and capture.sensor not in presets():
         found = f"none, and {where} comes from {capture.sensor}, which is not a preset"
         types = {preset: preset.partition("-")[2] for preset in presets()}  # the name without its maker
-        alike = [one for one, of_type in types.items() if of_type and of_type in capture.sensor.casefold()]
+        alike = [preset for preset, of_type in types.items() if of_type and of_type in capture.sensor.casefold()]
         hint = f"its type may be {' or '.join(alike)}" if alike else ""
         raise InputError("--sensor", "", found, f"one of {', '.join(presets())}, or the path of a .toml file", hint)
     return load_sensor(capture.sensor if name is None else name)

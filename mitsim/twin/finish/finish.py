@@ -35,7 +35,7 @@ ALPHA_RANGE = (0.01, 0.6)
 LOG_ALPHA_RANGE = (math.log(ALPHA_RANGE[0]), math.log(ALPHA_RANGE[1]))
 
 #: number of values in the table of alpha(Ra)
-_PLACES = 64
+_TABLE_SIZE = 64
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def metal_finish(finish: Finish, wavelength_nm: float, where: str) -> MetalFinis
 def _family(metal: str, process: str, wavelength_nm: float) -> MetalFinish:
     """Return the finishes of a metal and process at all alphas, from a table over the usual Ra of the process."""
     low, high = PROCESSES[process].usual
-    heights = np.geomspace(low, high, _PLACES)
+    heights = np.geomspace(low, high, _TABLE_SIZE)
     faces = [machined(MachinedFace(metal=metal, process=process, Ra=float(ra)), wavelength_nm) for ra in heights]
     widths = np.array([face.alpha_u for face in faces])
     last = int(np.argmax(widths >= ALPHA_LARGEST)) if (widths >= ALPHA_LARGEST).any() else len(widths)
@@ -140,7 +140,7 @@ def _family(metal: str, process: str, wavelength_nm: float) -> MetalFinish:
         "log_mirror": np.log([face.coherent_alpha[0] for face in branch]),
     }
     bright = normal_reflectance(metal, wavelength_nm)
-    scan = np.linspace(*LOG_ALPHA_RANGE, _PLACES)
+    scan = np.linspace(*LOG_ALPHA_RANGE, _TABLE_SIZE)
     factors = np.array([energy_factors(alpha, alpha, bright) for alpha in np.exp(scan).tolist()])
     energy = CubicSpline(scan, factors[:, 0]), CubicSpline(scan, factors[:, 1])
     return MetalFinish(

@@ -163,9 +163,9 @@ def observe(
         roi = coupon_roi(sensor.rig.cameras[name], place)
         white = renderer.white(place, name, roi, pattern)
         region = _CouponRegion.of(place, sensor, name, roi, white, capture.decoding.read_out.get(name))
-        loss, each = renderer.corner_loss(name), len(stack) // len(exposures)
+        loss, count = renderer.corner_loss(name), len(stack) // len(exposures)
         for number, seconds in enumerate(exposures):
-            images = stack[number * each : (number + 1) * each, *roi.slices]
+            images = stack[number * count : (number + 1) * count, *roi.slices]
             chip = chip_of(capture, sensor.imager, where)
             blocks = _Blocks.of(region.inside, images, chip, block_px)
             rows, columns = blocks.rows, blocks.columns
@@ -188,7 +188,7 @@ def observe(
                     illumination * room_s,
                     region.toward(region.camera_centre, rows, columns),
                     region.toward(region.projector_centre, rows, columns),
-                    pixel_noise(sensor.imager, chip, each - ambient, float(seconds), ambient),
+                    pixel_noise(sensor.imager, chip, count - ambient, float(seconds), ambient),
                     blocks.whole,
                     place,
                     "" if blocks.whole else _why_no_block(region, place, block_px),

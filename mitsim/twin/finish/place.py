@@ -108,8 +108,8 @@ class Place:
         columns, rows = occupied.shape[1], occupied.shape[0]
 
         def cells(axis: int, count: int, shift: NDArray[np.floating] | float) -> NDArray[np.intp]:
-            place = np.floor((points[:, axis] + shift - self.low[axis]) / self.cell[axis])
-            return np.asarray(np.fmax(np.fmin(place, count - 2), -1), np.intp) + 1  # NaN lies outside
+            index = np.floor((points[:, axis] + shift - self.low[axis]) / self.cell[axis])
+            return np.asarray(np.fmax(np.fmin(index, count - 2), -1), np.intp) + 1  # NaN lies outside
 
         column, row = cells(0, columns, 0.0), cells(1, rows, 0.0) * columns
         inside = np.ones(len(points), bool)
@@ -164,7 +164,7 @@ def plane_points(points: Floats) -> NDArray[np.bool_]:
         return best
     rng = np.random.default_rng(0)
     near = _FLAT * np.linalg.norm(points, axis=1)
-    some = rng.integers(0, len(points), min(len(points), 4000))
+    sample = rng.integers(0, len(points), min(len(points), 4000))
     votes = -1
     for _ in range(_TRIALS):
         a, b, c = points[rng.integers(0, len(points), 3)]
@@ -172,7 +172,7 @@ def plane_points(points: Floats) -> NDArray[np.bool_]:
         length = float(np.linalg.norm(normal))
         if length < 1e-9:
             continue
-        count = int((np.abs((points[some] - a) @ (normal / length)) < near[some]).sum())
+        count = int((np.abs((points[sample] - a) @ (normal / length)) < near[sample]).sum())
         if count > votes:
             votes, best = count, np.abs((points - a) @ (normal / length)) < near
     return best
@@ -194,8 +194,10 @@ def _largest_piece(row: NDArray[np.int64], column: NDArray[np.int64]) -> NDArray
     np.add.at(count, (row, column), 1)
     dense = np.pad(count > _DENSE * np.percentile(count[count > 0], 95), 3)
     dense = ndimage.binary_fill_holes(ndimage.binary_closing(dense, iterations=2))
-    pieces, found = ndimage.label(ndimage.binary_opening(dense, iterations=2)[3:-3, 3:-3])
-    return np.asarray(pieces == int(np.argmax(np.bincount(pieces.ravel())[1:])) + 1 if found else np.zeros_like(dense))
+    pieces, piece_count = ndimage.label(ndimage.binary_opening(dense, iterations=2)[3:-3, 3:-3])
+    return np.asarray(
+        pieces == int(np.argmax(np.bincount(pieces.ravel())[1:])) + 1 if piece_count else np.zeros_like(dense)
+    )
 
 
 def _no_plane(where: str, count: int) -> InputError:
@@ -214,13 +216,13 @@ def fit_bend(points: Floats) -> Bend | None:
     cell = float((high - low).max()) / _BEND_CELLS
     if not cell > 0:
         return None
-    places, heights = _cell_medians(points, low, cell)
+    centres, heights = _cell_medians(points, low, cell)
     if len(heights) < _CELLS_PER_TERM * 3:
         return None
     middle, half = (low + high) / 2, np.maximum((high - low) / 2, cell)
     best: tuple[float, int, Floats] | None = None
     for degree in DEGREES:
-        terms = _terms((places - middle) / half, degree)
+        terms = _terms((centres - middle) / half, degree)
         if len(heights) < _CELLS_PER_TERM * terms.shape[1]:
             break
         q, r = np.linalg.qr(terms)
@@ -232,7 +234,7 @@ def fit_bend(points: Floats) -> Bend | None:
             best = error, degree, coefficients
     assert best is not None
     _, degree, coefficients = best
-    rms = float(np.sqrt(np.mean((_terms((places - middle) / half, degree) @ coefficients) ** 2)))
+    rms = float(np.sqrt(np.mean((_terms((centres - middle) / half, degree) @ coefficients) ** 2)))
     return Bend(middle, half, degree, coefficients, rms)
 
 
@@ -249,9 +251,9 @@ def _cell_medians(points: Floats, low: Floats, cell: float) -> tuple[Floats, Flo
     return low + (np.stack([column, row], axis=1) + 0.5) * cell, heights
 
 
-def _terms(places: Floats, degree: int) -> Floats:
+def _terms(points: Floats, degree: int) -> Floats:
     """Return Legendre polynomials (..., k) up to the total degree ``degree`` at points (..., 2) in -1..1."""
-    inside = np.clip(places, -1.0, 1.0)
+    inside = np.clip(points, -1.0, 1.0)
     every = legvander2d(inside[..., 0], inside[..., 1], [degree, degree])
     power = np.add.outer(np.arange(degree + 1), np.arange(degree + 1)).reshape(-1)
     return np.asarray(every[..., power <= degree])

@@ -82,7 +82,7 @@ def finish_posterior(
         results.append(other.results(values)[0][1:3])
         cost.append(float(np.sum(other.residual(values, variance) ** 2)) / scale)
     grid = np.linspace(-LARGEST_DEVIATION, LARGEST_DEVIATION, 601)
-    shares = np.array([Deviation(tail=one).beckmann(prior.beckmann, prior.beckmann_range) for one in grid.tolist()])
+    shares = np.array([Deviation(tail=tail).beckmann(prior.beckmann, prior.beckmann_range) for tail in grid.tolist()])
     chi_square = CubicSpline(_SHARES, np.array(cost))(shares)
     weight = np.exp(-0.5 * (chi_square - chi_square.min() + grid**2))
     weight /= weight.sum()
@@ -106,8 +106,8 @@ def _log_odds(share: Floats) -> Floats:
     return np.asarray(np.log(inside / (LARGEST_WIDE_ANGLE - inside)))
 
 
-def _moments(values: Floats, weight: Floats, each: float) -> tuple[float, float]:
-    """Return mean and standard deviation of values whose own uncertainty is ``each``, inside the range of a study."""
+def _moments(values: Floats, weight: Floats, uncertainty: float) -> tuple[float, float]:
+    """Return mean and standard deviation of values of a standard ``uncertainty``, in the range of a study."""
     mean = float(weight @ values)
-    size = float(np.sqrt(weight @ (values - mean) ** 2 + each**2))
+    size = float(np.sqrt(weight @ (values - mean) ** 2 + uncertainty**2))
     return float(np.clip(mean, -LARGEST_DEVIATION, LARGEST_DEVIATION)), float(np.clip(size, _LEAST_SIZE, 3.0))

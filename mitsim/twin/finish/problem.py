@@ -174,17 +174,17 @@ class Problem:
         off -= self.means(off)[self.block]
         spread = self.means(off**2) * self.counts / np.maximum(self.counts - 1, 1) - noise_mean
         trust = self.counts * (square / (noise_mean + FIRST_GRAIN**2 * square)) ** 2
-        known = square > 0
-        ratio = np.sum((trust * spread)[known] / square[known]) / max(float(np.sum(trust[known])), 1e-300)
+        lit = square > 0
+        ratio = np.sum((trust * spread)[lit] / square[lit]) / max(float(np.sum(trust[lit])), 1e-300)
         grain = float(np.sqrt(max(ratio, 0.0)))
         sums = np.ones(self.count)
         widths = np.repeat([view.width for view in self.views], [view.size for view in self.views])
         for first, second in self.pairs if grain > 0 else ():
             block = self.block[first]
             count = np.bincount(block, minlength=self.count)
-            weight = np.where(known & (count > 0), trust, 0.0)
+            weight = np.where(lit & (count > 0), trust, 0.0)
             product = np.bincount(block, off[first] * off[second], self.count) / np.maximum(count, 1)
-            share = float(np.sum(weight * product / np.where(known, square, 1.0)) / max(weight.sum(), 1e-300)) / ratio
+            share = float(np.sum(weight * product / np.where(lit, square, 1.0)) / max(weight.sum(), 1e-300)) / ratio
             sums *= _sum_of_correlations(min(max(share, 0.0), _MOST_CORRELATED), widths)
         shared = np.concatenate(
             [np.full(view.size, (view.noise.row + view.noise.column) / view.width) for view in self.views]
@@ -195,13 +195,13 @@ class Problem:
         """Return the indices of pixels and of their neighbours in the same block, for both axes."""
         rows, columns = (np.concatenate([getattr(view, name) for view in self.views]) for name in ("rows", "columns"))
         steps = (1, int(columns.max()) + 2)
-        place = (self.block * (int(rows.max()) + 2) + rows) * steps[1] + columns
-        order = np.argsort(place)
-        ordered = place[order]
+        position = (self.block * (int(rows.max()) + 2) + rows) * steps[1] + columns
+        order = np.argsort(position)
+        ordered = position[order]
         out = []
         for step in steps:
-            at = np.minimum(np.searchsorted(ordered, place + step), len(ordered) - 1)
-            first = np.flatnonzero(ordered[at] == place + step)
+            at = np.minimum(np.searchsorted(ordered, position + step), len(ordered) - 1)
+            first = np.flatnonzero(ordered[at] == position + step)
             out.append((first, order[at[first]]))
         return out
 
@@ -234,8 +234,10 @@ class Problem:
         means = self.means(pixels)
         out, first = [], 0
         for view, at in zip(self.views, self.starts, strict=False):
-            own = slice(at, at + view.size)
+            blocks = slice(at, at + view.size)
             last = first + len(view.block)
-            out.append(Residual(view, self.measured[own], means[own], np.sqrt(variance[own]), pixels[first:last]))
+            out.append(
+                Residual(view, self.measured[blocks], means[blocks], np.sqrt(variance[blocks]), pixels[first:last])
+            )
             first = last
         return tuple(out)

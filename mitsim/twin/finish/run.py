@@ -208,13 +208,15 @@ def fit_captures(
             raise InputError(folder, "sensor", capture.sensor, f"{first.sensor}, as in {captures[0]}")
         if calibration_table(capture.rig) != calibration:
             renderer, calibration = WhiteCouponRenderer(with_rig(chosen, capture.rig)), calibration_table(capture.rig)
-        known = pattern_is_known(capture, chosen)
-        unknown |= not known
+        pattern_known = pattern_is_known(capture, chosen)
+        unknown |= not pattern_known
         place = place_of(capture, renderer.sensor, (sample.width, sample.height), str(folder), roi)
         lit = capture.source != "simulated" or has_emitters(sample.scene)
         coupon_capture = CouponCapture(capture, place, index, str(folder))
-        capture_views = observe(coupon_capture, renderer, block, pattern="mean" if known else "level", lit_room=lit)
-        if not known and isinstance(chosen.pattern, DotPattern):
+        capture_views = observe(
+            coupon_capture, renderer, block, pattern="mean" if pattern_known else "level", lit_room=lit
+        )
+        if not pattern_known and isinstance(chosen.pattern, DotPattern):
             dots += [compare_dots(view, renderer) for view in capture_views if view.size]
         views += capture_views
         places.append(place)
@@ -291,5 +293,5 @@ def _view_numbers(residual: Residual) -> dict[str, Any]:
 
 def _pooled(residuals: Sequence[Residual], name: str) -> float:
     """Return the root mean square of a property of residuals, weighted by their numbers of blocks."""
-    known = [(residual.view.size, getattr(residual, name)) for residual in residuals if residual.view.size]
-    return math.sqrt(sum(size * rms**2 for size, rms in known) / sum(size for size, _ in known))
+    pairs = [(residual.view.size, getattr(residual, name)) for residual in residuals if residual.view.size]
+    return math.sqrt(sum(size * rms**2 for size, rms in pairs) / sum(size for size, _ in pairs))

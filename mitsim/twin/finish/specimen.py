@@ -92,12 +92,12 @@ def specimen_place(capture: Capture, settings: Settings, roi: Roi | None, where:
 
     inside = shown(grid.origin + 1000.0 * grid.rays())
     cloud = capture_cloud(capture, settings, geometry, roi=Roi.around(inside))
-    found = cloud.points[inside & cloud.valid].astype(float)
+    candidates = cloud.points[inside & cloud.valid].astype(float)
     # outliers of a decoder lie far away along the rays, and a fit that starts with them would follow the rays
-    points = found[plane_points(found)]
+    points = candidates[plane_points(candidates)]
     if len(points) < _FEWEST_POINTS:
-        coplanar = f", {len(points)} of them in one plane" if len(found) else ""
-        number = f"{len(found)} points in {window}{coplanar}"
+        coplanar = f", {len(points)} of them in one plane" if len(candidates) else ""
+        number = f"{len(candidates)} points in {window}{coplanar}"
         raise InputError("--window", "", number, f"{_FEWEST_POINTS} or more, to find its plane")
     try:
         plane = fit_plane(points[:: -(-len(points) // _PLANE_POINTS)], camera.centre)

@@ -63,7 +63,7 @@ class WhiteCouponRenderer:
             Image that the projector shows in place of the sensor's patterns.
         """
         if pattern not in self._lit:
-            self._lit[pattern] = self._one(pattern)
+            self._lit[pattern] = self._projected(pattern)
         self._simulated.patterns = self._lit[pattern]
         scene = lambertian_coupon(*place.size, self.sensor.wavelength_nm)
         radiance = self._simulated.radiance(
@@ -71,7 +71,7 @@ class WhiteCouponRenderer:
         )
         return np.asarray(radiance[0], np.float64) * self.sensor.electrons()
 
-    def _one(self, pattern: Pattern) -> ProjectedPatterns:
+    def _projected(self, pattern: Pattern) -> ProjectedPatterns:
         projector = self.sensor.projector
         frames = self.sensor.patterns()
         if pattern == "first":

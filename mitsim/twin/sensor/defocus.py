@@ -71,10 +71,10 @@ def fitted_blur(width: Floats, ratio: Floats) -> float:
 
     The fit allows a common loss of modulation, which light scattered far by the lenses causes.
     """
-    found = least_squares(
+    fit = least_squares(
         lambda x: x[1] * modulation(float(x[0]), width) - ratio, [1.0, 0.9], bounds=([0.05, 0.3], [20.0, 1.0])
     )
-    return float(found.x[0])
+    return float(fit.x[0])
 
 
 @dataclass(frozen=True)
@@ -118,10 +118,10 @@ def fit_defocus(source: InputCapture, white: Floats, black: Floats, pairs: Float
     for top in range(0, white.shape[0] - _BLOCK_PX + 1, _BLOCK_PX):
         for left in range(0, white.shape[1] - _BLOCK_PX + 1, _BLOCK_PX):
             part = np.s_[top : top + _BLOCK_PX, left : left + _BLOCK_PX]
-            own, level = depth[part][np.isfinite(depth[part])], white[part]
-            if len(own) < _LEAST_SHARE * _BLOCK_PX**2 or level.std() > _EVEN * level.mean():
+            depths, level = depth[part][np.isfinite(depth[part])], white[part]
+            if len(depths) < _LEAST_SHARE * _BLOCK_PX**2 or level.std() > _EVEN * level.mean():
                 continue
-            near, middle, far = np.percentile(own, [10, 50, 90])
+            near, middle, far = np.percentile(depths, [10, 50, 90])
             modulated = float((level - black[part]).mean())
             if far - near > _DEEP * middle or modulated < least:
                 continue
@@ -131,12 +131,12 @@ def fit_defocus(source: InputCapture, white: Floats, black: Floats, pairs: Float
     if len(table) < _FEWEST:
         return None
     focal = float(projector.matrix[0, 0])
-    found = _fitted(table, focal)
+    values = _fitted(table, focal)
     # neighbouring blocks are correlated: the jackknife leaves out runs of them
     parts = np.array_split(np.arange(len(table)), _PARTS)
-    others = np.array([_fitted(np.delete(table, part, axis=0), focal) for part in parts])
-    off = others - others.mean(axis=0)
-    return Defocus(float(found[0]), float(found[1]), float(found[2]), (_PARTS - 1) / _PARTS * off.T @ off)
+    replicates = np.array([_fitted(np.delete(table, part, axis=0), focal) for part in parts])
+    off = replicates - replicates.mean(axis=0)
+    return Defocus(float(values[0]), float(values[1]), float(values[2]), (_PARTS - 1) / _PARTS * off.T @ off)
 
 
 def _fitted(table: Floats, focal: float) -> Floats:
@@ -148,7 +148,7 @@ def _fitted(table: Floats, focal: float) -> Floats:
 
     low, high = float(depth.min()), float(depth.max())
     starts = (low, float(np.median(depth)), high)
-    tried = [
+    fits = [
         least_squares(
             off,
             [max(float(np.median(blur)), 0.05), 20.0, start],
@@ -159,4 +159,4 @@ def _fitted(table: Floats, focal: float) -> Floats:
         )
         for start in starts
     ]
-    return np.asarray(min(tried, key=lambda one: one.cost).x)
+    return np.asarray(min(fits, key=lambda fit: fit.cost).x)

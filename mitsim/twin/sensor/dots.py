@@ -93,8 +93,8 @@ class DotsFit:
             )
             low, high = (np.where(np.arange(len(theta)) == index, end, theta) for end in ends)
             jacobian[:, index] = (numbers(high) - numbers(low)) / max(float(ends[1] - ends[0]), 1e-12)
-        found = [unscaled(x, p.scale) for x, p in zip(numbers(theta), self.parameters, strict=True)]
-        return np.array(found), np.sqrt(np.diag(jacobian @ self.moment_fit.covariance @ jacobian.T))
+        values = [unscaled(x, p.scale) for x, p in zip(numbers(theta), self.parameters, strict=True)]
+        return np.array(values), np.sqrt(np.diag(jacobian @ self.moment_fit.covariance @ jacobian.T))
 
 
 def with_values(sensor: Sensor, parameters: Sequence[Parameter], theta: Floats) -> Sensor:
@@ -162,9 +162,9 @@ def fit_dots(
     real = field_figures(capture.images[name][0][roi.slices].astype(float), field, window, black)
     simulator = SpecimenSimulator(sensor, place, roi)
     unit = simulator.projector_irradiance(sensor, seed)
-    own = list(parameters)
+    free_parameters = list(parameters)
     if room is None:
-        own += room_parameters(unit / sensor.projector.flux)
+        free_parameters += room_parameters(unit / sensor.projector.flux)
         sensor = with_room(sensor, [_FIRST_ROOM * unit, 0.0, 0.0, 0.0, 0.0, 0.0])
     else:
         sensor = with_room(sensor, list(room))
@@ -173,30 +173,34 @@ def fit_dots(
     names = [(figure, term) for figure in ("level", "contrast") for term in terms]
     names += [(alone, "1") for alone in _ALONE]
     spatial, count = np.array([term != "1" for _, term in names]), len(names)
-    if CORNER_BLUR in own:
+    if CORNER_BLUR in free_parameters:
         names += [("sharpness", term) for term in terms if term != "1"]
         spatial = np.append(spatial, np.zeros(len(names) - len(spatial), bool))
     wanted, covariance = real.of(names)
 
     def simulate(theta: Floats, number: int) -> tuple[Floats, Floats]:
-        levels = simulator.levels(_with_other_dots(with_values(sensor, own, theta), number), 1000 * seed + number)
+        levels = simulator.levels(
+            _with_other_dots(with_values(sensor, free_parameters, theta), number), 1000 * seed + number
+        )
         return field_figures(levels.astype(float), field, window, black).of(names)
 
-    start = np.array([parameter.get(sensor) for parameter in own])
-    if FLUX in own:
-        start[own.index(FLUX)] += wanted[0] - simulate(start, 0)[0][0]
-    found = match_moments(wanted, covariance, simulate, _prior(own, start), draws.number, where)
+    start = np.array([parameter.get(sensor) for parameter in free_parameters])
+    if FLUX in free_parameters:
+        start[free_parameters.index(FLUX)] += wanted[0] - simulate(start, 0)[0][0]
+    moment_fit = match_moments(wanted, covariance, simulate, _prior(free_parameters, start), draws.number, where)
     uneven = 0.0
-    if _misses(found) and spatial.sum() > 0:
-        off = wanted - np.mean([simulate(found.values, number)[0] for number in range(draws.number)], axis=0)
+    if _misses(moment_fit) and spatial.sum() > 0:
+        off = wanted - np.mean([simulate(moment_fit.values, number)[0] for number in range(draws.number)], axis=0)
         excess = float(np.mean(off[spatial] ** 2 - np.diag(covariance)[spatial]))
         uneven = float(np.sqrt(max(excess, 0.0)))
         covariance = covariance + np.diag(np.where(spatial, uneven**2, 0.0))
     undetermined: list[Parameter] = []
     settled = uneven == 0
     while True:
-        kept = np.array([_is_determined(found, index, parameter) for index, parameter in enumerate(own)])
-        dropped = [parameter for parameter, is_kept in zip(own, kept, strict=True) if not is_kept]
+        kept = np.array(
+            [_is_determined(moment_fit, index, parameter) for index, parameter in enumerate(free_parameters)]
+        )
+        dropped = [parameter for parameter, is_kept in zip(free_parameters, kept, strict=True) if not is_kept]
         if settled and not dropped:
             break
         # without it no parameter explains the variation of sharpness
@@ -205,16 +209,27 @@ def fit_dots(
             wanted, covariance = real.of(names)
             covariance = covariance + np.diag(np.where(spatial, uneven**2, 0.0))
         undetermined += dropped
-        own = [parameter for parameter, is_kept in zip(own, kept, strict=True) if is_kept]
+        free_parameters = [parameter for parameter, is_kept in zip(free_parameters, kept, strict=True) if is_kept]
         start = start[kept]
-        again = _prior(own, start, found.values[kept])
-        found = match_moments(wanted, covariance, simulate, again, draws.number, f"{where}, once more")
+        again = _prior(free_parameters, start, moment_fit.values[kept])
+        moment_fit = match_moments(wanted, covariance, simulate, again, draws.number, f"{where}, once more")
         settled = True
-    if _misses(found):
-        found = replace(found, covariance=found.covariance * found.chi_square / max(found.freedom, 1))
-    misfits = field_misfits(names, found.off, field.basis)
+    if _misses(moment_fit):
+        moment_fit = replace(
+            moment_fit, covariance=moment_fit.covariance * moment_fit.chi_square / max(moment_fit.freedom, 1)
+        )
+    misfits = field_misfits(names, moment_fit.off, field.basis)
     worst = max(misfits, key=lambda figure: misfits[figure])
-    return DotsFit(sensor, tuple(own), found, len(field.corners), uneven, tuple(undetermined), worst, misfits[worst])
+    return DotsFit(
+        sensor,
+        tuple(free_parameters),
+        moment_fit,
+        len(field.corners),
+        uneven,
+        tuple(undetermined),
+        worst,
+        misfits[worst],
+    )
 
 
 def field_misfits(names: Sequence[tuple[str, str]], off: Floats, basis: Floats) -> dict[str, float]:
@@ -235,22 +250,22 @@ def field_misfits(names: Sequence[tuple[str, str]], off: Floats, basis: Floats) 
     return {figure: float(np.sqrt(np.mean(values**2))) for figure, values in over_field.items()}
 
 
-def _misses(found: MomentFit) -> bool:
-    return bool(found.chi_square > chi2.isf(CHANCE, max(found.freedom, 1)))
+def _misses(moment_fit: MomentFit) -> bool:
+    return bool(moment_fit.chi_square > chi2.isf(CHANCE, max(moment_fit.freedom, 1)))
 
 
-def _is_determined(found: MomentFit, index: int, parameter: Parameter) -> bool:
+def _is_determined(moment_fit: MomentFit, index: int, parameter: Parameter) -> bool:
     """Return whether a parameter stays in the fit: the room's always, smoothing and corner blur if significant."""
     if parameter.key.startswith("room."):
         return True
     if parameter is SMOOTHING or parameter is CORNER_BLUR:
-        return bool(found.values[index] > _SURE * np.sqrt(found.covariance[index, index]))
-    return bool(found.determined[index])
+        return bool(moment_fit.values[index] > _SURE * np.sqrt(moment_fit.covariance[index, index]))
+    return bool(moment_fit.determined[index])
 
 
-def _prior(own: Sequence[Parameter], middle: Floats, first: Floats | None = None) -> Prior:
+def _prior(parameters: Sequence[Parameter], middle: Floats, first: Floats | None = None) -> Prior:
     spread, step, low, high = (
-        np.array([getattr(parameter, name) for parameter in own]) for name in ("spread", "step", "low", "high")
+        np.array([getattr(parameter, name) for parameter in parameters]) for name in ("spread", "step", "low", "high")
     )
     return Prior(middle, spread, step, low, high, first)
 

@@ -90,13 +90,14 @@ def pooled(estimates: Sequence[FittedKey]) -> list[FittedKey]:
     """Combine estimates of the same key, in the order in which the keys first occur."""
     out = []
     for key in dict.fromkeys(estimate.key for estimate in estimates):
-        own = [estimate for estimate in estimates if estimate.key == key]
-        first = own[0]
-        if len(own) > 1 and all(fitted_key.uncertainty > 0 for fitted_key in own):
+        group = [estimate for estimate in estimates if estimate.key == key]
+        first = group[0]
+        if len(group) > 1 and all(fitted_key.uncertainty > 0 for fitted_key in group):
             middle, spread = combined(
-                [scaled(fitted_key.value, first.scale) for fitted_key in own], [one.uncertainty for one in own]
+                [scaled(fitted_key.value, first.scale) for fitted_key in group],
+                [fitted_key.uncertainty for fitted_key in group],
             )
-            names = tuple(name for fitted_key in own for name in fitted_key.captures)
+            names = tuple(name for fitted_key in group for name in fitted_key.captures)
             first = replace(first, value=unscaled(middle, first.scale), uncertainty=spread, captures=names)
         out.append(first)
     return out

@@ -129,13 +129,13 @@ def field_figures(levels: Floats, field: SpecimenField, window_px: int, black: f
     table = patch_figures(np.asarray(levels, float) - black, field, window_px)
     basis = field.basis if len(table) >= _FEWEST_FOR_TERMS else field.basis[:, :1]
     inverse = np.linalg.inv(basis.T @ basis)
-    found = inverse @ basis.T @ table
-    rest = table - basis @ found
-    spread = rest.T @ rest / max(len(table) - basis.shape[1], 1)
+    solution = inverse @ basis.T @ table
+    residual = table - basis @ solution
+    spread = residual.T @ residual / max(len(table) - basis.shape[1], 1)
     coefficients = np.full((len(TERMS), len(FIGURES)), np.nan)
-    coefficients[: len(found)] = found
+    coefficients[: len(solution)] = solution
     whole = np.zeros((len(TERMS), len(TERMS)))
-    whole[: len(found), : len(found)] = inverse
+    whole[: len(solution), : len(solution)] = inverse
     return FieldFigures(coefficients, np.kron(whole, spread), len(table))
 
 
@@ -156,7 +156,7 @@ def patch_figures(image: Floats, field: SpecimenField, window_px: int) -> Floats
     def mean_of(values: Floats, where: NDArray[np.bool_] = inside) -> Floats:
         return np.asarray(np.where(where, values, 0.0).sum(axis=1) / where.sum(axis=1))
 
-    level, spread, near, fine = (field.patches(one) for one in (mean, deviation, near, fine))
+    level, spread, near, fine = (field.patches(values) for values in (mean, deviation, near, fine))
     rising, count = np.sort(np.where(inside, near, np.inf), axis=1), inside.sum(axis=1, keepdims=True)
     beside = np.concatenate([(count - 1) // 2, count // 2], axis=1)
     bright = near > np.take_along_axis(rising, beside, axis=1).mean(axis=1, keepdims=True)  # than the median

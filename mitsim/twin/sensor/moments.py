@@ -85,16 +85,16 @@ def match_moments(
     """
 
     def figures(theta: Floats) -> tuple[Floats, Floats]:
-        each = [simulate(theta, number) for number in range(draws)]
-        return np.mean([m for m, _ in each], axis=0), np.mean([s for _, s in each], axis=0)
+        simulations = [simulate(theta, number) for number in range(draws)]
+        return np.mean([m for m, _ in simulations], axis=0), np.mean([s for _, s in simulations], axis=0)
 
     inverse_prior = np.diag(prior.spread**-2.0)
     theta = np.clip(prior.start if prior.first is None else prior.first, prior.low, prior.high)
     seen, spread = figures(theta)
     weight = np.linalg.pinv(covariance + spread / draws)
 
-    def cost(at: Floats, found: Floats) -> float:
-        off, moved = real - found, at - prior.start
+    def cost(at: Floats, features: Floats) -> float:
+        off, moved = real - features, at - prior.start
         return float(off @ weight @ off + moved @ inverse_prior @ moved)
 
     jacobian = np.zeros((len(real), len(theta)))
@@ -106,8 +106,8 @@ def match_moments(
             other[index] += step if theta[index] + step <= prior.high[index] else -step
             jacobian[:, index] = (figures(other)[0] - seen) / (other[index] - theta[index])
         if label:
-            each = f"{time.monotonic() - start:.0f} s each"
-            say_progress(f"{label}: {len(theta)} parameters, round {number} of at most {_ROUNDS}, about {each}")
+            duration = f"{time.monotonic() - start:.0f} s each"
+            say_progress(f"{label}: {len(theta)} parameters, round {number} of at most {_ROUNDS}, about {duration}")
         weight = np.linalg.pinv(covariance + spread / draws)
         normal = jacobian.T @ weight @ jacobian + inverse_prior
         pull = jacobian.T @ weight @ (real - seen) - inverse_prior @ (theta - prior.start)
@@ -115,14 +115,14 @@ def match_moments(
         length, before = 1.0, cost(theta, seen)
         for _ in range(_HALVINGS):
             tried = np.clip(theta + length * change, prior.low, prior.high)
-            found, other_spread = figures(tried)
-            if cost(tried, found) < before:
+            features, other_spread = figures(tried)
+            if cost(tried, features) < before:
                 break
             length /= 2
         else:
             break
         moved = np.abs(tried - theta) * np.sqrt(np.diag(normal))
-        theta, seen, spread = tried, found, other_spread
+        theta, seen, spread = tried, features, other_spread
         if float(moved.max()) < _ENOUGH or before - cost(theta, seen) < _ENOUGH:
             break
     weight = np.linalg.pinv(covariance + spread / draws)

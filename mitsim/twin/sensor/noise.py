@@ -81,15 +81,17 @@ def fit_imager(groups: list[list[InputCapture]], sensor: Sensor, places: dict[st
         line = repeated_line([Repeats.of(images, mask, _PIXELS) for images, mask in masked], imager)
         if line is not None:
             names = tuple(source.name for group in repeated for source in group)
-            imager, found = _with_line(replace(imager, row_noise=0.0), line, names, "photon transfer of repeats")
+            imager, noise_estimates = _with_line(
+                replace(imager, row_noise=0.0), line, names, "photon transfer of repeats"
+            )
             imager, fixed, undetermined = _with_fixed(imager, sensor.imager, repeated, places)
-            return ImagerFit(imager, (*estimates, *found, *fixed), tuple(undetermined), repeated=True)
+            return ImagerFit(imager, (*estimates, *noise_estimates, *fixed), tuple(undetermined), repeated=True)
     for group in groups:
         if group[0].kind == "off":
-            found_one = _from_one_image(group[0], imager, places)
-            if found_one is not None:
-                imager, found = found_one
-                return ImagerFit(imager, (*estimates, *found))
+            from_one_image = _from_one_image(group[0], imager, places)
+            if from_one_image is not None:
+                imager, noise_estimates = from_one_image
+                return ImagerFit(imager, (*estimates, *noise_estimates))
     return ImagerFit(imager, tuple(estimates), known=False)
 
 
@@ -136,8 +138,8 @@ def smoothing_of(image: NDArray[np.unsignedinteger], mask: NDArray[np.bool_]) ->
             return _SMOOTHINGS[1]
         return float(brentq(lambda s: _correlation(s) - value, *_SMOOTHINGS))
 
-    found = at(correlation)
-    return found, max(at(correlation + spread) - found, found - at(correlation - spread), 1e-3)
+    smoothing = at(correlation)
+    return smoothing, max(at(correlation + spread) - smoothing, smoothing - at(correlation - spread), 1e-3)
 
 
 def fine_gain(smoothing: float) -> float:
@@ -254,8 +256,8 @@ def _from_one_image(
         scaled = replace(line, offset=line.offset / gain, slope=line.slope / gain, covariance=line.covariance / gain**2)
         line = scaled.not_negative()
         if line.full_well(imager)[1] < 0.3 * line.full_well(imager)[0] and line.offset >= 0:
-            found, from_line = _with_line(bare, line, names, method)
-            return found, [*estimates, *from_line]
+            fitted_imager, from_line = _with_line(bare, line, names, method)
+            return fitted_imager, [*estimates, *from_line]
     # nearly one level: keep the file's full well and attribute the rest to read noise; without a rest, fit the well
     electrons = linearised(image, imager)
     level = float(np.median(electrons[mask]))

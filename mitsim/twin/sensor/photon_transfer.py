@@ -117,12 +117,12 @@ class Repeats:
 def repeated_line(repeats: list[Repeats], chip: Imager) -> TransferLine | None:
     """Return the photon-transfer line from repeats of one or more lights; None with too few levels."""
     rows = []
-    for own in repeats:
-        electrons = linearised(own.levels, chip)
+    for group in repeats:
+        electrons = linearised(group.levels, chip)
         mean, variance = electrons.mean(axis=0), electrons.var(axis=0, ddof=1)
-        clear = _CLEAR_SIGMAS * float(np.sqrt(own.levels.var(axis=0, ddof=1).mean()))
-        inside = (own.around > clear) & (own.around < chip.full_scale - clear)
-        rows += _bins(mean[inside], variance[inside], own.around[inside], len(own.levels) - 1, chip)
+        clear = _CLEAR_SIGMAS * float(np.sqrt(group.levels.var(axis=0, ddof=1).mean()))
+        inside = (group.around > clear) & (group.around < chip.full_scale - clear)
+        rows += _bins(mean[inside], variance[inside], group.around[inside], len(group.levels) - 1, chip)
     return _line(rows)
 
 
@@ -140,9 +140,9 @@ def one_image_line(
         shown = float(np.interp(level, linearised(every, chip), every))
         if not _CLEAR_DN < shown < chip.full_scale - _CLEAR_DN:
             continue
-        own = float(widths(np.array(shown), chip)) ** 2 / 12
+        rounding = float(widths(np.array(shown), chip)) ** 2 / 12
         spread = 2 * variance**2 / (count * _MEDIAN_EFFICIENCY * independent_share())
-        rows.append((level, variance - own, spread))
+        rows.append((level, variance - rounding, spread))
     return _line(rows)
 
 
@@ -178,14 +178,16 @@ def _bins(
     where = np.clip(np.searchsorted(edges, level, side="right") - 1, 0, _BINS - 1)
     rows = []
     for index in range(_BINS):
-        own = where == index
-        if own.sum() < 2:
+        members = where == index
+        if members.sum() < 2:
             continue
-        cut = float((widths(level[own], chip) ** 2).mean()) / 12
-        found = float(variance[own].mean())
-        if found <= 0:
+        cut = float((widths(level[members], chip) ** 2).mean()) / 12
+        bin_variance = float(variance[members].mean())
+        if bin_variance <= 0:
             continue
-        rows.append((float(mean[own].mean()), found - cut, 2 * found**2 / (freedom * float(own.sum()))))
+        rows.append(
+            (float(mean[members].mean()), bin_variance - cut, 2 * bin_variance**2 / (freedom * float(members.sum())))
+        )
     return rows
 
 

@@ -151,7 +151,7 @@ def first_knee(image: Floats, mask: Mask, imager: Imager) -> Knee | None:
 
 def _bias(clean: Floats, mask: Mask, tiles: _Tiles, knee: Knee) -> tuple[float, float]:
     """Return the bias of a knee whose levels come from a denoised image, from draws of noise, and its uncertainty."""
-    numbers, found = tiles.fitted(knee.level, knee.slope), []
+    numbers, knee_levels = tiles.fitted(knee.level, knee.slope), []
     k = knee.level - _ROUNDED_DOWN_DN
     every = np.linspace(0.0, k + (float(clean.max()) + 5 - k) / knee.slope, 1500)
     spread = tiles.spread(every, numbers)
@@ -165,8 +165,13 @@ def _bias(clean: Floats, mask: Mask, tiles: _Tiles, knee: Knee) -> tuple[float, 
             _Tiles.of(drawn, levels, _quiet(variance, levels, mask), tiles.black)
             for levels in (denoised(drawn, mask), clean)
         ]
-        found.append([np.nan if one is None else _least(one, knee.level, knee.slope, _BESIDE_IT) for one in both])
-    off = np.array(found) @ [1.0, -1.0]
+        knee_levels.append(
+            [
+                np.nan if drawn_tiles is None else _least(drawn_tiles, knee.level, knee.slope, _BESIDE_IT)
+                for drawn_tiles in both
+            ]
+        )
+    off = np.array(knee_levels) @ [1.0, -1.0]
     off = off[np.isfinite(off)]
     return (float(off.mean()), float(off.std(ddof=1) / np.sqrt(len(off)))) if len(off) > 1 else (0.0, float("inf"))
 
@@ -192,12 +197,12 @@ def _least(tiles: _Tiles, middle: float, slope: float, around: int) -> float:
 class _Tiles:
     """Tiles (n, 36, 36) of an image without noise, which pixels are used, their squared detail, and that of the print.
 
-    ``rising`` (n * 36 * 36,) are the indices of the pixels by rising level, ``ranks`` (n, 36, 36) the places of the
+    ``rising`` (n * 36 * 36,) are the indices of the pixels by rising level, ``ranks`` (n, 36, 36) the ranks of the
     pixels in this order. ``used`` are indices of pixels among those of the tiles without their rims.
     """
 
-    def __init__(self, clean: Floats, inside: Mask, square: Floats, own: Floats, black: float) -> None:
-        self.clean, self.inside, self.square, self.own, self.black = clean, inside, square, own, black
+    def __init__(self, clean: Floats, inside: Mask, square: Floats, print_square: Floats, black: float) -> None:
+        self.clean, self.inside, self.square, self.print_square, self.black = clean, inside, square, print_square, black
         self.rising = np.argsort(clean, axis=None)
         self.rising_levels = clean.reshape(-1)[self.rising]
         ranks = np.empty(clean.size, np.intp)
@@ -213,19 +218,21 @@ class _Tiles:
         rim = np.zeros((side, side), bool)
         rim[_RIM_PX:-_RIM_PX, _RIM_PX:-_RIM_PX] = True
         inside = _cut(quiet, side).astype(bool) & rim
-        some = np.flatnonzero(inside.any(axis=(1, 2)))
-        if len(some) < _FEWEST:
+        indices = np.flatnonzero(inside.any(axis=(1, 2)))
+        if len(indices) < _FEWEST:
             return None
-        some = some[:: int(np.ceil(len(some) / _TILES))]
-        levels, square, own = (_cut(one, side)[some] for one in (clean, finest_detail(image), finest_detail(clean)))
-        inside = inside[some]
-        return cls(levels, inside, square[inside] ** 2, own[inside] ** 2, black)
+        indices = indices[:: int(np.ceil(len(indices) / _TILES))]
+        levels, square, print_detail = (
+            _cut(values, side)[indices] for values in (clean, finest_detail(image), finest_detail(clean))
+        )
+        inside = inside[indices]
+        return cls(levels, inside, square[inside] ** 2, print_detail[inside] ** 2, black)
 
     def away_from(self, level: float) -> _Tiles:
         """Return the tiles without pixels near a level: a curve that is flat there only is no knee."""
         far = np.abs(self.clean - level) > _NEAR_DN
         kept = far[self.inside]
-        return _Tiles(self.clean, self.inside & far, self.square[kept], self.own[kept], self.black)
+        return _Tiles(self.clean, self.inside & far, self.square[kept], self.print_square[kept], self.black)
 
     def best(self, knee: float, slope: float) -> Floats:
         """Return -2 log likelihood (n,) of the tiles with the best common a and b."""
@@ -235,24 +242,24 @@ class _Tiles:
         """Return a and b of all tiles, by weighted least squares."""
         middle = float(np.median(self.square)) / MEDIAN_SQUARE
         numbers = np.array([0.0, middle / max(float(np.median(self.clean)), 1.0)])
-        variance, excess = np.full_like(self.square, middle), self.square - 1 / 12 - self.own
+        variance, excess = np.full_like(self.square, middle), self.square - 1 / 12 - self.print_square
         for _ in range(3):
             shares = self._shares(knee, slope, numbers)
             maps = np.stack([_of_neighbours(share).take(self.used) for share in shares])
             for _ in range(2):
                 weight = (self.square < _LARGEST**2 * variance) / variance**2
-                numbers = _two(maps, excess, weight)
-                variance = np.maximum(numbers @ maps, 1e-3) + 1 / 12 + self.own
+                numbers = _nonnegative_pair(maps, excess, weight)
+                variance = np.maximum(numbers @ maps, 1e-3) + 1 / 12 + self.print_square
         return numbers
 
     def misfit(self, knee: float, slope: float, numbers: Floats) -> Floats:
         """Return -2 log likelihood (n,) of the tiles."""
         ratio, light = self._shares(knee, slope, numbers)
-        known = _of_neighbours(numbers[0] * ratio + numbers[1] * light).take(self.used)
-        variance = np.maximum(known, 1e-3) + 1 / 12 + self.own
-        each = np.zeros((len(self.clean), _TILE_PX**2))
-        each.reshape(-1)[self.used] = np.log(variance) + np.minimum(self.square / variance, _LARGEST**2)
-        return np.asarray(independent_share() * each.sum(axis=1), float)
+        noise_variance = _of_neighbours(numbers[0] * ratio + numbers[1] * light).take(self.used)
+        variance = np.maximum(noise_variance, 1e-3) + 1 / 12 + self.print_square
+        terms = np.zeros((len(self.clean), _TILE_PX**2))
+        terms.reshape(-1)[self.used] = np.log(variance) + np.minimum(self.square / variance, _LARGEST**2)
+        return np.asarray(independent_share() * terms.sum(axis=1), float)
 
     def uncertainty(self, knee: float, slope: float) -> float:
         """Return the standard uncertainty [DN] of the knee by a jackknife that leaves out one tile at a time.
@@ -287,8 +294,8 @@ class _Tiles:
             every = np.linspace(0.0, top, 1500)
             mean, share = _through(every, knee, slope, self.spread(every, numbers))
             # both at once, and in the order of the levels, which finds the neighbours five times as fast
-            found = np.interp(self.rising_levels, mean, every + 1j * share).take(self.ranks)
-            light, ratio = found.real, found.imag.copy()
+            values = np.interp(self.rising_levels, mean, every + 1j * share).take(self.ranks)
+            light, ratio = values.real, values.imag.copy()
         return ratio, ratio * np.maximum(light - self.black, 0.0)
 
     def spread(self, level: Floats, numbers: Floats) -> Floats:
@@ -310,16 +317,16 @@ def _through(level: Floats, knee: float, slope: float, spread: Floats) -> tuple[
     return level - flat * spread * first, 1 - 2 * flat * above + flat**2 * (second - first**2)
 
 
-def _two(design: Floats, values: Floats, weight: Floats) -> Floats:
+def _nonnegative_pair(design: Floats, values: Floats, weight: Floats) -> Floats:
     """Return two non-negative numbers by weighted least squares; the design is (2, N)."""
     weighted = design * weight
     normal, right = weighted @ design.T, weighted @ values
-    found = np.linalg.solve(normal + 1e-12 * np.eye(2), right)
-    if found[0] < 0:
-        found = np.array([0.0, max(right[1] / normal[1, 1], 0.0)])
-    elif found[1] < 0:
-        found = np.array([max(right[0] / normal[0, 0], 0.0), 0.0])
-    return np.asarray(found)
+    numbers = np.linalg.solve(normal + 1e-12 * np.eye(2), right)
+    if numbers[0] < 0:
+        numbers = np.array([0.0, max(right[1] / normal[1, 1], 0.0)])
+    elif numbers[1] < 0:
+        numbers = np.array([max(right[0] / normal[0, 0], 0.0), 0.0])
+    return np.asarray(numbers)
 
 
 def _of_neighbours(values: Floats) -> Floats:

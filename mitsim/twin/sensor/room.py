@@ -44,13 +44,17 @@ def fit_room(input_captures: list[InputCapture], sensor: Sensor, places: dict[st
     rows, values = [], []
     for source in input_captures:
         camera = source.capture.rig.reference
-        own = like(source.capture, sensor, source.name)
-        if own.exposure.base_s is None:
+        capture_sensor = like(source.capture, sensor, source.name)
+        if capture_sensor.exposure.base_s is None:
             continue
         chip = chip_of(source.capture, sensor.imager, source.name)
         electrons = linearised(source.image, chip)
         loss = camera_illumination(sensor.imager.corner_illumination, camera)
-        scale = electrons_per_radiance(sensor.imager, sensor.wavelength_nm, own.exposure.base_s) * REFLECTANCE / np.pi
+        scale = (
+            electrons_per_radiance(sensor.imager, sensor.wavelength_nm, capture_sensor.exposure.base_s)
+            * REFLECTANCE
+            / np.pi
+        )
         irradiance = electrons / scale / (1.0 if loss is None else loss)
         field = SpecimenField.of(camera, image_mask(places[source.name], camera, MARGIN_PX), _PATCH_PX)
         corners = field.corners + np.array([field.roi.top, field.roi.left])
@@ -63,22 +67,22 @@ def fit_room(input_captures: list[InputCapture], sensor: Sensor, places: dict[st
         values.append([float(np.median(irradiance[r : r + _PATCH_PX, c : c + _PATCH_PX])) for r, c in corners])
     if not rows:
         return None
-    design, seen = np.concatenate(rows), np.concatenate([np.array(own) for own in values])
+    design, seen = np.concatenate(rows), np.concatenate([np.array(medians) for medians in values])
     if len(seen) < _FEWEST_FOR_TERMS:
         design = design[:, :1]
-    found = np.linalg.lstsq(design, seen, rcond=None)[0]
-    rest = seen - design @ found
-    covariance = float(rest @ rest) / max(len(seen) - design.shape[1], 1) * np.linalg.inv(design.T @ design)
+    solution = np.linalg.lstsq(design, seen, rcond=None)[0]
+    residual = seen - design @ solution
+    covariance = float(residual @ residual) / max(len(seen) - design.shape[1], 1) * np.linalg.inv(design.T @ design)
     terms = np.zeros(len(ROOM_KEYS))
-    terms[: len(found)] = found
+    terms[: len(solution)] = solution
     names, estimates = tuple(source.name for source in input_captures), []
-    for index in range(len(found)):
-        gradient = np.zeros(len(found))
+    for index in range(len(solution)):
+        gradient = np.zeros(len(solution))
         if index == 0:
-            gradient[0], value = 1.0, found[0]
+            gradient[0], value = 1.0, solution[0]
         else:
-            value = found[index] / found[0]
-            gradient[index], gradient[0] = 1 / found[0], -value / found[0]
+            value = solution[index] / solution[0]
+            gradient[index], gradient[0] = 1 / solution[0], -value / solution[0]
         spread = float(np.sqrt(gradient @ covariance @ gradient))
         key, unit = f"room.{ROOM_KEYS[index]}", "W/mm^2" if index == 0 else "1"
         estimates.append(FittedKey(key, float(value), spread, unit, names, "level with the projector off"))

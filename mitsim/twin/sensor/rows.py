@@ -52,16 +52,16 @@ def row_turns(
     errors, columns, rows = patch_rows(capture, settings, geometry, place)
     focal, matrix = float(geometry.rectification.matrix_right[0, 0]), geometry.rectification.matrix_right
     x, y = (columns - matrix[0, 2]) / focal, (rows - matrix[1, 2]) / focal
-    known = np.isfinite(errors)
+    used = np.isfinite(errors)
     design = focal * 1e-3 * np.column_stack([1 + y**2, -x])
     for _ in range(3):
-        if known.sum() < _FEWEST:
+        if used.sum() < _FEWEST:
             return {}
-        found, covariance, rest = _line(design[known], errors[known], np.array(prior))
-        off = errors - design @ found
-        known &= np.abs(off) <= _CLIP * max(_MAD_TO_SIGMA * float(np.median(np.abs(rest))), 1e-3)
+        turns, covariance, residual = _line(design[used], errors[used], np.array(prior))
+        off = errors - design @ turns
+        used &= np.abs(off) <= _CLIP * max(_MAD_TO_SIGMA * float(np.median(np.abs(residual))), 1e-3)
     spread = np.sqrt(np.diag(covariance))
-    return {name: (float(found[k]), float(spread[k])) for k, name in enumerate(("row_mrad", "roll_mrad"))}
+    return {name: (float(turns[k]), float(spread[k])) for k, name in enumerate(("row_mrad", "roll_mrad"))}
 
 
 def _line(design: Floats, values: Floats, prior: Floats) -> tuple[Floats, Floats, Floats]:
@@ -69,5 +69,5 @@ def _line(design: Floats, values: Floats, prior: Floats) -> tuple[Floats, Floats
     free = values - design @ np.linalg.lstsq(design, values, rcond=None)[0]
     variance = max(float(free @ free) / max(len(values) - design.shape[1], 1), 1e-12)
     covariance = np.linalg.inv(design.T @ design / variance + np.diag(1 / np.maximum(prior, 1e-6) ** 2))
-    found = covariance @ design.T @ values / variance
-    return np.asarray(found, float), np.asarray(covariance, float), values - design @ found
+    solution = covariance @ design.T @ values / variance
+    return np.asarray(solution, float), np.asarray(covariance, float), values - design @ solution

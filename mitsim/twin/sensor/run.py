@@ -67,10 +67,11 @@ class SensorFit:
     @property
     def fitted_to(self) -> tuple[FittedCapture, ...]:
         """Return the captures of this fit and of the one that it starts from, each once."""
-        own = [
-            FittedCapture(name=one.name, images_sha256=images_digest(one.capture.images)) for one in self.input_captures
+        captures = [
+            FittedCapture(name=source.name, images_sha256=images_digest(source.capture.images))
+            for source in self.input_captures
         ]
-        return tuple({one.images_sha256: one for one in (*self.sensor.fitted_to, *own)}.values())
+        return tuple({capture.images_sha256: capture for capture in (*self.sensor.fitted_to, *captures)}.values())
 
     @property
     def verdict(self) -> Verdict:
@@ -133,10 +134,10 @@ def fit_sensor(
     if isinstance(base.pattern, LightCode):
         coded: list[FittedKey] = []
         for source in on_captures:
-            own = replace(like(source.capture, base, source.name), imager=base.imager)
-            coded += fit_stripes(source, own, places[source.name])
-        known = {estimate.key for estimate in estimates}  # repeats and the dark before a single image
-        estimates += [estimate for estimate in pooled(coded) if estimate.key not in known]
+            capture_sensor = replace(like(source.capture, base, source.name), imager=base.imager)
+            coded += fit_stripes(source, capture_sensor, places[source.name])
+        keys = {estimate.key for estimate in estimates}  # repeats and the dark before a single image
+        estimates += [estimate for estimate in pooled(coded) if estimate.key not in keys]
     if not imager.repeated and any(estimate.key in _NOISE for estimate in estimates):
         undetermined += unseparated(chosen.imager)
     turned, assumed, method = list[FittedKey](), chosen.unknowns.calibration, "row errors over the field"
@@ -147,8 +148,8 @@ def fit_sensor(
             turned.append(FittedKey(f"misalignment.{key}", *pair, "mrad", (source.name,), method))
     estimates += pooled(turned)
     agreements = tuple(
-        DotAgreement(name, found.moment_fit.chi_square, found.moment_fit.freedom, found.misfit, found.worst)
-        for name, found in dots.items()
+        DotAgreement(name, fit.moment_fit.chi_square, fit.moment_fit.freedom, fit.misfit, fit.worst)
+        for name, fit in dots.items()
     )
     return SensorFit(base, tuple(input_captures), tuple(estimates), tuple(undetermined), agreements)
 
@@ -201,16 +202,16 @@ def _dots(
             sensor = replace(sensor, imager=without_fixed_pattern(sensor.imager))
         place, terms = places[source.name], None if room is None else room.terms
         sensor = _check_exposure(sensor, source)
-        found = fit_dots(source.capture, sensor, place, parameters, source.name, room=terms, draws=draws)
-        if not imager.known and not {parameter.key for parameter in found.parameters} & _NOISE:
+        dots_fit = fit_dots(source.capture, sensor, place, parameters, source.name, room=terms, draws=draws)
+        if not imager.known and not {parameter.key for parameter in dots_fit.parameters} & _NOISE:
             # the noise stays that of the file, and so does the fixed pattern beside it
-            sensor, others = replace(sensor, imager=base.imager), [p for p in parameters if p.key not in _NOISE]
-            found = fit_dots(source.capture, sensor, place, others, source.name, room=terms, draws=draws)
-            found = replace(found, undetermined=(FULL_WELL, READ_NOISE, *found.undetermined))
-        out[source.name], fit = found, found.moment_fit
+            sensor, dot_parameters = replace(sensor, imager=base.imager), [p for p in parameters if p.key not in _NOISE]
+            dots_fit = fit_dots(source.capture, sensor, place, dot_parameters, source.name, room=terms, draws=draws)
+            dots_fit = replace(dots_fit, undetermined=(FULL_WELL, READ_NOISE, *dots_fit.undetermined))
+        out[source.name], fit = dots_fit, dots_fit.moment_fit
         say(
-            f"{source.name}: {found.patches} patches, chi-square {fit.chi_square:.1f} of {fit.freedom}, "
-            f"unevenness beyond the model {100 * found.uneven:.1f} %"
+            f"{source.name}: {dots_fit.patches} patches, chi-square {fit.chi_square:.1f} of {fit.freedom}, "
+            f"unevenness beyond the model {100 * dots_fit.uneven:.1f} %"
         )
     return out
 
@@ -228,9 +229,9 @@ def _combined_estimates(
             method = "figures of the dots over the field"
             estimates.append(FittedKey(parameter.key, value, spread, parameter.unit, (name,), method, parameter.scale))
         parameters |= {parameter.key: parameter for parameter in (*fit.parameters, *fit.undetermined)}
-    known = {estimate.key for estimate in estimates}
+    keys = {estimate.key for estimate in estimates}
     undetermined += [
-        Undetermined(p.key, p.read(base), p.determined_by) for p in parameters.values() if p.key not in known
+        Undetermined(p.key, p.read(base), p.determined_by) for p in parameters.values() if p.key not in keys
     ]
     if room is None and dots:
         undetermined.append(Undetermined(BLACK_LEVEL.key, BLACK_LEVEL.read(base), BLACK_LEVEL.determined_by))

@@ -99,7 +99,7 @@ class SpecimenSimulator:
             pattern = sensor.pattern
             if getattr(pattern, "shifts_px", None):
                 pattern = pattern.model_copy(update={"shifts_px": []})  # type: ignore[union-attr]
-            one = replace(
+            bare_sensor = replace(
                 sensor,
                 projector=projector,
                 imager=bare,
@@ -108,10 +108,12 @@ class SpecimenSimulator:
                 ambient_image=False,
                 rig=Rig({self.name: self.camera}, sensor.rig.projector),
             )
-            simulated = self._of(one)
+            simulated = self._of(bare_sensor)
             pose = self.place.world_from_sensor
             rng = np.random.default_rng(np.random.SeedSequence([seed, 2]))
-            speckle = draw_speckle(self._scene, one, self.camera, simulated.pixel_rays(self.name), pose, self.roi, rng)
+            speckle = draw_speckle(
+                self._scene, bare_sensor, self.camera, simulated.pixel_rays(self.name), pose, self.roi, rng
+            )
             still = None if speckle is None else replace(speckle, gain=np.ones_like(speckle.gain))
             rendering = Rendering(samples=_SAMPLES, depth=1)
             radiance = simulated.radiance(

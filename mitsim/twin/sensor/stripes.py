@@ -169,10 +169,10 @@ def _blur(
     width = seen.widths * np.where(seen.across, scales[0], scales[1])
     fine = width < 40 * max(scales)
     for label in np.unique(block):
-        own = rows[block == label], columns[block == label]
-        if len(own[0]) < 200:
+        pixels = rows[block == label], columns[block == label]
+        if len(pixels[0]) < 200:
             continue
-        ratio = off[:, *own].mean(axis=1) / depth[own].mean()
+        ratio = off[:, *pixels].mean(axis=1) / depth[pixels].mean()
         values.append(fitted_blur(width[fine], ratio[fine]))
     if len(values) < 4:
         return []

@@ -70,15 +70,15 @@ def fit_table(fit: SensorFit) -> str:
             f"| {estimate.key} | {estimate.value:.4g} | {low:.4g} to {high:.4g} | {estimate.unit} | "
             f"{', '.join(estimate.captures)} | {estimate.method} |"
         )
-    kept = [one for one in fit.undetermined if one.value]
+    kept = [entry for entry in fit.undetermined if entry.value]
     if kept:
         lines += ["", "| not determined | in the file | a capture that would determine it |", "| --- | --- | --- |"]
         lines += [
-            f"| {one.key} | {f'0, before {one.value:.4g}' if one.contained else f'{one.value:.4g}, kept'} "
-            f"| {one.determined_by} |"
-            for one in kept
+            f"| {entry.key} | {f'0, before {entry.value:.4g}' if entry.contained else f'{entry.value:.4g}, kept'} "
+            f"| {entry.determined_by} |"
+            for entry in kept
         ]
-    absent = [f"{one.key} ({one.determined_by})" for one in fit.undetermined if not one.value]
+    absent = [f"{entry.key} ({entry.determined_by})" for entry in fit.undetermined if not entry.value]
     if absent:
         lines += ["", f"Not determined, and 0 before and after: {', '.join(absent)}."]
     return "\n".join(lines) + "\n"
@@ -102,8 +102,8 @@ def _entries(fit: SensorFit) -> dict[str, Entry]:
         count, limit = (3, 200.0) if key == "room.curvature" else (2, 20.0)
         values = [parts[index].value if index in parts else 0.0 for index in range(count)]
         spreads = [two_digits(parts[index].uncertainty) if index in parts else "-" for index in range(count)]
-        some = next(iter(parts.values()))
-        comment = f"fitted: standard uncertainties {', '.join(spreads)}; {some.method}; {', '.join(some.captures)}"
+        part = next(iter(parts.values()))
+        comment = f"fitted: standard uncertainties {', '.join(spreads)}; {part.method}; {', '.join(part.captures)}"
         entries[key] = Entry(numbers(np.clip(values, -limit, limit), 5), comment)
     for kept in fit.undetermined:
         if kept.contained:
@@ -119,8 +119,8 @@ def _entries(fit: SensorFit) -> dict[str, Entry]:
 
 def _comment(key: FittedKey) -> str:
     low, high = key.interval()
-    found = f"fitted: {key.value:.4g} {key.unit}, 95 % interval {low:.4g} to {high:.4g}"
-    return f"{found}; {key.method}; {', '.join(key.captures)}"
+    text = f"fitted: {key.value:.4g} {key.unit}, 95 % interval {low:.4g} to {high:.4g}"
+    return f"{text}; {key.method}; {', '.join(key.captures)}"
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ class Entry:
 
 
 def _list(captures: Sequence[FittedCapture]) -> str:
-    texts = ((json.dumps(one.name, ensure_ascii=False), one.images_sha256) for one in captures)
+    texts = ((json.dumps(capture.name, ensure_ascii=False), capture.images_sha256) for capture in captures)
     return "[\n" + "".join(f'    {{ name = {name}, images_sha256 = "{digest}" }},\n' for name, digest in texts) + "]"
 
 
@@ -172,7 +172,7 @@ def with_cameras(text: str, cameras: Mapping[str, Camera], source: str) -> str:
     index = next((n for n, (table, _) in enumerate(blocks) if table.startswith("cameras.")), 1)
     made: list[str] = [*remarks, f"# cameras of this unit, from {source}"]
     for name, camera in cameras.items():
-        matrix, place = camera.matrix, camera.sensor_from_camera
+        matrix, pose = camera.matrix, camera.sensor_from_camera
         made += [
             f"[cameras.{name}]",
             f"width = {camera.width}",
@@ -183,9 +183,9 @@ def with_cameras(text: str, cameras: Mapping[str, Camera], source: str) -> str:
         ]
         if camera.model != "perspective":
             made.append(f'model = "{camera.model}"')
-        if place.translation.any() or not np.array_equal(place.rotation, np.eye(3)):
-            turn = Rotation.from_matrix(place.rotation).as_euler("xyz", degrees=True)
-            made += [f"position_mm = {numbers(place.translation)}", f"rotation_deg = {numbers(turn)}"]
+        if pose.translation.any() or not np.array_equal(pose.rotation, np.eye(3)):
+            turn = Rotation.from_matrix(pose.rotation).as_euler("xyz", degrees=True)
+            made += [f"position_mm = {numbers(pose.translation)}", f"rotation_deg = {numbers(turn)}"]
         made.append("")
     kept.insert(index, made)
     return "\n".join(line for lines in kept for line in lines)
@@ -233,7 +233,7 @@ def _blocks(text: str) -> list[tuple[str, list[str]]]:
         before = blocks[-1][1]
         while before and before[-1].startswith("#"):
             above.insert(0, before.pop())
-        if not any(not one.lstrip().startswith("#") and one.strip() for one in before) and not blocks[-1][0]:
+        if not any(not row.lstrip().startswith("#") and row.strip() for row in before) and not blocks[-1][0]:
             before += above  # the title of the file
             above = []
         blocks.append((header[1], [*above, line]))
@@ -249,17 +249,17 @@ def _with_entry(text: str, table: str, key: str, entry: Entry) -> str:
         if name != table:
             continue
         header = next((n for n, line in enumerate(lines) if _TABLE.match(line)), -1) if table else -1
-        found = next((n for n, line in enumerate(lines) if (match := _KEY.match(line)) and match[2] == key), None)
-        if found is None and not entry.optional:
+        index = next((n for n, line in enumerate(lines) if (match := _KEY.match(line)) and match[2] == key), None)
+        if index is None and not entry.optional:
             # without a table, above the first key, below the title of the file
             first = next((n for n, line in enumerate(lines) if _KEY.match(line)), len(lines))
             at = _end(lines) if table else first
             lines.insert(at, f"{key} = {entry.value}")
             at = header if table else at
             lines[at:at] = comment
-        elif found is not None:
-            lines[found : _end_of_value(lines, found) + 1] = _replaced(lines, found, f"{key} = {entry.value}")
-            at = header if table else found
+        elif index is not None:
+            lines[index : _end_of_value(lines, index) + 1] = _replaced(lines, index, f"{key} = {entry.value}")
+            at = header if table else index
             lines[at:at] = comment
         return "\n".join(line for _, part in blocks for line in part)
     if entry.optional:
@@ -285,13 +285,13 @@ def _end(lines: list[str]) -> int:
 def _value_and_remark(text: str) -> tuple[str, str]:
     """Return the value of a key and the comment after it; a # in quotes is part of the value."""
     quote = ""
-    for place, letter in enumerate(text):
+    for index, letter in enumerate(text):
         if quote:
             quote = "" if letter == quote else quote
         elif letter in "\"'":
             quote = letter
         elif letter == "#":
-            return text[:place].strip(), text[place + 1 :].strip()
+            return text[:index].strip(), text[index + 1 :].strip()
     return text.strip(), ""
 
 
