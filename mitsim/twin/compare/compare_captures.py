@@ -31,6 +31,7 @@ from scipy.stats import wasserstein_distance
 from characterisation.files.arrays import Floats
 from characterisation.files.atomic_io import json_values
 from characterisation.files.errors import InputError
+from mitsim.capture.calibration import calibration_table
 from mitsim.capture.capture import Capture
 from mitsim.decoding.cloud import Geometry, Settings, capture_geometry
 from mitsim.decoding.matching.stereo import StereoGeometry
@@ -144,7 +145,8 @@ def compare_captures(
     Raises
     ------
     InputError
-        If the simulated capture has another camera, its specimen is at another distance, or the specimen is too small.
+        If the simulated capture has another calibration, its specimen is at another distance, or the specimen is too
+        small.
     """
     _check(real, simulated, where)
     window = contrast_window(real, place)
@@ -155,7 +157,7 @@ def compare_captures(
     ]
     real_patches, simulated_patches = _known_in_both(*seen)
     patches = {"image": len(real_patches.contrast), "cloud": len(real_patches.sigma)}
-    if min(patches.values()) < LEAST_PATCHES or len(simulated_patches.sigma) != len(real_patches.sigma):
+    if min(patches.values()) < LEAST_PATCHES:
         found = f"{min(patches.values())} patches of {PATCH_PX} px on it"
         raise InputError(
             "REAL", "specimen", found, f"{LEAST_PATCHES} or more", "use a larger --window, or a nearer view"
@@ -177,8 +179,6 @@ def _known_in_both(
     real_patches: SpecimenPatches, simulated_patches: SpecimenPatches
 ) -> tuple[SpecimenPatches, SpecimenPatches]:
     """Return both without values of patches that only one capture has, so that medians are over the same patches."""
-    if len(real_patches.sigma) != len(simulated_patches.sigma):
-        return real_patches, simulated_patches
     changes: list[dict[str, Floats]] = [{}, {}]
     for name in ("sigma", "sigma_px", "distance", "row_error"):
         values = getattr(real_patches, name), getattr(simulated_patches, name)
@@ -198,6 +198,10 @@ def _check(real: Capture, simulated: Capture, where: str) -> None:
         raise InputError(where, "camera", found, allowed, "leave SIMULATED out: mitsim then simulates it")
     if simulated.technology != real.technology:
         raise InputError(where, "technology", simulated.technology, f"{real.technology}, as REAL")
+    rig = simulated.rig if real.rig.projector else replace(simulated.rig, projector=None)
+    if calibration_table(rig) != calibration_table(real.rig):  # then patches are not the same pixels
+        allowed, hint = "that of REAL", "leave SIMULATED out: mitsim then simulates it"
+        raise InputError(where, "calibration", "that of another unit", allowed, hint)
 
 
 def _check_place(real_patches: SpecimenPatches, simulated_patches: SpecimenPatches, where: str) -> None:
