@@ -85,7 +85,7 @@ def read_depth_image(
     settings: dict[str, Any] = {"imported_from": path.name}
     if image.dtype.kind == "f":
         invalid = 0 if invalid is None else invalid
-    missing, warnings = _missing(image, invalid or 0)
+    missing, warnings = missing_depths(image, invalid or 0)
     median = 0.0 if missing.all() else float(np.median(image[~missing]))
     in_metres = image.dtype.kind == "f" and median < METRES_UNDER
     scale_mm, invalid, assumed = scale_mm or (1000.0 if in_metres else 1.0), invalid or 0, scale_mm is None
@@ -107,7 +107,7 @@ def read_depth_image(
     return depth_capture(depth, read, path, settings, camera=camera, sensor=sensor)
 
 
-def _missing(image: NDArray[Any], invalid: int) -> tuple[NDArray[np.bool_], list[str]]:
+def missing_depths(image: NDArray[Any], invalid: int = 0) -> tuple[NDArray[np.bool_], list[str]]:
     """Return the pixels (H, W) of an image without a depth, and warnings about those that the user did not name.
 
     These have the level ``invalid`` or 0, no finite number, or less than 0; the largest level of 16 bits; or one level
@@ -193,7 +193,7 @@ def depth_capture(
     """
     height, width = depth.shape
     eye = camera_of(calibrated, camera, (width, height), where)
-    seen = depth[np.isfinite(depth)]
+    seen = depth[~np.isnan(depth)]
     if not seen.size:
         raise InputError(where, "", "no pixel with a depth", "an image with some depths")
     if seen.min() <= 0 or seen.max() > FARTHEST_MM:

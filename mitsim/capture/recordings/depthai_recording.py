@@ -31,6 +31,7 @@ from characterisation.files.checked_files import is_inside
 from characterisation.files.errors import InputError, MissingEnvironmentError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
+from mitsim.capture.recordings.depth_image import missing_depths
 from mitsim.capture.recordings.depthai_calibration import DepthaiCalibration, read_depthai_calibration
 from mitsim.sensor.camera import Camera, Rig, stereo_rectification
 
@@ -212,8 +213,11 @@ def _derived(
     """Return the device's own maps, NaN where it has no value."""
     derived = {}
     if "depth" in frames:
-        depth = frames["depth"].image.astype(np.float32)  # DepthAI: uint16 [mm]
-        derived["depth"] = np.where(depth > 0, depth, np.float32(np.nan))
+        levels = frames["depth"].image  # DepthAI: uint16 [mm]
+        missing, warnings = missing_depths(levels)
+        derived["depth"] = np.where(missing, np.float32(np.nan), levels.astype(np.float32))
+        if warnings:
+            settings["warnings"] = warnings
     if "disparity" in frames:
         frame = frames["disparity"]
         depth_bits = _subpixel_bits(frame, frames.get("depth"), calibration)
@@ -234,7 +238,7 @@ def _subpixel_bits(frame: RecordedFrame, depth: RecordedFrame | None, calibratio
     """Return n for which Z d = f B; None without a depth map of the same pixels, or if no n fits."""
     if depth is None or depth.image.shape != frame.image.shape:
         return None
-    both = (depth.image > 0) & (frame.image > 0) & (depth.image < 65535)
+    both = ~missing_depths(depth.image)[0] & (frame.image > 0)
     if not both.any():
         return None
     product = float(np.median(depth.image[both].astype(float) * frame.image[both]))

@@ -25,6 +25,7 @@ from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_image import read_grey
+from mitsim.capture.recordings.depth_image import missing_depths
 from mitsim.capture.recordings.json_fields import nearest_rotation
 from mitsim.capture.recordings.recording_files import chosen_frame
 from mitsim.sensor.calibration_qualifiers import check_camera
@@ -94,13 +95,16 @@ def read_robi(
     if grey.shape != images["left"].shape[1:] or not unit > 0:
         found = f"{grey.shape[1]} x {grey.shape[0]} pixels of depth, depth_unit {unit:g}"
         raise InputError(files["depth"], "", found, "as many as the left image, and a unit over 0 mm")
-    depth = np.where(grey > 0, grey * np.float32(unit), np.float32(np.nan)).astype(np.float32)
+    missing, warnings = missing_depths(grey)
+    depth = np.where(missing, np.float32(np.nan), grey * np.float32(unit)).astype(np.float32)
     settings: dict[str, Any] = {
         "view": view,
         "files": {name: file.name for name, file in files.items()},
         "projector_on": True,
         "disparity_shift_px": numbers["depth"].get("disparity_shift", 0.0),
     }
+    if warnings:
+        settings["warnings"] = warnings
     depths, decoding = depth[np.isfinite(depth)], Decoding()
     if len(depths):
         near, far = np.percentile(depths, _PERCENTILES)

@@ -23,7 +23,7 @@ from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_bits import bits_of, from_bit_0
 from mitsim.capture.recordings.calibration_file import Calibrated, calibrated_by, camera_of, read_calibration
 from mitsim.capture.recordings.cloud_numbers import leave_out_marks
-from mitsim.capture.recordings.depth_image import depth_capture
+from mitsim.capture.recordings.depth_image import depth_capture, missing_depths
 from mitsim.capture.recordings.organised_cloud import StoredCloud
 from mitsim.capture.recordings.recording_files import chosen_frame
 from mitsim.capture.recordings.ros_bag import RosBag, Topic
@@ -187,11 +187,15 @@ def read_ros_depth(
         raise InputError(where, "depth", "8 bits", "16 bits or floating point")
     recorded = unit_of_depths(bag, topic) if levels.dtype == np.uint16 else None
     scale = scale_mm or recorded or unit
-    depth = levels.astype(np.float32) * np.float32(scale)
-    depth[(levels == (invalid or 0)) | ~np.isfinite(depth)] = np.nan
+    missing, warnings = missing_depths(levels, invalid or 0)
+    with np.errstate(over="ignore"):
+        depth = levels.astype(np.float32) * np.float32(scale)
+    depth[missing] = np.nan
     size = (depth.shape[1], depth.shape[0])
     calibrated = _calibrated(chosen, size, calibration)
     settings: dict[str, Any] = {"imported_from": bag.path.name, "topic": topic.name, "depth_scale_mm": float(scale)}
+    if warnings:
+        settings["warnings"] = warnings
     return depth_capture(depth, calibrated, Path(where), settings | _stamp(message), camera=camera, sensor=sensor)
 
 

@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
@@ -25,6 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.files.errors import InputError
 from mitsim.capture.folder import read_capture, write_capture
+from mitsim.capture.recordings import depthai_recording
 from mitsim.capture.recordings.depthai_calibration import read_depthai_calibration
 from mitsim.capture.recordings.depthai_frames import read_frames
 from mitsim.capture.recordings.depthai_recording import read_depthai_recording
@@ -268,6 +270,24 @@ def test_depth_alone_is_taken_as_it_is_and_says_so(recorded, tmp_path):
     row, column = 20, 50
     x = (column - 32.0) / 55.0 * raw[row, column]
     assert cloud.points[row, column, 0] == pytest.approx(x, rel=1e-6)
+
+
+def test_the_largest_level_of_the_devices_depth_is_no_depth(recorded, monkeypatch):
+    """Before, it was a depth of 65.5 m."""
+    of_files = depthai_recording._read_frames
+
+    def saturated(streams, frame):
+        frames = of_files(streams, frame)
+        levels = frames["depth"].image.copy()
+        levels[20, 50] = 65535
+        return frames | {"depth": replace(frames["depth"], image=levels)}
+
+    monkeypatch.setattr(depthai_recording, "_read_frames", saturated)
+    capture = read_depthai_recording(recorded[0], frame=1)
+    missing = recorded[1]["depth"][1] == 0
+    missing[20, 50] = True
+    np.testing.assert_array_equal(np.isnan(capture.derived["depth"]), missing)
+    assert ["the level 65535" in warning for warning in capture.settings["warnings"]] == [True]
 
 
 def test_how_disparity_is_counted_is_told_or_assumed(recorded, tmp_path):

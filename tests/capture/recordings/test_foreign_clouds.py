@@ -334,6 +334,11 @@ def test_what_is_wrong_with_a_depth_image_is_named(tmp_path):
         read_depth_image(depth_png(tmp_path, good[1:]), pinhole(tmp_path))
     with pytest.raises(InputError, match="only the level 0"):
         read_depth_image(depth_png(tmp_path, good * 0), pinhole(tmp_path))
+    with pytest.raises(InputError, match=r"depth: found 70000 to inf mm; .*check --scale"):
+        far = good.astype(np.float32)
+        far[0, 0] = 1e38  # before, infinity in the capture
+        assert cv2.imwrite(str(tmp_path / "far.tif"), far)
+        read_depth_image(tmp_path / "far.tif", pinhole(tmp_path), scale_mm=100)
     with pytest.raises(InputError, match="--camera: found 'right'; allowed: camera"):
         read_depth_image(depth_png(tmp_path, good), pinhole(tmp_path), camera="right")
     with pytest.raises(InputError, match="no such file"):

@@ -167,6 +167,24 @@ def test_what_is_missing_is_named_all_at_once(tmp_path):
         read_robi(folder)
 
 
+def small_scene(tmp_path: Path, depth) -> Path:
+    """One view with a depth image of its own and blank images; the folder of its sensor."""
+    write_cameras(tmp_path / "cam", "Ensenso", 0.0)
+    folder, blank = tmp_path / "Scene_1" / "Ensenso", np.zeros((HEIGHT, WIDTH), np.uint8)
+    write_view(folder, "view_0", blank, blank, depth, np.eye(4))
+    (folder / "list.txt").write_text("view_0\n")
+    return folder
+
+
+def test_the_largest_level_is_no_depth(tmp_path):
+    """Before, it was the farthest depth."""
+    depth = np.full((HEIGHT, WIDTH), round(DISTANCE / UNIT), np.uint16)
+    depth[7, 9] = 65535
+    capture, _ = read_robi(small_scene(tmp_path, depth))
+    np.testing.assert_array_equal(np.isnan(capture.derived["depth"]), depth == 65535)
+    assert ["the level 65535" in warning for warning in capture.settings["warnings"]] == [True]
+
+
 @pytest.mark.parametrize(
     ("sensor", "focal", "baseline", "shift"),
     [

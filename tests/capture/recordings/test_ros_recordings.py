@@ -73,6 +73,17 @@ def test_files_of_a_split_bag_follow_one_another(tmp_path):
     assert np.nanmax(depth_of(folder, frame="1")) == 2 * depth_mm().max()
 
 
+def test_the_largest_level_is_no_depth(tmp_path):
+    """Before, it was a depth of 65.5 m."""
+    levels = depth_mm().copy()
+    levels[20, 30] = 65535
+    path = bag(tmp_path, [("/a/camera_info", info(ROS2)), ("/a/depth", image(ROS2, levels, "16UC1"))])
+    capture = read_recording(path, ReadOptions()).capture
+    expected = seen(np.where(levels == 65535, 0, levels))
+    np.testing.assert_array_equal(capture.derived["depth"], expected)
+    assert ["the level 65535" in warning for warning in capture.settings["warnings"]] == [True]
+
+
 METRES = depth_mm().astype(np.float32) / 1000
 PREFIX, LEVELS = quantised(METRES)
 
