@@ -53,7 +53,7 @@ def tiff_pages(data: bytes, where: str | Path) -> list[int]:
             if not any(kind & _REDUCED_OR_MASK for kind in kinds):
                 images.append(len(seen) - 1)
             at = following
-    except struct.error:
+    except (struct.error, OverflowError):
         raise InputError(
             where, "", f"a TIFF cut off in page {len(seen) + 1}", "a complete TIFF: copy it again"
         ) from None

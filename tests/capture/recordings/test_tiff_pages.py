@@ -97,6 +97,19 @@ def test_a_reduced_copy_or_a_mask_is_no_page(tmp_path, kind, place):
     np.testing.assert_array_equal(read_grey(tmp_path / "a.tif"), pages_of(2)[1 - place])
 
 
+@pytest.mark.parametrize("field", ["page", "entries", "following page"])
+def test_an_offset_beyond_any_file_is_refused(tmp_path, field):
+    """Before, an OverflowError."""
+    path = stacked(tmp_path / "a.tif", pages_of(1), big=True)
+    data = path.read_bytes()
+    (first,) = struct.unpack_from("<Q", data, 8)
+    (entries,) = struct.unpack_from("<Q", data, first)
+    at = {"page": 8, "entries": first, "following page": first + 8 + 20 * entries}[field]
+    path.write_bytes(data[:at] + bytes([0xFF] * 8) + data[at + 8 :])
+    with pytest.raises(InputError, match="a TIFF cut off in page"):
+        page_count(path)
+
+
 def test_a_damaged_stack_is_refused_or_read_whole(tmp_path):
     """Cut off anywhere, or with any byte of a directory changed: never fewer pages in silence, nor a traceback."""
     path = stacked(tmp_path / "a.tif", pages_of(3)[:, :6, :8])
