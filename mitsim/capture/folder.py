@@ -37,6 +37,7 @@ from mitsim.capture.capture_document import SCHEMA_VERSION, CaptureDocument, Fil
 from mitsim.capture.decoding import read_settings
 from mitsim.capture.npy import decode_npy
 from mitsim.capture.packed_files import SAFE_NAME, check_image, packed
+from mitsim.capture.recordings.json_fields import parsed_json
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.png import Image, decode_png
 from mitsim.sensor.transforms import Transform
@@ -288,10 +289,7 @@ def _parse(data: bytes, where: Path) -> dict[str, Any]:
     def reject(constant: str) -> None:
         raise ValueError(f"{constant} is not a JSON number")
 
-    try:
-        table = json.loads(data.decode(), parse_constant=reject)
-    except (ValueError, RecursionError) as error:
-        raise InputError(where, "", f"text that is not JSON ({error})", "JSON in UTF-8") from None
+    table = parsed_json(data, where, "JSON in UTF-8", reject)
     if not isinstance(table, dict):
         raise InputError(where, "", type(table).__name__, "a JSON object")
     return table

@@ -136,7 +136,7 @@ def _holder(handle: int) -> str:
             f"mitsim {str(about['command'])[:40]} (process {int(about['pid'])} on {str(about['host'])[:80]}, "
             f"since {str(about['since'])[:40]})"
         )
-    except (ValueError, KeyError, TypeError, RecursionError):
+    except (ValueError, KeyError, TypeError, RecursionError, OverflowError):
         return "another mitsim"
 
 

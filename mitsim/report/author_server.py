@@ -107,7 +107,7 @@ class AuthorServer:
             request = json.loads(body)
             sent = request["files"]
             texts = {self.names[key]: str(text) for key, text in sent.items() if key in self.names}
-        except (ValueError, TypeError, KeyError, AttributeError):
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
             return 400, {"fault": "the request does not hold the files of this page"}
         try:
             self._check_texts(texts)

@@ -19,6 +19,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, field_validator
 
+from characterisation.files.checked_files import read_json_object
 from characterisation.files.documents import Document, read_toml
 from characterisation.files.errors import InputError
 from mitsim.capture.folder import write_packed
@@ -243,6 +244,6 @@ def origin_of(scene: Path, sensor: Sensor, parameters: Mapping[str, str]) -> str
 def digest_of(folder: Path, command: str = "many") -> Any:
     """Return the digest of the job whose capture a folder holds; None without a job of ``command``."""
     try:
-        return json.loads((folder / "settings.json").read_text(encoding="utf-8"))[command]["digest"]
-    except (OSError, ValueError, KeyError, TypeError):
+        return read_json_object(folder / "settings.json")[command]["digest"]
+    except (InputError, KeyError, TypeError):
         return None

@@ -13,7 +13,7 @@ import pytest
 
 from characterisation.files.atomic_io import HOST, atomic_write, atomic_write_named, write_folder
 from characterisation.files.errors import InputError
-from mitsim.cli.folder_lock import LOCK, lock_folder, remove_partial, remove_partial_beside
+from mitsim.cli.folder_lock import LOCK, _holder, lock_folder, remove_partial, remove_partial_beside
 from mitsim.study.scoring import score_study
 from tests.shell import mitsim_here
 from tests.small_study import small_study
@@ -48,6 +48,13 @@ def test_a_folder_that_is_held_is_refused_and_a_dead_holder_keeps_nothing(tmp_pa
     release()
     assert list(tmp_path.iterdir()) == []
     lock_folder(tmp_path)()
+
+
+def test_a_lock_of_no_process_is_another_mitsim(tmp_path):
+    """Before, an OverflowError."""
+    (tmp_path / "lock").write_text('{"command": "run", "pid": 1e999, "host": "a", "since": "b"}')
+    with (tmp_path / "lock").open() as stream:
+        assert _holder(stream.fileno()) == "another mitsim"
 
 
 def test_only_left_overs_of_the_dead_are_swept(tmp_path):

@@ -51,6 +51,11 @@ def test_the_command_ends_if_the_page_closes_while_it_saves_and_finishes(closed,
     assert capfd.readouterr().err == ""
 
 
+def test_a_request_nested_too_deep_is_no_request(closed):
+    """Before, a RecursionError."""
+    assert closed[0].save(b"[" * 100_000)[0] == 400
+
+
 def test_the_server_continues_after_a_page_that_closed_while_it_saved(closed, capfd):
     server, thread, gone = closed
     post(server, "save", {"files": {"task": TASK}}).close()

@@ -13,7 +13,7 @@ from mitsim.capture.folder import read_capture
 from mitsim.cli.program import app
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
-from mitsim.study.many_captures import CaptureSettings, ManyFile, read_jobs
+from mitsim.study.many_captures import CaptureSettings, ManyFile, digest_of, read_jobs
 from tests.quick_process import QuickProcess
 from tests.smaller_sensors import coarse_sensor
 
@@ -129,6 +129,12 @@ def test_captures_of_another_plan_are_not_mixed_in(plan, tmp_path, coarse):
     with pytest.raises(InputError, match="neither --position nor --many"):
         CliRunner().invoke(app, ["render", str(SCENE), "-o", "x"], standalone_mode=False, catch_exceptions=False)
     assert files(tmp_path / "out") == before
+
+
+def test_a_folder_with_json_nested_too_deep_holds_no_job(tmp_path):
+    """Before, a RecursionError."""
+    (tmp_path / "settings.json").write_text("[" * 100_000)
+    assert digest_of(tmp_path) is None
 
 
 def test_a_worker_gives_the_same_capture(plan, coarse):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,21 @@ from characterisation.files.errors import InputError
 from mitsim.sensor.transforms import is_rotation
 
 
-def parsed_json(data: bytes, where: str | Path, expected: str) -> Any:
-    """Return the value of a JSON text in UTF-8, in which NaN and infinity are null; messages say what is ``expected``.
+def parsed_json(
+    data: bytes, where: str | Path, expected: str, constant: Callable[[str], Any] = lambda name: None
+) -> Any:
+    """Return the value of a JSON text in UTF-8.
+
+    Parameters
+    ----------
+    data
+        The text.
+    where
+        File that messages name.
+    expected
+        What it should be, for messages.
+    constant
+        Returns the value of ``NaN`` and of the infinities, which JSON does not have; by default null.
 
     Raises
     ------
@@ -23,7 +37,7 @@ def parsed_json(data: bytes, where: str | Path, expected: str) -> Any:
         If it is not JSON.
     """
     try:
-        return json.loads(data.decode("utf-8-sig"), parse_constant=lambda _: None)
+        return json.loads(data.decode("utf-8-sig"), parse_constant=constant)
     except (ValueError, RecursionError) as error:
         raise InputError(where, "", f"text that is not JSON ({error})", expected) from None
 

@@ -7,7 +7,6 @@ order, such as a pose or a transform of ROS, which are in metres.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from characterisation.files.checked_files import read_bounded
 from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
 from mitsim.capture.calibration import PoseDocument
+from mitsim.capture.recordings.json_fields import parsed_json
 from mitsim.sensor.calibration_numbers import vector
 from mitsim.sensor.calibration_qualifiers import UNIT_NAMES, unit_mm
 from mitsim.sensor.calibration_quaternions import ORDERED, with_rotations
@@ -50,10 +50,7 @@ def read_pose(file: str | Path) -> tuple[Transform, NDArray[np.float64] | None]:
     data = read_bounded(file, "a pose")
     text = data.decode("utf-8", errors="replace").strip()
     if text.startswith(("{", "[")):
-        try:
-            table = json.loads(text)
-        except (ValueError, RecursionError) as error:
-            raise InputError(file, "", f"text that is not JSON ({error})", _WANTED) from None
+        table = parsed_json(data, file, _WANTED)
         table = {"world_from_sensor": table} if isinstance(table, list) else table
     elif ":" in text:
         table, *more = read_yaml(file, data, _WANTED)

@@ -13,7 +13,7 @@ is assumed to be in mm.
 
 from __future__ import annotations
 
-import json
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_image import read_grey
 from mitsim.capture.recordings.depth_image import missing_depths
-from mitsim.capture.recordings.json_fields import nearest_rotation
+from mitsim.capture.recordings.json_fields import JsonFields, nearest_rotation, parsed_json
 from mitsim.capture.recordings.recording_files import chosen_frame
 from mitsim.sensor.calibration_qualifiers import check_camera
 from mitsim.sensor.camera import Camera, Rectification, Rig
@@ -43,6 +43,9 @@ _WIDER = 0.15
 
 #: tolerance on the orthogonality of a rotation stored with few digits
 _RIGID = 1e-3
+
+#: largest number of a camera file; chosen
+_LARGEST = 1e9
 
 
 def is_robi(folder: Path) -> bool:
@@ -95,8 +98,8 @@ def read_robi(
     if grey.shape != images["left"].shape[1:] or not unit > 0:
         found = f"{grey.shape[1]} x {grey.shape[0]} pixels of depth, depth_unit {unit:g}"
         raise InputError(files["depth"], "", found, "as many as the left image, and a unit over 0 mm")
-    missing, warnings = missing_depths(grey)
-    depth = np.where(missing, np.float32(np.nan), grey * np.float32(unit)).astype(np.float32)
+    without_depth, warnings = missing_depths(grey)
+    depth = np.where(without_depth, np.float32(np.nan), grey * np.float32(unit)).astype(np.float32)
     settings: dict[str, Any] = {
         "view": view,
         "files": {name: file.name for name, file in files.items()},
@@ -144,12 +147,12 @@ def _numbers(path: Path) -> dict[str, float]:
     """Return the plain numbers of a file of ``key: number`` lines; lists and comments are skipped."""
     out = {}
     for line in read_bounded(path).decode("utf-8", "replace").splitlines():
-        key, mark, value = line.partition("#")[0].partition(":")
-        try:
-            if mark:
-                out[key.strip()] = float(value)
-        except ValueError:
-            continue
+        key, _, value = line.partition("#")[0].partition(":")
+        with suppress(ValueError):
+            out[key.strip()] = float(value)
+    wrong = next((key for key, number in out.items() if not abs(number) <= _LARGEST), None)
+    if wrong is not None:
+        raise InputError(path, wrong, f"{out[wrong]:g}", f"a number up to {_LARGEST:g}")
     return out
 
 
@@ -191,11 +194,11 @@ def _image(path: Path, camera: Camera) -> NDArray[np.uint8]:
 
 def _pose(path: Path) -> Transform:
     """Return the pose of the camera in the world, ``cam_pose``."""
-    try:
-        matrix = np.array(json.loads(read_bounded(path))["cam_pose"], float).reshape(4, 4)
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(path, "cam_pose", f"invalid data ({error!r})", "16 numbers, rows first") from None
-    turn = nearest_rotation(matrix[:3, :3], _RIGID) if np.isfinite(matrix).all() else None
+    fields = JsonFields(parsed_json(read_bounded(path), path, "the pose of a view in JSON"), path)
+    rows = fields.get("cam_pose")
+    by_rows = isinstance(rows, list) and len(rows) == 4
+    matrix = fields.numbers("cam_pose", (4, 4) if by_rows else (16,)).reshape(4, 4)
+    turn = nearest_rotation(matrix[:3, :3], _RIGID)
     if turn is None:
         raise InputError(path, "cam_pose", "a matrix that is not a rigid motion", "a rotation and a translation")
     return Transform(turn, matrix[:3, 3])

@@ -11,7 +11,6 @@ A file that is damaged, or whose content belongs to another finish, is made agai
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import tempfile
@@ -19,7 +18,7 @@ import time
 from pathlib import Path
 
 from characterisation.files.atomic_io import write_json
-from characterisation.files.checked_files import is_file
+from characterisation.files.checked_files import is_file, read_json_object
 from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from mitsim.capture.simulated.simulate import SimulatedSensor
@@ -120,12 +119,9 @@ def keep_rate(sensor: str, seconds: float) -> None:
 
 
 def _rates() -> dict[str, float]:
-    path = cache_folder() / "rates.json"
     try:
-        stored = json.loads(path.read_text(encoding="utf-8")) if is_file(path) else {}
-    except (OSError, ValueError):
-        return {}
-    if not isinstance(stored, dict):
+        stored = read_json_object(cache_folder() / "rates.json")
+    except InputError:
         return {}
     return {
         str(name): float(rate)

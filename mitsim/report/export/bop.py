@@ -30,6 +30,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 
 from characterisation.files.atomic_io import atomic_folder
+from characterisation.files.checked_files import read_json_object
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.capture.capture import Capture
@@ -91,11 +92,12 @@ def find_sources(folder: str | Path) -> list[Source]:
     """
     sources = []
     for path in sorted(Path(folder).glob("*/view_*/settings.json")):
+        settings = read_json_object(path)
         try:
-            many = json.loads(path.read_text(encoding="utf-8"))["many"]
+            many = settings["many"]
             scene, view = Path(many["scene"]), int(many["view"])
             sources.append(Source(path.parent, str(many["finish"]), view, scene, dict(many["parameters"])))
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, OverflowError) as error:
             allowed = "a capture taken by mitsim render --many"
             raise InputError(path, "many", f"unreadable data ({error})", allowed) from None
         if not scene.is_file():

@@ -186,6 +186,34 @@ def test_the_largest_level_is_no_depth(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("pose", "told"),
+    [
+        ("[" * 100_000, "found text that is not JSON"),
+        ('{"cam_pose": [' + "9, " * 15 + "1" + "0" * 400 + "]}", "cam_pose: found .*; allowed: 16 finite numbers"),
+        ('{"cam_pose": [NaN, 0, 0, 0]}', "cam_pose: found .*; allowed: 4 x 4 finite numbers"),
+        ("[]", "cam_pose: found nothing"),
+    ],
+)
+def test_a_pose_that_is_none_is_refused(tmp_path, pose, told):
+    """Before, a RecursionError and an OverflowError."""
+    folder = small_scene(tmp_path, np.ones((HEIGHT, WIDTH), np.uint16))
+    (folder / "Depth" / "DEPTH_view_0.json").write_text(pose)
+    with pytest.raises(InputError, match=f"DEPTH_view_0.json: {told}"):
+        read_robi(folder)
+
+
+@pytest.mark.parametrize("number", ["nan", "inf", "-inf"])
+@pytest.mark.parametrize("key", ["width", "fx", "disparity_shift"])
+def test_numbers_of_cameras_are_finite(tmp_path, key, number):
+    """Before, a ValueError of the width, and others in the rig."""
+    folder = small_scene(tmp_path, np.ones((HEIGHT, WIDTH), np.uint16))
+    table = tmp_path / "cam" / f"Ensenso_{'DEPTH' if key == 'disparity_shift' else 'LEFT'}.yml"
+    table.write_text(f"{table.read_text()}\n{key}: {number}\n")
+    with pytest.raises(InputError, match=f"{table.name}: {key}: found {float(number):g}; allowed: a number up to"):
+        read_robi(folder)
+
+
+@pytest.mark.parametrize(
     ("sensor", "focal", "baseline", "shift"),
     [
         ("Ensenso", 1083.097, 101.184, 0.0),

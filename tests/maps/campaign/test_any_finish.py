@@ -293,8 +293,9 @@ def test_expected_time_is_that_of_this_machine_once_it_is_known(quick, n10):
     cache_folder().mkdir(parents=True)
     finish_cache.keep_rate(n10.name, 3 * usual)
     assert finish_cache.expected_seconds(one) == pytest.approx(3 * usual, abs=0.1)
-    (cache_folder() / "rates.json").write_text("[]")
-    assert finish_cache.expected_seconds(one) == usual
+    for text in ("[]", "[" * 100_000):  # before, a RecursionError
+        (cache_folder() / "rates.json").write_text(text)
+        assert finish_cache.expected_seconds(one) == usual
     assert finish_cache.expected_seconds(replace(one, finish=finish_of(**MILLED, lay="u"))) == 4 * usual
 
 

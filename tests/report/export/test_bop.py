@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.cli.program import app
-from mitsim.report.export.bop import depth_scale, on_pinhole
+from mitsim.report.export.bop import depth_scale, find_sources, on_pinhole
 from tests.report.export.test_export_command import export
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -176,6 +176,18 @@ def test_what_cannot_be_exported_is_told(data_set, tmp_path):
     with pytest.raises(InputError, match="train, val or test"):
         export("bop", data_set / "captures", "--split", "all", "-o", tmp_path / "data")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [("[" * 100_000, "not JSON"), ('{"many": {"scene": "a", "view": 1e999}}', "many: found unreadable")],
+)
+def test_settings_that_are_not_of_many_captures_are_refused(tmp_path, text, told):
+    """Before, a RecursionError and an OverflowError."""
+    (tmp_path / "cast/view_0001").mkdir(parents=True)
+    (tmp_path / "cast/view_0001/settings.json").write_text(text)
+    with pytest.raises(InputError, match=told):
+        find_sources(tmp_path)
 
 
 def test_a_lens_that_bends_is_taken_out():
