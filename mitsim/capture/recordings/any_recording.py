@@ -22,7 +22,7 @@ from mitsim.capture.recordings.array_file import map_in
 from mitsim.capture.recordings.depth_image import read_depth_image
 from mitsim.capture.recordings.depthai_recording import calibration_beside, read_depthai_recording, recorded_streams
 from mitsim.capture.recordings.ensenso import ensenso_originals, image_sets, read_ensenso
-from mitsim.capture.recordings.image_folder import read_image_folder, size_of_images
+from mitsim.capture.recordings.image_folder import at_size_of_images, read_image_folder
 from mitsim.capture.recordings.organised_cloud import Axes, StoredCloud, read_organised_cloud
 from mitsim.capture.recordings.pose_file import read_pose
 from mitsim.capture.recordings.recognise import NAMES, kind_of
@@ -117,7 +117,8 @@ def _read_images(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, b
             "the rig that took them: --sensor my.toml",
             "for a plain stereo pair --calibration suffices",
         )
-    rig = load_sensor(options.sensor, "decoding", size_of_images(path))
+    source = options.sensor
+    rig = at_size_of_images(path, lambda size: load_sensor(source, "decoding", size))
     if options.images:
         rig = replace(rig, images={**(rig.images or {}), **options.images})
     capture = read_image_folder(path, rig, channel_of(options.channel))

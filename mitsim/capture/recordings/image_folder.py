@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -38,6 +38,8 @@ from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.light_code import LightCode, roles
 from mitsim.sensor.projector_images import ProjectorImages, counted, described
 from mitsim.sensor.sensor import Sensor
+
+Read = TypeVar("Read")
 
 
 def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNELS["green"]) -> Capture:
@@ -123,17 +125,38 @@ def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNEL
     )
 
 
-def size_of_images(folder: Path) -> tuple[int, int] | None:
-    """Return width and height [px] of the first readable image in a folder or its subfolders; None without one."""
-    if not folder.is_dir():
-        return None
+def at_size_of_images(folder: Path, read: Callable[[tuple[int, int] | None], Read]) -> Read:
+    """Return what ``read`` makes of the size (width, height) [px] of a folder's images; of None without images.
+
+    The first size that it accepts counts, since a thumbnail or a picture of the rig may be among the images.
+
+    Raises
+    ------
+    InputError
+        If it accepts none: its error for the largest.
+    """
+    faults: dict[tuple[int, int], InputError] = {}
+    for size in _sizes(folder):
+        try:
+            return read(size)
+        except InputError as error:
+            faults[size] = error
+    if faults:
+        raise faults[max(faults)]
+    return read(None)
+
+
+def _sizes(folder: Path) -> Iterator[tuple[int, int]]:
+    """Yield the size of an image in a folder or its subfolders, for each group of names alike but for their numbers."""
+    groups = set[str]()
     for pattern in ("*", "*/*"):
         for path in sorted(folder.glob(pattern), key=counted):
-            if path.suffix.lower() in SUFFIXES and path.is_file():
+            group = re.sub(r"\d+", "", str(path))
+            if group not in groups and path.suffix.lower() in SUFFIXES and path.is_file():
                 with suppress(InputError):
                     image = next(read_pages(path, channel=CHANNELS["green"]))
-                    return image.shape[1], image.shape[0]
-    return None
+                    groups.add(group)
+                    yield image.shape[1], image.shape[0]
 
 
 def _files(folder: Path, sensor: Sensor, camera: str, cameras: int) -> list[Path]:

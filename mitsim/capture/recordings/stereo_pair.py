@@ -17,7 +17,7 @@ from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_bits import bits_of, from_bit_0
 from mitsim.capture.grey_image import CHANNELS, SUFFIXES, channel_name, is_colour, read_grey
 from mitsim.capture.recordings.calibration_file import camera_of, read_calibration
-from mitsim.capture.recordings.image_folder import size_of_images
+from mitsim.capture.recordings.image_folder import at_size_of_images
 from mitsim.capture.recordings.recording_files import chosen_frame, frame_of
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.projector_images import counted
@@ -67,7 +67,7 @@ def read_stereo_pair(
     pair_files : the images of one camera
     """
     folder = Path(folder)
-    calibrated = read_calibration(calibration, size_of_images(folder))
+    calibrated = at_size_of_images(folder, lambda size: read_calibration(calibration, size))  # for the names alone
     names = list(calibrated.rig.cameras)[:2]
     if len(names) < 2 or calibrated.unrelated:
         stated = f"{', '.join(names)}{', without the pose of the second' if calibrated.unrelated else ''}"

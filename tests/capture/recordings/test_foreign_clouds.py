@@ -449,6 +449,20 @@ def test_a_stereo_pair_and_opencvs_calibration_measure_a_plane(tmp_path, rng):
         read_stereo_pair(tmp_path / "pair", calibration)
 
 
+def test_a_thumbnail_beside_a_pair_does_not_count(tmp_path):
+    """Before, a calibration without a size was checked with that of the thumbnail."""
+    (tmp_path / "pair").mkdir()
+    for name, shape in (("a_preview", (12, 20)), ("left_0", (120, 200)), ("right_0", (120, 200))):
+        depth_png(tmp_path / "pair", np.full(shape, 90, np.uint8), f"{name}.png")
+    calibration = save(tmp_path / "stereo.yml", STEREO.replace("image_size: [200, 120]\n", "").encode())
+    capture = read_stereo_pair(tmp_path / "pair", calibration)
+    assert capture.images["left"].shape == (1, 120, 200)
+    assert (capture.rig.reference.width, capture.rig.reference.height) == (200, 120)
+    wrong = save(tmp_path / "wrong.yml", calibration.read_bytes().replace(b"300., 0., 100.", b"300., 0., 9000."))
+    with pytest.raises(InputError, match=r"wrong\.yml: .*principal"):
+        read_stereo_pair(tmp_path / "pair", wrong)
+
+
 @pytest.mark.parametrize(
     ("order", "told"),
     [

@@ -15,7 +15,7 @@ import pytest
 from characterisation.files.errors import InputError
 from mitsim.capture.grey_image import page_count, read_grey, read_pages
 from mitsim.capture.recordings.depth_image import read_depth_image
-from mitsim.capture.recordings.image_folder import read_image_folder, size_of_images
+from mitsim.capture.recordings.image_folder import at_size_of_images, read_image_folder
 from mitsim.capture.recordings.stereo_pair import read_stereo_pair
 from tests.capture.recordings.test_image_folder import rig, save, see_plane
 
@@ -49,7 +49,7 @@ def test_a_stack_of_a_rig_is_that_of_single_files(tmp_path):
     for folder in ("some", "all"):
         capture = read_image_folder(tmp_path / folder, sensor)
         np.testing.assert_array_equal(capture.images["camera"], images)
-        assert size_of_images(tmp_path / folder) == (64, 48)
+        assert at_size_of_images(tmp_path / folder, lambda size: size) == (64, 48)
     assert capture.settings["files"]["camera"][1] == f"stack.tif, page 2 of {len(images)}"
 
 
