@@ -19,9 +19,7 @@ import numpy as np
 
 from characterisation.files.errors import InputError, nearest
 from mitsim.capture.capture import Capture
-from mitsim.capture.decoding import Decoding
-from mitsim.capture.grey_bits import bits_of, from_bit_0
-from mitsim.capture.recordings.calibration_file import Calibrated, calibrated_by, camera_of, read_calibration
+from mitsim.capture.recordings.calibration_file import Calibrated, calibrated_by, read_calibration
 from mitsim.capture.recordings.cloud_numbers import leave_out_marks
 from mitsim.capture.recordings.depth_image import depth_capture, missing_depths
 from mitsim.capture.recordings.organised_cloud import StoredCloud
@@ -42,7 +40,7 @@ from mitsim.capture.recordings.ros_messages import (
     read_message,
     unit_of_depths,
 )
-from mitsim.sensor.camera import Rig
+from mitsim.capture.recordings.stereo_pair import names_of_pair, pair_capture
 
 
 @dataclass(frozen=True)
@@ -235,37 +233,14 @@ def read_ros_pair(
     number = chosen_frame(frame, left.count, bag.path, f"messages of {left.name}")
     first = read_message(bag, left, number)
     second = _of_same_time(bag, right, first, number)
-    images = [
-        grey_of(message, label_of(topic, bag.path), channel) for topic, message in ((left, first), (right, second))
-    ]
+    places = [label_of(topic, bag.path) for topic in chosen.topics]
+    images = [grey_of(message, place, channel) for message, place in zip((first, second), places, strict=True)]
     size = (images[0].shape[1], images[0].shape[0])
     calibrated = _calibrated(chosen, size, calibration)
-    names = list(calibrated.rig.cameras)[:2]
-    if len(names) < 2:
-        raise InputError(calibration or bag.path, "cameras", ", ".join(names), "two cameras: a stereo pair")
-    for name, image, topic in zip(names, images, chosen.topics, strict=True):
-        where = label_of(topic, bag.path)
-        camera_of(calibrated, name, (image.shape[1], image.shape[0]), where)
-        if image.dtype != images[0].dtype:
-            raise InputError(where, "depth", f"{8 * image.itemsize} bits", f"{8 * images[0].itemsize}, as the left")
+    names = names_of_pair(calibrated, calibration or bag.path)
     settings: dict[str, Any] = {"imported_from": bag.path.name, "topic": [left.name, right.name]} | _stamp(first)
-    if calibrated.notes:
-        settings["warnings"] = list(calibrated.notes)
-    shown, empty = from_bit_0(dict(zip(names, images, strict=True)))
-    if empty:
-        settings["empty_bits"] = empty
-    near, far = calibrated.range_mm or (None, None)
-    rig = calibrated.rig
-    return Capture(
-        sensor=sensor or calibrated.sensor or "stereo-pair",
-        technology="active_stereo",
-        source="device",
-        rig=Rig({name: rig.cameras[name] for name in names}, rig.projector, rig.rectification),
-        images={name: image[None] for name, image in shown.items()},
-        bits=bits_of(shown.values()),
-        decoding=Decoding(near_mm=near, far_mm=far),
-        settings=settings,
-    )
+    levels, labels = dict(zip(names, images, strict=True)), dict(zip(names, places, strict=True))
+    return pair_capture(levels, labels, calibrated, settings, sensor)
 
 
 def _of_same_time(bag: RosBag, topic: Topic, first: Any, number: int) -> Any:

@@ -6,6 +6,7 @@ green channel of colour images -> capture for the matcher.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,8 @@ from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_bits import bits_of, from_bit_0
-from mitsim.capture.grey_image import CHANNELS, SUFFIXES, channel_name, is_colour, read_grey
-from mitsim.capture.recordings.calibration_file import camera_of, read_calibration
+from mitsim.capture.grey_image import CHANNELS, SUFFIXES, Image, channel_name, is_colour, read_grey
+from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
 from mitsim.capture.recordings.image_folder import at_size_of_images
 from mitsim.capture.recordings.recording_files import chosen_frame, frame_of
 from mitsim.sensor.camera import Rig
@@ -68,11 +69,7 @@ def read_stereo_pair(
     """
     folder = Path(folder)
     calibrated = at_size_of_images(folder, lambda size: read_calibration(calibration, size))  # for the names alone
-    names = list(calibrated.rig.cameras)[:2]
-    if len(names) < 2 or calibrated.unrelated:
-        stated = f"{', '.join(names)}{', without the pose of the second' if calibrated.unrelated else ''}"
-        hint = "; ".join([*calibrated.notes, _POSE])
-        raise InputError(calibration, "cameras", stated, "two cameras with R and T: a stereo pair", hint)
+    names = names_of_pair(calibrated, calibration)
     files = {name: pair_files(folder, name, (images or {}).get(name)) for name in names}
     counts = [len(paths) for paths in files.values()]
     if counts[0] != counts[1] or counts[0] == 0:
@@ -85,26 +82,77 @@ def read_stereo_pair(
     chosen = {name: paths[number] for name, paths in files.items()}
     levels = {name: read_grey(file, channel=channel) for name, file in chosen.items()}
     first = levels[names[0]]
-    size = (first.shape[1], first.shape[0])
-    read = read_calibration(calibration, size)
-    for name, image in levels.items():
-        camera_of(read, name, (image.shape[1], image.shape[0]), chosen[name])
-        if image.dtype != first.dtype:
-            raise InputError(chosen[name], "depth", f"{8 * image.itemsize} bits", f"{8 * first.itemsize}, as the left")
+    read = read_calibration(calibration, (first.shape[1], first.shape[0]))
     settings: dict[str, Any] = {"files": {name: file.name for name, file in chosen.items()}}
     if is_colour(chosen[names[0]]):
         settings["channel"] = channel_name(channel)
-    if read.notes:
-        settings["warnings"] = list(read.notes)
+    return pair_capture(levels, chosen, read, settings, sensor)
+
+
+def names_of_pair(calibrated: Calibrated, where: str | Path) -> list[str]:
+    """Return the names of the left and the right camera of a calibration, which messages name ``where``.
+
+    Raises
+    ------
+    InputError
+        If it is not that of a pair.
+    """
+    names = list(calibrated.rig.cameras)[:2]
+    if len(names) < 2 or calibrated.unrelated:
+        stated = f"{', '.join(names)}{', without the pose of the second' if calibrated.unrelated else ''}"
+        hint = "; ".join([*calibrated.notes, _POSE])
+        raise InputError(where, "cameras", stated, "two cameras with R and T: a stereo pair", hint)
+    return names
+
+
+def pair_capture(
+    levels: Mapping[str, Image],
+    places: Mapping[str, str | Path],
+    calibrated: Calibrated,
+    settings: dict[str, Any],
+    sensor: str | None = None,
+) -> Capture:
+    """Return the capture of a stereo pair.
+
+    Parameters
+    ----------
+    levels
+        Images (H, W) [DN] by name of their camera, the left one first.
+    places
+        File or topic of each, for messages.
+    calibrated
+        The cameras.
+    settings
+        Records of the import.
+    sensor
+        Name of the sensor; by default that of the calibration, or ``stereo-pair``.
+
+    Raises
+    ------
+    InputError
+        If the size of an image differs from its camera's, or its type from that of the left one.
+
+    See Also
+    --------
+    read_stereo_pair : of a folder
+    """
+    first = next(iter(levels.values()))
+    for name, image in levels.items():
+        camera_of(calibrated, name, (image.shape[1], image.shape[0]), places[name])
+        if image.dtype != first.dtype:
+            raise InputError(places[name], "depth", f"{8 * image.itemsize} bits", f"{8 * first.itemsize}, as the left")
+    if calibrated.notes:
+        settings["warnings"] = list(calibrated.notes)
     shown, empty = from_bit_0(dict(levels))
     if empty:
         settings["empty_bits"] = empty
-    near, far = read.range_mm or (None, None)
+    near, far = calibrated.range_mm or (None, None)
+    rig = calibrated.rig
     return Capture(
-        sensor=sensor or read.sensor or "stereo-pair",
+        sensor=sensor or calibrated.sensor or "stereo-pair",
         technology="active_stereo",
         source="device",
-        rig=Rig({name: read.rig.cameras[name] for name in names}, read.rig.projector, read.rig.rectification),
+        rig=Rig({name: rig.cameras[name] for name in levels}, rig.projector, rig.rectification),
         images={name: np.asarray(image)[None] for name, image in shown.items()},
         bits=bits_of(shown.values()),
         decoding=Decoding(near_mm=near, far_mm=far),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -242,6 +244,15 @@ def test_a_pair_of_two_times_or_without_a_baseline_is_refused(tmp_path):
         read_recording(write_bag(tmp_path / "a", pair(ROS2, 1.1), "mcap"), ReadOptions(topic=names))
     with pytest.raises(InputError, match="without a baseline"):
         read_recording(write_bag(tmp_path / "b", pair(ROS2, baseline_m=0), "mcap"), ReadOptions(topic=names))
+
+
+def test_a_calibration_of_two_single_cameras_is_none_of_a_pair(tmp_path):
+    """Before, both images were of one place."""
+    eyes = {name: {"K": [[60, 0, x], [0, 61, 22.8], [0, 0, 1]]} for name, x in (("one", 31.3), ("other", 33.3))}
+    (tmp_path / "eyes.json").write_text(json.dumps(eyes))
+    options = ReadOptions(topic=("/l/image_rect_raw", "/r/image_rect_raw"), calibration=str(tmp_path / "eyes.json"))
+    with pytest.raises(InputError, match="one, other, without the pose of the second; allowed: two cameras"):
+        read_recording(bag(tmp_path, pair(ROS2)), options)
 
 
 def test_several_topics_are_listed_and_one_is_chosen(tmp_path):
