@@ -8,14 +8,13 @@ A kind is one entry of :data:`KINDS`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from characterisation.files.checked_files import read_bounded
-from characterisation.files.errors import InputError, MissingEnvironmentError, nearest
+from characterisation.files.errors import InputError, nearest
 from mitsim.capture.capture import Capture
 from mitsim.capture.grey_image import channel_of
 from mitsim.capture.recordings.array_file import map_in
@@ -26,7 +25,7 @@ from mitsim.capture.recordings.image_folder import at_size_of_images, read_image
 from mitsim.capture.recordings.organised_cloud import Axes, StoredCloud, read_organised_cloud
 from mitsim.capture.recordings.pose_file import read_pose
 from mitsim.capture.recordings.recognise import NAMES, kind_of
-from mitsim.capture.recordings.recording_files import frame_of, plain_name
+from mitsim.capture.recordings.recording_files import frame_of, needs_recordings, plain_name
 from mitsim.capture.recordings.robi import read_robi
 from mitsim.capture.recordings.stereo_pair import read_stereo_pair
 from mitsim.sensor.calibration_qualifiers import LENGTHS_MM
@@ -201,7 +200,7 @@ def _read_depthai(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, 
 
 
 def _read_ros(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
-    with _needs_recordings(path, "a bag of ROS"):
+    with needs_recordings(path, "a bag of ROS"):
         from mitsim.capture.recordings import ros_bag, ros_recording
     bag = ros_bag.open_bag(path)
     chosen = ros_recording.chosen_topics(bag, options.topic or ())
@@ -230,17 +229,6 @@ def _read_ros(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, byte
     messages = {f"{plain_name(topic.name.strip('/').replace('/', '_'))}_{number}.msg": topic for topic in chosen.topics}
     kept = {name: bag.message(topic.name, number) for name, topic in messages.items() if number < topic.count}
     return capture, kept | _originals(_file_of(options.cameras))
-
-
-@contextmanager
-def _needs_recordings(path: Path, kind: str) -> Iterator[None]:
-    """Say which packages a recording needs if they are not installed."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        raise MissingEnvironmentError(
-            f"{path}: {kind} needs packages that are not installed ({error.name}): pip install 'mitsim[recordings]'"
-        ) from None
 
 
 def _read_robi(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:

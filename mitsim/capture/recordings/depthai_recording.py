@@ -28,11 +28,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.checked_files import is_inside
-from characterisation.files.errors import InputError, MissingEnvironmentError
+from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.capture.recordings.depth_image import missing_depths
 from mitsim.capture.recordings.depthai_calibration import DepthaiCalibration, read_depthai_calibration
+from mitsim.capture.recordings.recording_files import needs_recordings
 from mitsim.sensor.camera import Camera, Rig, stereo_rectification
 
 if TYPE_CHECKING:
@@ -163,13 +164,8 @@ def read_depthai_recording(
 
 def _read_frames(streams: dict[str, Path], frame: int | None) -> dict[str, RecordedFrame]:
     """Return the frames of the streams; only here are the packages of the extra ``recordings`` imported."""
-    try:
+    with needs_recordings(next(iter(streams.values())), "a recording of DepthAI"):
         from mitsim.capture.recordings.depthai_frames import read_frames
-    except ModuleNotFoundError as error:
-        raise MissingEnvironmentError(
-            f"{next(iter(streams.values()))}: a recording of DepthAI needs packages that are not installed "
-            f"({error.name}): pip install 'mitsim[recordings]'"
-        ) from None
     return read_frames(streams, frame)
 
 

@@ -11,11 +11,12 @@ import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
 from characterisation.files.checked_files import LARGEST_FILE, is_inside, read_bounded
-from characterisation.files.errors import InputError
+from characterisation.files.errors import InputError, MissingEnvironmentError
 
 #: first and last bytes of an MCAP file (mcap.dev/spec)
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -98,6 +99,17 @@ def recorded_files(path: Path, names: Iterable[str]) -> dict[str, bytes]:
     except (*_DAMAGED, KeyError) as error:
         raise _damaged(path, error) from None
     return out
+
+
+@contextmanager
+def needs_recordings(path: Path, kind: str) -> Iterator[None]:
+    """Say which packages a recording needs if they are not installed."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise MissingEnvironmentError(
+            f"{path}: {kind} needs packages that are not installed ({error.name}): pip install 'mitsim[recordings]'"
+        ) from None
 
 
 def plain_name(name: str) -> str:
