@@ -28,7 +28,7 @@ def capture(
 
     Example: mitsim capture --device ensenso:150358 --repeats 20 -o captures/sheet
     """
-    from mitsim.capture.devices.maker_captures import open_device
+    from mitsim.capture.devices.maker_captures import device_capture, open_device
     from mitsim.capture.folder import write_capture
 
     table = device_table(device, settings)
@@ -37,7 +37,7 @@ def capture(
     first = max(taken_before, default=-1) + 1
     with open_device(table) as camera:
         for number in track(range(first, first + repeats), "capture", repeats):
-            taken = camera.take()
+            taken = device_capture(camera.take())
             folder = write_capture(taken.capture, output / f"{number:04d}", vendor=taken.originals)
             print(folder)
     say(f"captures: {output}")

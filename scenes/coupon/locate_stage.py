@@ -10,7 +10,7 @@ import numpy as np
 
 from characterisation.files.documents import read_toml
 from characterisation.stage.calibration import axis_deviations, calibrate_with_board, calibration_angles
-from mitsim.capture.devices.maker_captures import open_device
+from mitsim.capture.devices.maker_captures import device_capture, open_device
 from mitsim.capture.devices.stage import open_stage
 from mitsim.capture.devices.stage_connection import StageConnection
 from mitsim.cli.devices import device_table
@@ -27,7 +27,7 @@ with open_device(device) as camera, open_stage(connection) as stage:
     stage.home()
     for angles in np.degrees(calibration_angles(np.radians([[-35, 35], [-30, 25]]), 5)):
         read.append(np.radians(stage.move(angles)))  # the angles that the stage reports, not the requested ones
-        capture = camera.take().capture
+        capture = device_capture(camera.take()).capture
         corners, ids, _, _ = detector.detectBoard(capture.images["left"][0])
         pose = np.full((4, 4), np.nan)  # where the board is not seen
         if ids is not None and len(ids) >= 8:

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import timedelta
 from importlib import import_module
@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 
 from characterisation.files.errors import MissingEnvironmentError
 from mitsim.capture.devices.depthai_settings import DepthaiSettings, configuration, configure
-from mitsim.capture.devices.device_error import DeviceError, check_open
+from mitsim.capture.devices.device_error import DeviceError
+from mitsim.capture.devices.live_camera import LiveCamera
 
 Image = NDArray[np.unsignedinteger[Any]]
 
@@ -52,14 +53,13 @@ class DepthaiShot:
     serial: str
 
 
-class DepthaiCamera:
+class DepthaiCamera(LiveCamera):
     """An open camera; a context manager that switches its light off and closes it."""
 
     def __init__(self, settings: DepthaiSettings, identifier: str, dai: Any) -> None:
         self.where, self.settings = f"camera depthai{':' + identifier if identifier else ''}", settings
         self._dai, self._device, self._pipeline = dai, None, None
-        self._fault, self._closed = "", False
-        with self._light_off_on_error("open"):
+        with self._closed_on_error("open"):
             self._device = dai.Device(dai.DeviceInfo(identifier)) if identifier else dai.Device()
             self._pipeline = dai.Pipeline(self._device)
             stereo = stereo_pipeline(self._pipeline, settings, dai)
@@ -82,7 +82,7 @@ class DepthaiCamera:
         DeviceError
             If the camera fails; its light is switched off before the error is raised.
         """
-        with self._light_off_on_error("capture"):
+        with self._closed_on_error("capture"):
             newest = -1
             for queue in self._queues.values():  # queued frames are older than the call
                 for old in queue.tryGetAll():
@@ -102,11 +102,7 @@ class DepthaiCamera:
                 disparity = disparity_of(pixels(frames["disparity"]), self.settings.subpixel_bits)
             return DepthaiShot(images, disparity, self.calibration, settings, self.model, self.serial)
 
-    def close(self) -> None:
-        """Switch the light off and close the camera; further calls do nothing."""
-        if self._closed:
-            return
-        self._closed = True
+    def _release(self) -> None:
         with suppress(Exception):  # the camera may be disconnected
             self._light(0.0, 0.0)
         with suppress(Exception):
@@ -116,11 +112,8 @@ class DepthaiCamera:
             if self._device is not None:
                 self._device.close()
 
-    def __enter__(self) -> DepthaiCamera:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
+    def _fault_of(self, error: BaseException, operation: str) -> BaseException:
+        return fault_of(error, self._dai, self.where, operation)
 
     def _light(self, dots: float, flood: float) -> None:
         device = self._device
@@ -138,19 +131,6 @@ class DepthaiCamera:
                     "one that has it (OAK-D Pro)",
                     f"Write {name} = 0",
                 )
-
-    @contextmanager
-    def _light_off_on_error(self, operation: str) -> Iterator[None]:
-        check_open(self.where, operation, self._closed, self._fault)
-        try:
-            yield
-        except BaseException as error:  # Ctrl-C as well
-            self._fault = operation
-            self.close()
-            fault = fault_of(error, self._dai, self.where, operation)
-            if fault is error:
-                raise
-            raise fault from error
 
 
 def open_depthai(settings: DepthaiSettings, identifier: str = "") -> DepthaiCamera:

@@ -33,19 +33,21 @@ class DeviceError(MissingEnvironmentError):
         return type(self), (self.where, self.operation, self.found, self.expected, self.hint)
 
 
-def check_open(where: str, operation: str, closed: bool, fault: str) -> None:
-    """Reject a camera that was closed, or that failed.
+def check_open(where: str, operation: str, closed: bool, fault: str, again: str = "Open it again") -> None:
+    """Reject a device that was closed, or that failed.
 
     Parameters
     ----------
     where
-        Name of the camera in messages.
+        Name of the device in messages.
     operation
         Operation that is requested.
     closed
-        Whether the camera was closed.
+        Whether the device was closed.
     fault
-        Operation at which the camera failed, "" for no failure.
+        Operation at which the device failed, "" for no failure.
+    again
+        What to do.
 
     Raises
     ------
@@ -53,5 +55,5 @@ def check_open(where: str, operation: str, closed: bool, fault: str) -> None:
         Naming the rejected operation.
     """
     if closed or fault:
-        found = "a camera that was closed" if not fault else f"a camera that has failed, at {fault}"
-        raise DeviceError(where, operation, found, "an open camera", "Open it again")
+        found = f"a device that has failed, at {fault}" if fault else "a device that was closed"
+        raise DeviceError(where, operation, found, "an open device", again)

@@ -15,8 +15,7 @@ the library, never with a device.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Annotated, Any, Literal
@@ -27,8 +26,9 @@ from pydantic import Field
 
 from characterisation.files.documents import Document
 from characterisation.files.errors import MissingEnvironmentError
-from mitsim.capture.devices.device_error import DeviceError, check_open
+from mitsim.capture.devices.device_error import DeviceError
 from mitsim.capture.devices.ensenso_faults import fault_of, no_library
+from mitsim.capture.devices.live_camera import LiveCamera
 
 Value = bool | int | float | str
 Images = NDArray[np.unsignedinteger[Any]]
@@ -101,7 +101,7 @@ class EnsensoShot:
     source: Literal["device", "emulator", "replay", "simulated"]
 
 
-class EnsensoCamera:
+class EnsensoCamera(LiveCamera):
     """An open camera; a context manager that restores its previous state."""
 
     def __init__(self, serial: str, settings: EnsensoSettings, nxlib: Any, library: str | None = None) -> None:
@@ -109,8 +109,8 @@ class EnsensoCamera:
         self._nxlib, self._session, self._camera = nxlib, nxlib.NxLib(library), None
         self._before: dict[str, Value] = {}
         self._link: dict[str, Any] | None = None
-        self._fault, self._closed, self._started = "", False, False
-        with self._left_as_found("open"):
+        self._started = False
+        with self._closed_on_error("open"):
             self._session.__enter__()
             self._started = True
             self._camera = nxlib.StereoCamera(serial)
@@ -129,7 +129,7 @@ class EnsensoCamera:
         DeviceError
             If the camera fails; its previous state is restored before the error is raised.
         """
-        with self._left_as_found("capture"):
+        with self._closed_on_error("capture"):
             camera, seconds = self._camera, self.settings.capture_timeout_s
             assert camera is not None
             camera.capture({} if seconds is None else {"Timeout": round(1000 * seconds)})
@@ -147,11 +147,7 @@ class EnsensoCamera:
                 node["Link"] = self._link
             return EnsensoShot(node, self._images(), disparity, points, self._source(node))
 
-    def close(self) -> None:
-        """Restore the camera's previous state, and close it and the library; further calls do nothing."""
-        if self._closed:
-            return
-        self._closed = True
+    def _release(self) -> None:
         self._restore()
         with suppress(Exception):  # the camera may be disconnected
             if self._camera is not None:
@@ -160,11 +156,8 @@ class EnsensoCamera:
             if self._started:
                 self._session.__exit__(None, None, None)
 
-    def __enter__(self) -> EnsensoCamera:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
+    def _fault_of(self, error: BaseException, operation: str) -> BaseException:
+        return fault_of(error, self._nxlib, self.where, operation, self._serials())
 
     def _item(self, path: str) -> Any:
         item = self._camera
@@ -242,21 +235,6 @@ class EnsensoCamera:
                 self._command("Synchronize")
         self._before.clear()
         self._link = None
-
-    @contextmanager
-    def _left_as_found(self, operation: str) -> Iterator[None]:
-        """Run a block with a working camera; on any error restore and close it before the error is raised."""
-        check_open(self.where, operation, self._closed, self._fault)
-        try:
-            yield
-        except BaseException as error:  # Ctrl-C as well
-            self._fault = operation
-            # needs the library, so before closing
-            fault = fault_of(error, self._nxlib, self.where, operation, self._serials())
-            self.close()
-            if fault is error:
-                raise
-            raise fault from error
 
     def _serials(self) -> list[str]:
         """Return the serial numbers of the stereo cameras that NxLib lists."""

@@ -57,6 +57,8 @@ class DepthaiTable(Document):
     settings: DepthaiSettings = DepthaiSettings()
 
 
+OpenDevice = EnsensoCamera | DepthaiCamera
+
 DeviceTable = Annotated[EnsensoTable | DepthaiTable, Field(discriminator="kind")]
 
 
@@ -68,32 +70,7 @@ class DeviceCapture:
     originals: dict[str, bytes]
 
 
-class LiveDevice:
-    """An open camera of any make; a context manager that restores its former state."""
-
-    def __init__(self, camera: EnsensoCamera | DepthaiCamera) -> None:
-        self._camera = camera
-        self.close = camera.close
-
-    def take(self) -> DeviceCapture:
-        """Take one capture.
-
-        Raises
-        ------
-        DeviceError
-            If the camera returns none.
-        """
-        shot = self._camera.take()
-        return ensenso_capture(shot) if isinstance(shot, EnsensoShot) else depthai_capture(shot)
-
-    def __enter__(self) -> LiveDevice:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
-
-def open_device(table: EnsensoTable | DepthaiTable) -> LiveDevice:
+def open_device(table: EnsensoTable | DepthaiTable) -> OpenDevice:
     """Open the camera of a ``[device]`` table and apply its settings.
 
     Raises
@@ -104,8 +81,19 @@ def open_device(table: EnsensoTable | DepthaiTable) -> LiveDevice:
         If the camera is not connected, or rejects its settings.
     """
     if isinstance(table, EnsensoTable):
-        return LiveDevice(open_ensenso(table.serial, table.settings))
-    return LiveDevice(open_depthai(table.settings, table.id))
+        return open_ensenso(table.serial, table.settings)
+    return open_depthai(table.settings, table.id)
+
+
+def device_capture(shot: EnsensoShot | DepthaiShot) -> DeviceCapture:
+    """Return the capture of a camera's shot.
+
+    Raises
+    ------
+    DeviceError
+        If its calibration cannot be read.
+    """
+    return ensenso_capture(shot) if isinstance(shot, EnsensoShot) else depthai_capture(shot)
 
 
 def ensenso_capture(shot: EnsensoShot) -> DeviceCapture:

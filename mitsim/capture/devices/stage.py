@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from characterisation.files.errors import InputError
-from mitsim.capture.devices.device_error import DeviceError
+from mitsim.capture.devices.device_error import DeviceError, check_open
 from mitsim.capture.devices.grbl import Grbl
 from mitsim.capture.devices.ptu import PanTiltUnit
 from mitsim.capture.devices.serial_line import WALL_CLOCK, Clock, SerialLine, open_line
@@ -266,9 +266,7 @@ class LiveStage:
     @contextmanager
     def _stopped_on_error(self, operation: str) -> Iterator[None]:
         """Run a block with a working stage; on any error stop the axes before the error is raised."""
-        if self._closed or self._fault:
-            found = "a stage that was closed" if self._closed else f"a stage that failed before, at {self._fault}"
-            raise DeviceError(self.connection.where, operation, found, "an open stage", _AGAIN.capitalize())
+        check_open(self.connection.where, operation, self._closed, self._fault, _AGAIN.capitalize())
         try:
             yield
         except BaseException as error:  # Ctrl-C as well

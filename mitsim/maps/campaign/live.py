@@ -24,7 +24,7 @@ import numpy as np
 
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
-from mitsim.capture.devices.maker_captures import DepthaiTable, EnsensoTable, LiveDevice, open_device
+from mitsim.capture.devices.maker_captures import DepthaiTable, EnsensoTable, OpenDevice, device_capture, open_device
 from mitsim.capture.devices.stage import LiveStage, open_stage
 from mitsim.capture.devices.stage_connection import StageConnection
 from mitsim.maps.campaign.acquire import DISTANCE_SLACK, CaptureSource, Source
@@ -143,7 +143,7 @@ def live_source(live: LiveCampaign, mount: Mount) -> Iterator[CaptureSource]:
         If one of them fails; kept captures stay.
     """
     with ExitStack() as opened:
-        hardware: list[tuple[LiveDevice, LiveStage]] = []
+        hardware: list[tuple[OpenDevice, LiveStage]] = []
         mounted: list[tuple[str, float]] = []
 
         def take(shot: Shot) -> Capture:
@@ -152,7 +152,8 @@ def live_source(live: LiveCampaign, mount: Mount) -> Iterator[CaptureSource]:
                 mount(*wanted)
                 mounted[:] = [wanted]
             if not hardware:
-                camera = opened.enter_context(open_device(live.device))
+                camera = open_device(live.device)
+                opened.enter_context(camera)
                 stage = opened.enter_context(open_stage(live.connection))  # opened last, so stopped first
                 stage.home()
                 hardware.append((camera, stage))
@@ -161,13 +162,13 @@ def live_source(live: LiveCampaign, mount: Mount) -> Iterator[CaptureSource]:
         yield take
 
 
-def _live_capture(live: LiveCampaign, shot: Shot, camera: LiveDevice, stage: LiveStage) -> Capture:
+def _live_capture(live: LiveCampaign, shot: Shot, camera: OpenDevice, stage: LiveStage) -> Capture:
     """Rotate the stage to a shot's normal, and take a capture with the pose at the angles that are read back."""
     distance = shot.series.distance
     calibration = live.calibrations[distance]
     asked = np.degrees(live.stages[distance].angles(shot.normal)[0])
     read = stage.move(asked)
-    capture = camera.take().capture
+    capture = device_capture(camera.take()).capture
     angles = np.radians(read)
     stage_record = {"axes": list(stage.axes), "asked_deg": asked.tolist(), "read_deg": read.tolist()}
     return replace(

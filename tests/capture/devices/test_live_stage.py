@@ -81,12 +81,12 @@ def test_after_a_fault_it_does_nothing_more_and_may_be_closed(kind):
     with pytest.raises(DeviceError, match="stands at"):
         stage.move([10.0] * len(stage.axes))
     for call in (lambda: stage.move([0.0] * len(stage.axes)), stage.position, stage.home, stage.stop):
-        with pytest.raises(DeviceError, match=r"failed before, at move.*Open the stage again and home it"):
+        with pytest.raises(DeviceError, match=r"has failed, at move.*Open the stage again and home it"):
             call()
     stage.close()
     stage.close()
     assert not port.open
-    with pytest.raises(DeviceError, match="a stage that was closed"):
+    with pytest.raises(DeviceError, match="a device that has failed, at move"):
         stage.position()
 
 
