@@ -106,11 +106,10 @@ def with_values(sensor: Sensor, parameters: Sequence[Parameter], theta: Floats) 
 
 @dataclass(frozen=True)
 class DotDraws:
-    """Simulated dots that a fit compares with: their ``number`` and ``seed``, in patches of ``patch_px``."""
+    """Simulated dots that a fit compares with: their ``number`` and ``seed``."""
 
     number: int = 3
     seed: int = 1
-    patch_px: int = PATCH_PX
 
 
 _DRAWS = DotDraws()
@@ -151,10 +150,10 @@ def fit_dots(
         If too little of the sheet is visible.
     """
     name, camera = next(iter(capture.rig.cameras.items()))
-    seed, patch_px = draws.seed, draws.patch_px
-    field = SpecimenField.of(camera, image_mask(place, camera, MARGIN_PX if patch_px >= PATCH_PX else 2.0), patch_px)
+    seed = draws.seed
+    field = SpecimenField.of(camera, image_mask(place, camera, MARGIN_PX), PATCH_PX)
     if len(field.corners) < FEWEST_PATCHES:
-        seen = f"{len(field.corners)} patches of {patch_px} px of it"
+        seen = f"{len(field.corners)} patches of {PATCH_PX} px of it"
         raise InputError(where, "specimen", seen, f"{FEWEST_PATCHES} or more", "a larger --window, or a nearer view")
     roi = field.roi
     window = contrast_window(capture, place)

@@ -34,6 +34,9 @@ TERMS = ("1", "x", "y", "xx", "xy", "yy")
 #: least number of patches for terms other than the constant
 _FEWEST_FOR_TERMS = 24
 
+#: least share of a patch that shows the specimen; chosen
+_LEAST_SHARE = 0.8
+
 #: least value of a feature ahead of its logarithm
 _LEAST = 1e-3
 
@@ -72,22 +75,10 @@ class SpecimenField:
     basis: Floats
 
     @classmethod
-    def of(cls, camera: Camera, mask: NDArray[np.bool_], patch_px: int, least_share: float = 0.8) -> SpecimenField:
-        """Divide the specimen's pixels of a camera into patches.
-
-        Parameters
-        ----------
-        camera
-            Camera that took the image.
-        mask
-            (H, W) pixels that show the specimen.
-        patch_px
-            Side of a patch [px].
-        least_share
-            Least share of a patch that shows the specimen, 0..1.
-        """
+    def of(cls, camera: Camera, mask: NDArray[np.bool_], patch_px: int) -> SpecimenField:
+        """Divide the specimen's pixels (H, W) in an image of a camera into patches with sides of ``patch_px``."""
         roi = Roi.around(mask) or Roi(0, 0, 0, 0)
-        corners = np.array(patch_corners(mask, patch_px, least_share), int).reshape(-1, 2)
+        corners = np.array(patch_corners(mask, patch_px, _LEAST_SHARE), int).reshape(-1, 2)
         basis = _basis(camera, corners, patch_px)
         return cls(roi, mask[roi.slices], patch_px, corners - [roi.top, roi.left], basis)
 

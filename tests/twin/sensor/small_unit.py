@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from unittest import mock
 
 import numpy as np
 
@@ -17,7 +18,8 @@ from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.sensor_file import RoomTable
 from mitsim.sensor.transforms import Transform, look_at
 from mitsim.twin.finish.place import Place, known_place
-from mitsim.twin.sensor.dots import DotDraws, DotsFit, fit_dots
+from mitsim.twin.sensor import dots
+from mitsim.twin.sensor.dots import DotDraws, DotsFit
 from mitsim.twin.sensor.estimate import scaled
 from mitsim.twin.sensor.parameters import (
     FLUX,
@@ -30,7 +32,6 @@ from mitsim.twin.sensor.parameters import (
 )
 
 DISTANCE, HALF = 450.0, 300.0
-PATCH_PX = 24
 
 
 def optics(width: int, height: int, focal: float, across: float) -> Camera:
@@ -128,19 +129,19 @@ def parameters(smoothing: bool = False) -> list[Parameter]:
     ]
 
 
+def small_fit(capture: Capture, sensor: Sensor, at: Place, varied: list[Parameter], draws: DotDraws) -> DotsFit:
+    """The fit in patches of 24 px, since the images are small."""
+    with mock.patch.multiple(dots, PATCH_PX=24, MARGIN_PX=2.0):
+        return dots.fit_dots(capture, sensor, at, varied, "unit", draws=draws)
+
+
 def standard_errors(seed: int, draws: int = 3) -> tuple[DotsFit, dict[str, float]]:
     """Fit one unit; errors of all determined numbers, in the file's units, over their standard uncertainties."""
     truth = unit(seed)
     # which dots the unit has is not known to the fit: another draw of them each time
     other = small_sensor().pattern.model_copy(update={"seed": 50_000 + 37 * seed})
-    found = fit_dots(
-        capture_of(truth, seed),
-        replace(small_sensor(), pattern=other),
-        place(),
-        parameters(),
-        "unit",
-        draws=DotDraws(draws, 7 + seed, PATCH_PX),
-    )
+    sensor = replace(small_sensor(), pattern=other)
+    found = small_fit(capture_of(truth, seed), sensor, place(), parameters(), DotDraws(draws, 7 + seed))
     values, spreads = found.in_file_units()
     errors = {}
     for parameter, value, spread in zip(found.parameters, values, spreads, strict=True):
