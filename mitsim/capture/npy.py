@@ -26,8 +26,10 @@ def encode_npy(values: NDArray[Any]) -> bytes:
     return stream.getvalue()
 
 
-def numbers_of_npy(data: bytes, where: str | Path) -> NDArray[Any]:
+def numbers_of_npy(data: bytes, where: str | Path, *, tables: bool = False) -> NDArray[Any]:
     """Return the array in the bytes of an ``.npy`` file of any version, type and order, by rows.
+
+    ``tables``: whether its entries may have named fields.
 
     Raises
     ------
@@ -43,7 +45,7 @@ def numbers_of_npy(data: bytes, where: str | Path) -> NDArray[Any]:
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         hint = "np.save writes such a file, np.savez an archive"
         raise InputError(where, "", f"an unreadable file ({reason})", "a .npy file with numbers", hint) from None
-    if array.dtype.kind not in "fiu":
+    if array.dtype.kind not in "fiu" and not (tables and array.dtype.names):
         raise InputError(where, "dtype", str(array.dtype), "real numbers")
     return np.ascontiguousarray(array)
 

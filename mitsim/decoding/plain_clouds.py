@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
-from mitsim.capture.recordings.array_file import array_of_npy, arrays_of_npz, map_in, points_among
+from mitsim.capture.npy import numbers_of_npy
+from mitsim.capture.recordings.array_file import arrays_of_npz, map_in, points_among
 from mitsim.capture.recordings.cloud_numbers import leave_out_marks, scale_to_mm
 from mitsim.capture.recordings.cloud_text import points_of_text
 from mitsim.sensor.mat_structure import read_mat
@@ -121,7 +122,7 @@ def is_map_of_depths(path: Path) -> bool:
 def _of_arrays(path: Path, data: bytes, suffix: str) -> NDArray[np.floating]:
     """Return the points (n, 3) or (H, W, 3) of a file of NumPy or MATLAB, in its unit."""
     if suffix == ".npy":
-        arrays = {path.name: array_of_npy(data, path)}
+        arrays = {path.name: numbers_of_npy(data, path, tables=True)}
     elif suffix == ".npz":
         arrays = arrays_of_npz(data, path)
     else:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
-from mitsim.capture.npy import NPY_MAGIC
+from mitsim.capture.npy import NPY_MAGIC, numbers_of_npy
 from mitsim.capture.recordings.recording_files import chosen_frame
 
 #: most values of a point: x, y, z, normal and colour
@@ -28,25 +28,6 @@ _NO_POINTS = re.compile(r"normal|colou?r|rgb|bgr|image|img|texture", re.IGNORECA
 
 #: largest unpacked archive [bytes]
 _LARGEST_ARCHIVE = 4 * 1024**3
-
-
-def array_of_npy(data: bytes, where: str | Path) -> NDArray[Any]:
-    """Return the array in the bytes of an ``.npy`` file, by rows: real numbers, or a table of these.
-
-    Raises
-    ------
-    InputError
-        If the bytes are not a complete file of numbers.
-    """
-    try:
-        array = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
-    except Exception as error:  # NumPy raises many types of errors for damaged files
-        reason = " ".join(str(error).split())[:120] or type(error).__name__
-        hint = "np.save writes such a file, np.savez an archive"
-        raise InputError(where, "", f"an unreadable file ({reason})", "a .npy file with numbers", hint) from None
-    if array.dtype.kind not in "fiu" and array.dtype.names is None:
-        raise InputError(where, "dtype", str(array.dtype), "real numbers")
-    return np.ascontiguousarray(array)
 
 
 def arrays_of_npz(data: bytes, where: str | Path) -> dict[str, NDArray[Any]]:
@@ -72,7 +53,7 @@ def arrays_of_npz(data: bytes, where: str | Path) -> dict[str, NDArray[Any]]:
     out: dict[str, NDArray[Any]] = {}
     for name, member in members.items():
         if member.startswith(NPY_MAGIC) and b"'|O'" not in member[:200]:
-            out[name.removesuffix(".npy")] = array_of_npy(member, f"{where}: {name}")
+            out[name.removesuffix(".npy")] = numbers_of_npy(member, f"{where}: {name}", tables=True)
     return out
 
 
@@ -93,7 +74,9 @@ def map_in(data: bytes, where: Path, frame: int | None = None) -> NDArray[Any]:
     InputError
         If the file has neither, several arrays of depths of which none is named so, or no such frame.
     """
-    arrays = {"": array_of_npy(data, where)} if data.startswith(NPY_MAGIC) else arrays_of_npz(data, where)
+    arrays = (
+        {"": numbers_of_npy(data, where, tables=True)} if data.startswith(NPY_MAGIC) else arrays_of_npz(data, where)
+    )
     points = points_among(arrays)
     if points is not None and points.ndim == 3 and min(points.shape[:2]) > 1:
         return points

@@ -216,6 +216,11 @@ def test_points_in_an_array_are_an_organised_cloud(tmp_path):
     np.save(tmp_path / "points.npy", pinhole_cloud()[None])
     with pytest.raises(InputError, match="rows x columns"):
         read_recording(tmp_path / "points.npy", ReadOptions())
+    with (tmp_path / "two.npy").open("wb") as stream:  # before, the first was read
+        np.save(stream, pinhole_cloud())
+        np.save(stream, pinhole_cloud())
+    with pytest.raises(InputError, match="bytes beyond the array"):
+        read_recording(tmp_path / "two.npy", ReadOptions())
     np.save(tmp_path / "points.npy", np.array(["a"]))
     with pytest.raises(InputError, match="real numbers"):
         read_recording(tmp_path / "points.npy", ReadOptions())
