@@ -1,13 +1,12 @@
 """Read Zivid's ``.zdf``: points, colour and signal-to-noise ratio of every pixel, and the camera's matrix, if any.
 
-Signal chain: netCDF-4 file -> in a process of its own, the variables by name -> arrays.
+Signal chain: netCDF-4 file -> the variables by name (:mod:`mitsim.capture.recordings.zdf_worker`) -> arrays.
 
 Zivid's samples (zivid-python-samples, ``read_zdf_without_zivid.py``) state the names in the group ``data``:
 ``pointcloud`` (H, W, 3) float32 [mm], NaN where missing; ``rgba_image`` (H, W, 4) uint8; ``snr``, before it
 ``contrast``, (H, W). They do not state where the matrix of the camera is: a matrix of 3 x 3 is taken whose name says
 *camera matrix* or *intrinsics*, with a *distortion* beside it, or the numbers FX, FY, CX, CY, and K1, K2, P1, P2, K3 by
-which Zivid's own calibration files state it. HDF5 may hang or crash on a damaged file; the process of
-its own ends alone.
+which Zivid's own calibration files state it.
 """
 
 from __future__ import annotations
@@ -34,49 +33,8 @@ PATIENCE_S = 60.0
 #: largest cloud [points]
 _MOST_POINTS = 1 << 25
 
-_PROGRAM = r"""
-import sys, netCDF4, numpy as np
-most, found, matrices, lenses, numbers = int(sys.argv[2]), {}, [], [], {}
-names = "pointcloud xyz x y z snr contrast rgba_image rgb_image".split()
-
-def values(one, name):
-    if int(np.prod(one.shape, dtype=float)) > most * 4:
-        sys.exit(f"TOO LARGE {name}: {' x '.join(map(str, one.shape))}")
-    return np.asarray(one[...])
-
-def search(group):
-    for name, one in group.variables.items():
-        low = name.lower()
-        if one.dtype is str or one.dtype.kind not in "fiu":
-            continue
-        if low in names and low not in found:
-            found[low] = values(one, name)
-        elif one.shape == (3, 3) and ("matrix" in low or "intrinsic" in low) and "transform" not in low:
-            matrices.append(values(one, name))
-        elif "distortion" in low and one.ndim == 1 and one.shape[0] in (4, 5, 8, 12, 14):
-            lenses.append(values(one, name))
-        elif one.ndim == 0:
-            numbers.setdefault(low, float(one[...]))
-    for name in group.ncattrs():
-        value = np.asarray(group.getncattr(name))
-        if value.size == 1 and value.dtype.kind in "fiu":
-            numbers.setdefault(name.lower(), float(value.ravel()[0]))
-    for inner in group.groups.values():
-        search(inner)
-
-with netCDF4.Dataset(sys.argv[1]) as file:
-    file.set_auto_maskandscale(False)
-    search(file)
-if not matrices and {"fx", "fy", "cx", "cy"} <= set(numbers):
-    fx, fy, cx, cy = (numbers[name] for name in ("fx", "fy", "cx", "cy"))
-    matrices.append(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
-    lenses.append(np.array([numbers.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")]))
-if matrices:
-    found["matrix"] = matrices[0]
-if lenses:
-    found["distortion"] = lenses[0]
-np.savez(sys.stdout.buffer, **found)
-"""
+#: program that reads the variables of a file
+_WORKER = Path(__file__).with_name("zdf_worker.py")
 
 
 @dataclass(frozen=True)
@@ -129,7 +87,7 @@ def read_zdf(path: Path) -> Zdf:
 
 
 def _arrays(path: Path, expected: str) -> dict[str, NDArray[Any]]:
-    command = [sys.executable, "-I", "-c", _PROGRAM, str(path.resolve()), str(_MOST_POINTS)]
+    command = [sys.executable, "-I", str(_WORKER), str(path.resolve()), str(_MOST_POINTS)]
     try:
         done = subprocess.run(command, capture_output=True, timeout=PATIENCE_S, check=False)
     except subprocess.TimeoutExpired:
