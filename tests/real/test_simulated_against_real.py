@@ -77,7 +77,7 @@ def test_the_knee_of_a_recorded_n10_is_where_its_histograms_double(real_data):
         step = 60 + int(np.argmax(counts[60:100] / counts[59:99]))
         assert step == 80 and counts[80] / counts[79] == pytest.approx(2.0, rel=0.2)
         knee = first_knee(image.astype(float), np.ones(image.shape, bool), imager)
-        assert knee is not None and knee.slope == 0.5 and abs(knee.level - step) < 0.75
+        assert knee is not None and abs(knee.level - step) < 0.75
 
 
 def test_a_makers_virtual_camera_against_ours(real_data, tmp_path):

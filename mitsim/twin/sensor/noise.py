@@ -34,7 +34,7 @@ from mitsim.twin.sensor.photon_transfer import (
     repeated_line,
     widths,
 )
-from mitsim.twin.sensor.response import first_knee, quiet_pixels
+from mitsim.twin.sensor.response import SLOPE, first_knee, quiet_pixels
 
 #: largest number of pixels used in a group
 _PIXELS = 200_000
@@ -175,7 +175,7 @@ def _with_curve(imager: Imager, groups: list[list[InputCapture]], sensor: Sensor
         levels, mask = image.astype(float), (image > 0) & (image < imager.full_scale)
         knee = first_knee(levels, mask, imager)
         if knee is not None:
-            method = f"noise by level of one image: the first knee, {knee.slope:g} times as steep beyond it"
+            method = f"noise by level of one image: the first knee, {SLOPE:g} times as steep beyond it"
             knee_estimate = FittedKey(
                 "imager.companding_dn", knee.level, knee.uncertainty, "DN", (source.name,), method
             )

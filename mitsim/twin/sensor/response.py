@@ -54,7 +54,7 @@ _TILES = 120
 _FEWEST = 8
 
 #: slope beyond a knee; chips compand by steps of two
-_SLOPE = 0.5
+SLOPE = 0.5
 
 #: coarse step of a knee's level [DN]; chosen
 _COARSE_DN = 3.0
@@ -101,17 +101,16 @@ _WEIGHTS = sum(np.eye(_TILE_PX, _TILE_PX + 2 * _RIM_PX, at) * weight for at, wei
 
 @dataclass(frozen=True)
 class Knee:
-    """A curve's first knee at ``level`` [DN], its standard ``uncertainty``, and the ``slope`` beyond it [1]."""
+    """A curve's first knee at ``level`` [DN], its standard ``uncertainty``; beyond it the slope is :data:`SLOPE`."""
 
     level: float
     uncertainty: float
-    slope: float
 
     def companding(self, bits: int) -> tuple[tuple[float, float], ...]:
-        """Return the knees of the curve [DN]: straight to the knee, then with the slope to near full scale."""
+        """Return the knees of the curve [DN]: straight to the knee, then with its slope to near full scale."""
         full = 2.0**bits
         near = full * (1 - 1 / 64)
-        reached = self.level + (near - self.level) / self.slope
+        reached = self.level + (near - self.level) / SLOPE
         last = 2.0 ** np.ceil(np.log2(reached + (full - near)))
         return (self.level, self.level), (reached, near), (float(last), full)
 
@@ -139,50 +138,47 @@ def first_knee(image: Floats, mask: Mask, imager: Imager) -> Knee | None:
     coarse = np.arange(low, high, _COARSE_DN)
     if not len(coarse):
         return None
-    _, middle = min((tiles.best(k, _SLOPE).sum(), k) for k in coarse)
-    slope, level = _SLOPE, _least(tiles, middle, _SLOPE, _AROUND)
+    _, middle = min((tiles.best(k).sum(), k) for k in coarse)
+    level = _least(tiles, middle, _AROUND)
     away = tiles.away_from(level)
-    gain = away.best(np.inf, 1.0) - away.best(level, slope)
+    gain = away.best(np.inf) - away.best(level)
     if gain.sum() < max(_GAIN, _SURE * float(gain.std()) * np.sqrt(len(gain))) or not low < level < high:
         return None
-    bias, spread = _bias(clean, mask, tiles, Knee(level, 0.0, slope))
-    return Knee(level - bias, float(np.hypot(tiles.uncertainty(level, slope), spread)), slope)
+    bias, spread = _bias(clean, mask, tiles, level)
+    return Knee(level - bias, float(np.hypot(tiles.uncertainty(level), spread)))
 
 
-def _bias(clean: Floats, mask: Mask, tiles: _Tiles, knee: Knee) -> tuple[float, float]:
+def _bias(clean: Floats, mask: Mask, tiles: _Tiles, level: float) -> tuple[float, float]:
     """Return the bias of a knee whose levels come from a denoised image, from draws of noise, and its uncertainty."""
-    numbers, knee_levels = tiles.fitted(knee.level, knee.slope), []
-    k = knee.level - _ROUNDED_DOWN_DN
-    every = np.linspace(0.0, k + (float(clean.max()) + 5 - k) / knee.slope, 1500)
+    numbers, knee_levels = tiles.fitted(level), []
+    k = level - _ROUNDED_DOWN_DN
+    every = np.linspace(0.0, k + (float(clean.max()) + 5 - k) / SLOPE, 1500)
     spread = tiles.spread(every, numbers)
-    mean, _ = _through(every, knee.level, knee.slope, spread)
+    mean, _ = _through(every, level, spread)
     light = np.interp(clean, mean, every)
     for stream in np.random.default_rng(0).spawn(_DRAWS):
         drawn = light + np.interp(light, every, spread) * stream.normal(size=light.shape)
-        drawn = np.rint(np.minimum(drawn, k) + knee.slope * np.maximum(drawn - k, 0.0))
+        drawn = np.rint(np.minimum(drawn, k) + SLOPE * np.maximum(drawn - k, 0.0))
         variance = noise_of_levels(drawn, mask)
         both = [
             _Tiles.of(drawn, levels, _quiet(variance, levels, mask), tiles.black)
             for levels in (denoised(drawn, mask), clean)
         ]
         knee_levels.append(
-            [
-                np.nan if drawn_tiles is None else _least(drawn_tiles, knee.level, knee.slope, _BESIDE_IT)
-                for drawn_tiles in both
-            ]
+            [np.nan if drawn_tiles is None else _least(drawn_tiles, level, _BESIDE_IT) for drawn_tiles in both]
         )
     off = np.array(knee_levels) @ [1.0, -1.0]
     off = off[np.isfinite(off)]
     return (float(off.mean()), float(off.std(ddof=1) / np.sqrt(len(off)))) if len(off) > 1 else (0.0, float("inf"))
 
 
-def _least(tiles: _Tiles, middle: float, slope: float, around: int) -> float:
+def _least(tiles: _Tiles, middle: float, around: int) -> float:
     """Return the most likely level of a knee, downhill from ``middle``, by a parabola through three levels."""
     total: dict[int, float] = {}
 
     def at(step: int) -> float:
         if step not in total:
-            total[step] = float(tiles.best(middle + step * _STEP_DN, slope).sum())
+            total[step] = float(tiles.best(middle + step * _STEP_DN).sum())
         return total[step]
 
     best = min(range(-around, around + 1), key=at)
@@ -234,17 +230,17 @@ class _Tiles:
         kept = far[self.inside]
         return _Tiles(self.clean, self.inside & far, self.square[kept], self.print_square[kept], self.black)
 
-    def best(self, knee: float, slope: float) -> Floats:
-        """Return -2 log likelihood (n,) of the tiles with the best common a and b."""
-        return self.misfit(knee, slope, self.fitted(knee, slope))
+    def best(self, knee: float) -> Floats:
+        """Return -2 log likelihood (n,) of the tiles with the best common a and b; an infinite knee is none."""
+        return self.misfit(knee, self.fitted(knee))
 
-    def fitted(self, knee: float, slope: float) -> Floats:
+    def fitted(self, knee: float) -> Floats:
         """Return a and b of all tiles, by weighted least squares."""
         middle = float(np.median(self.square)) / MEDIAN_SQUARE
         numbers = np.array([0.0, middle / max(float(np.median(self.clean)), 1.0)])
         variance, excess = np.full_like(self.square, middle), self.square - 1 / 12 - self.print_square
         for _ in range(3):
-            shares = self._shares(knee, slope, numbers)
+            shares = self._shares(knee, numbers)
             maps = np.stack([_of_neighbours(share).take(self.used) for share in shares])
             for _ in range(2):
                 weight = (self.square < _LARGEST**2 * variance) / variance**2
@@ -252,26 +248,26 @@ class _Tiles:
                 variance = np.maximum(numbers @ maps, 1e-3) + 1 / 12 + self.print_square
         return numbers
 
-    def misfit(self, knee: float, slope: float, numbers: Floats) -> Floats:
+    def misfit(self, knee: float, numbers: Floats) -> Floats:
         """Return -2 log likelihood (n,) of the tiles."""
-        ratio, light = self._shares(knee, slope, numbers)
+        ratio, light = self._shares(knee, numbers)
         noise_variance = _of_neighbours(numbers[0] * ratio + numbers[1] * light).take(self.used)
         variance = np.maximum(noise_variance, 1e-3) + 1 / 12 + self.print_square
         terms = np.zeros((len(self.clean), _TILE_PX**2))
         terms.reshape(-1)[self.used] = np.log(variance) + np.minimum(self.square / variance, _LARGEST**2)
         return np.asarray(independent_share() * terms.sum(axis=1), float)
 
-    def uncertainty(self, knee: float, slope: float) -> float:
+    def uncertainty(self, knee: float) -> float:
         """Return the standard uncertainty [DN] of the knee by a jackknife that leaves out one tile at a time.
 
         K, a and b without a tile follow by one Newton step, from the first and second derivatives of every tile's
         likelihood. Tiles are independent samples, whether the model fits or not.
         """
-        numbers = self.fitted(knee, slope)
+        numbers = self.fitted(knee)
         steps = np.diag([_STEP_DN, 0.1 * max(numbers[0], 0.1), 0.05 * max(numbers[1], 1e-4)])
 
         def at(step: Floats) -> Floats:
-            return self.misfit(knee + float(step[0]), slope, numbers + step[1:])
+            return self.misfit(knee + float(step[0]), numbers + step[1:])
 
         middle, sides = at(np.zeros(3)), [(at(step), at(-step)) for step in steps]
         slopes, bend = np.stack([(up - down) / 2 for up, down in sides], axis=1), np.empty((len(middle), 3, 3))
@@ -286,13 +282,13 @@ class _Tiles:
         moved = np.linalg.solve(without, (slopes - slopes.mean(axis=0))[..., None])[:, 0, 0] * _STEP_DN
         return float(np.sqrt((len(moved) - 1) * moved.var()))
 
-    def _shares(self, knee: float, slope: float, numbers: Floats) -> tuple[Floats, Floats]:
+    def _shares(self, knee: float, numbers: Floats) -> tuple[Floats, Floats]:
         """Return the factors (n, 36, 36) of a and b in every pixel alone."""
         light, ratio = self.clean, np.ones(self.clean.shape)
-        if slope < 1:
-            top = knee + (float(self.rising_levels[-1]) + 5 - knee) / slope
+        if np.isfinite(knee):
+            top = knee + (float(self.rising_levels[-1]) + 5 - knee) / SLOPE
             every = np.linspace(0.0, top, 1500)
-            mean, share = _through(every, knee, slope, self.spread(every, numbers))
+            mean, share = _through(every, knee, self.spread(every, numbers))
             # both at once, and in the order of the levels, which finds the neighbours five times as fast
             values = np.interp(self.rising_levels, mean, every + 1j * share).take(self.ranks)
             light, ratio = values.real, values.imag.copy()
@@ -309,9 +305,9 @@ def _cut(values: NDArray[Any], side: int) -> Floats:
     return np.asarray(tiles.reshape(-1, side, side), float)
 
 
-def _through(level: Floats, knee: float, slope: float, spread: Floats) -> tuple[Floats, Floats]:
+def _through(level: Floats, knee: float, spread: Floats) -> tuple[Floats, Floats]:
     """Return the mean (n,) behind the curve of levels with normal noise, and the remaining share of the variance."""
-    t, flat = (level - (knee - _ROUNDED_DOWN_DN)) / spread, 1 - slope
+    t, flat = (level - (knee - _ROUNDED_DOWN_DN)) / spread, 1 - SLOPE
     above, density = ndtr(t), np.exp(-(t**2) / 2.0) / np.sqrt(2 * np.pi)
     first, second = density + t * above, (1 + t**2) * above + t * density
     return level - flat * spread * first, 1 - 2 * flat * above + flat**2 * (second - first**2)
