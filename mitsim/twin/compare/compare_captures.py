@@ -37,8 +37,7 @@ from mitsim.decoding.cloud import Geometry, Settings, capture_geometry
 from mitsim.decoding.matching.stereo import StereoGeometry
 from mitsim.running.numbers import two_digits
 from mitsim.twin.compare.compared_quantities import QUANTITIES, Quantity
-from mitsim.twin.compare.plain_image import plain_image
-from mitsim.twin.compare.rebuild import median_level
+from mitsim.twin.compare.plain_image import median_level, plain_image
 from mitsim.twin.compare.specimen_patches import PATCH_PX, SpecimenPatches, contrast_window, specimen_patches
 from mitsim.twin.finish.place import Place
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from characterisation.coupon.residual_field import Autocorrelation
 from characterisation.files.arrays import Floats
 from characterisation.point_cloud import Status
-from mitsim.twin.compare.rebuild import median_level
+from mitsim.twin.compare.plain_image import median_level
 from mitsim.twin.compare.specimen_patches import SpecimenPatches
 
 Picked = NDArray[np.intp]

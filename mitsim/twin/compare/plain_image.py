@@ -56,3 +56,11 @@ def plain_image(capture: Capture) -> PlainImage:
         return PlainImage((kinds.index("white"),), "the white image", False)
     coded = tuple(number for number, kind in enumerate(kinds) if kind in _CODED)
     return PlainImage(coded, "the brightest levels of the code's images", False)
+
+
+def median_level(counts: NDArray[Any]) -> float:
+    """Return the median [DN] of a histogram, with the pixels of each level spread evenly over the level."""
+    total = np.cumsum(counts)
+    level = int(np.searchsorted(total, total[-1] / 2))
+    below = total[level - 1] if level else 0
+    return float(level - 0.5 + (total[-1] / 2 - below) / counts[level])

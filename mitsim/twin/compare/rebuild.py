@@ -24,10 +24,9 @@ Not included: a print under dots, and objects around the specimen.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
@@ -42,7 +41,7 @@ from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.projector_images import ImagesDescription
 from mitsim.sensor.sensor import Sensor
-from mitsim.twin.compare.plain_image import plain_image
+from mitsim.twin.compare.plain_image import median_level, plain_image
 from mitsim.twin.compare.plate import REFLECTANCE, plate, printed, texture_of
 from mitsim.twin.finish.electrons import chip_of, linearised
 from mitsim.twin.finish.place import Place
@@ -210,14 +209,6 @@ def _scale(
         middle = float(np.sqrt(low * high))
         low, high = (low, middle) if too_bright(middle) else (middle, high)
     return float(np.sqrt(low * high))
-
-
-def median_level(counts: NDArray[Any]) -> float:
-    """Return the median [DN] of a histogram, with the pixels of each level spread evenly over the level."""
-    total = np.cumsum(counts)
-    level = int(np.searchsorted(total, total[-1] / 2))
-    below = total[level - 1] if level else 0
-    return float(level - 0.5 + (total[-1] / 2 - below) / counts[level])
 
 
 def projector_was_on(real: Capture, state: Literal["on", "off"] | None, where: str) -> bool:
