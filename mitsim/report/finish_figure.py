@@ -81,8 +81,8 @@ def remarks(coupon_fit: CouponFit) -> list[str]:
         lines.append("residuals of neighbouring blocks are correlated: light, form or lobe differ from the model")
     if coupon_fit.pattern_unknown:
         lines.append("the pattern is not known to be that of the sensor file: block means were compared, not dots")
-    if any(not math.isnan(place.off_plane) for place in coupon_fit.places):
-        worst = max(place.off_plane for place in coupon_fit.places if not math.isnan(place.off_plane))
+    if any(not math.isnan(specimen.off_plane) for specimen in coupon_fit.specimens):
+        worst = max(specimen.off_plane for specimen in coupon_fit.specimens if not math.isnan(specimen.off_plane))
         lines.append(
             f"the place of the coupon is the plane of its cloud, which scatters by up to {worst:.2g} mm about it"
         )

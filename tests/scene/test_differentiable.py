@@ -18,7 +18,7 @@ from mitsim.scene.surface.metals import refractive_index
 from mitsim.scene.surface.microfacet import fresnel, shadowing, slope_density
 from mitsim.sensor.transforms import look_at
 from mitsim.twin.finish.finish import metal_finish
-from mitsim.twin.finish.place import known_place
+from mitsim.twin.finish.specimen import known_specimen
 from mitsim.twin.finish.white_coupon import WhiteCouponRenderer, coupon_roi
 from tests.figures_of_surfaces import lobe_factor
 
@@ -130,9 +130,9 @@ def test_white_light_times_the_lobe_is_what_the_renderer_gives(n10, lobe, scenes
     scatter = scene.finishes[0].scatter
     ground = metal_finish(scene.finishes[0], n10.wavelength_nm, "coupon")
     pose = look_at([60.0, -150.0, 580.0], [0, 0, 0], [0, 0, 1])
-    place, camera = known_place(pose, 120.0, 120.0), n10.rig.cameras["left"]
-    part = coupon_roi(camera, place)
-    white = WhiteCouponRenderer(n10, samples=4).white(place, "left", part, "mean")
+    specimen, camera = known_specimen(pose, 120.0, 120.0), n10.rig.cameras["left"]
+    part = coupon_roi(camera, specimen)
+    white = WhiteCouponRenderer(n10, samples=4).white(specimen, "left", part, "mean")
     rendered = SimulatedSensor(n10).radiance(scene, pose, "left", Rendering(samples=4, depth=1), seed=1, roi=part)[0]
     rendered = rendered * n10.electrons()
     columns, rows = np.meshgrid(np.arange(part.width) + part.left, np.arange(part.height) + part.top)

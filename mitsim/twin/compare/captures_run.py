@@ -31,8 +31,8 @@ from mitsim.twin.compare.plain_image import plain_image
 from mitsim.twin.compare.rebuild import check_technology, projector_was_on, rebuild
 from mitsim.twin.compare.specimen_patches import PATCH_PX, SpecimenPatches, reference_levels
 from mitsim.twin.finish.electrons import sensor_of
-from mitsim.twin.finish.place import Place
-from mitsim.twin.finish.specimen import MARGIN_PX, image_mask, specimen_place
+from mitsim.twin.finish.find_specimen import MARGIN_PX, find_specimen, image_mask
+from mitsim.twin.finish.specimen import Specimen
 
 #: border of the picture around the specimen [px]
 _BORDER_PX = 24
@@ -114,12 +114,12 @@ def validate_captures(
     if twin_sensor is not None:
         check_technology(recorded, twin_sensor, str(real))  # before the capture is decoded
     settings, _ = decoder_settings(recorded)
-    place = specimen_place(recorded, settings, roi, str(real))
+    specimen = find_specimen(recorded, settings, roi, str(real))
     on = projector_was_on(recorded, cast(Literal["on", "off"] | None, projector), str(real))
-    say(f"specimen: a plane at {_distance(place):.0f} mm, with {place.off_plane:.2g} mm rms deviation")
+    say(f"specimen: a plane at {_distance(specimen):.0f} mm, with {specimen.off_plane:.2g} mm rms deviation")
     if twin_sensor is not None:
         other, where = (
-            rebuild(recorded, twin_sensor, place, str(real), projector_on=on, seed=seed),
+            rebuild(recorded, twin_sensor, specimen, str(real), projector_on=on, seed=seed),
             str(output / "simulated"),
         )
         write_capture(other, output / "simulated", overwrite=True)
@@ -127,13 +127,13 @@ def validate_captures(
     else:
         assert simulated is not None
         other, where = read_capture(simulated), str(simulated)
-    comparison = compare_captures(recorded, other, place, settings, where, projector_on=on, seed=seed)
+    comparison = compare_captures(recorded, other, specimen, settings, where, projector_on=on, seed=seed)
     table = comparison_table(comparison.rows, _whose(recorded))
     fitted = shows_the_fit(recorded_in(other.settings, where), recorded.images, other.sensor)
     write_json(output / "comparison.json", comparison.numbers() | {"fitted": fitted})
-    shown = _shown(_whose(recorded), recorded, place, comparison.real)
-    sides = shown, _shown("simulated", other, place, comparison.simulated)
-    preamble = _preamble(recorded, other, place, comparison, real, on)
+    shown = _shown(_whose(recorded), recorded, specimen, comparison.real)
+    sides = shown, _shown("simulated", other, specimen, comparison.simulated)
+    preamble = _preamble(recorded, other, specimen, comparison, real, on)
     preamble += f"\n**{fitted}.**\n" if fitted else ""
     return CaptureValidation(comparison, table, preamble, sides, fitted)
 
@@ -174,20 +174,22 @@ def _decimals(row: ComparedRow) -> int:
     return int(np.clip(1 - np.floor(np.log10(row.uncertainty)), 1, 4))
 
 
-def _distance(place: Place) -> float:
-    return float(np.linalg.norm(place.world_from_sensor.translation))
+def _distance(specimen: Specimen) -> float:
+    return float(np.linalg.norm(specimen.world_from_sensor.translation))
 
 
-def _preamble(real: Capture, simulated: Capture, place: Place, comparison: Comparison, where: Path, on: bool) -> str:
+def _preamble(
+    real: Capture, simulated: Capture, specimen: Specimen, comparison: Comparison, where: Path, on: bool
+) -> str:
     rebuilt = simulated.settings.get("rebuilt", {})
     power = rebuilt.get("power_times_reflectance_w")
     serial = f" (serial {real.serial})" if real.serial else ""
     words = [
         f"{_whose(real).capitalize()}: `{where}`, {real.sensor}{serial}, source {real.source}. Simulated: "
         f"{simulated.sensor}, source {simulated.source}. Projector {'on' if on else 'off'}.",
-        f"Specimen: a plane at {_distance(place):.0f} mm; the cloud deviates by {rounded(place.off_plane, 2)} mm rms. "
-        f"Patches of {PATCH_PX} px: {comparison.image_patches} of the image, {comparison.cloud_patches} of the cloud; "
-        f"a margin of {MARGIN_PX:g} px inside the specimen's outline is excluded. Contrast in windows of "
+        f"Specimen: a plane at {_distance(specimen):.0f} mm; the cloud deviates by {rounded(specimen.off_plane, 2)} mm "
+        f"rms. Patches of {PATCH_PX} px: {comparison.image_patches} of the image, {comparison.cloud_patches} of the "
+        f"cloud; a margin of {MARGIN_PX:g} px inside the specimen's outline is excluded. Contrast in windows of "
         f"{comparison.window_px} px. Grey levels are those of {plain_image(real).name}.",
     ]
     if power is not None:
@@ -197,8 +199,8 @@ def _preamble(real: Capture, simulated: Capture, place: Place, comparison: Compa
     return "\n\n".join(words) + "\n"
 
 
-def _shown(name: str, capture: Capture, place: Place, patches: SpecimenPatches) -> Shown:
-    mask = image_mask(place, capture.rig.reference)
+def _shown(name: str, capture: Capture, specimen: Specimen, patches: SpecimenPatches) -> Shown:
+    mask = image_mask(specimen, capture.rig.reference)
     rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
     image = reference_levels(capture)
     cut = (

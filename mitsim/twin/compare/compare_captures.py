@@ -39,7 +39,7 @@ from mitsim.running.numbers import two_digits
 from mitsim.twin.compare.compared_quantities import QUANTITIES, Quantity
 from mitsim.twin.compare.plain_image import median_level, plain_image
 from mitsim.twin.compare.specimen_patches import PATCH_PX, SpecimenPatches, contrast_window, specimen_patches
-from mitsim.twin.finish.place import Place
+from mitsim.twin.finish.specimen import Specimen
 
 Verdict = Literal["agrees", "differs", "not comparable", "does not apply"]
 
@@ -116,7 +116,7 @@ HISTOGRAMS = "grey levels, distance"
 def compare_captures(
     real: Capture,
     simulated: Capture,
-    place: Place,
+    specimen: Specimen,
     settings: Settings,
     where: str,
     *,
@@ -129,7 +129,7 @@ def compare_captures(
     ----------
     real, simulated
         The two captures.
-    place
+    specimen
         Pose and extent of the specimen in the real capture's sensor frame; its pixels are evaluated in both captures.
     settings
         Settings of the decoder, the same for both.
@@ -148,11 +148,11 @@ def compare_captures(
         small.
     """
     _check(real, simulated, where)
-    window = contrast_window(real, place)
+    window = contrast_window(real, specimen)
     geometry = capture_geometry(real, settings)
     seen = [
-        specimen_patches(real, settings, geometry, place, window),
-        specimen_patches(simulated, settings, capture_geometry(simulated, settings), place, window),
+        specimen_patches(real, settings, geometry, specimen, window),
+        specimen_patches(simulated, settings, capture_geometry(simulated, settings), specimen, window),
     ]
     real_patches, simulated_patches = _known_in_both(*seen)
     patches = {"image": len(real_patches.contrast), "cloud": len(real_patches.sigma)}
@@ -161,7 +161,7 @@ def compare_captures(
         raise InputError(
             "REAL", "specimen", found, f"{LEAST_PATCHES} or more", "use a larger --window, or a nearer view"
         )
-    _check_place(real_patches, simulated_patches, where)
+    _check_distance(real_patches, simulated_patches, where)
     reasons, inapplicable = _reasons_not_comparable(simulated, projector_on), _inapplicable(real, geometry)
     rows = [_histogram_row(real_patches, simulated_patches, reasons, seed)]
     for number, quantity in enumerate(QUANTITIES):
@@ -203,7 +203,7 @@ def _check(real: Capture, simulated: Capture, where: str) -> None:
         raise InputError(where, "calibration", "that of another unit", allowed, hint)
 
 
-def _check_place(real_patches: SpecimenPatches, simulated_patches: SpecimenPatches, where: str) -> None:
+def _check_distance(real_patches: SpecimenPatches, simulated_patches: SpecimenPatches, where: str) -> None:
     off = np.abs(simulated_patches.distance / real_patches.distance - 1)
     off = off[np.isfinite(off)]
     if len(off) and np.median(off) > _SAME_PLANE:

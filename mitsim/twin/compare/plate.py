@@ -24,8 +24,8 @@ from mitsim.sensor.camera import Camera
 from mitsim.sensor.sensor import Sensor
 from mitsim.twin.compare.denoise import denoised
 from mitsim.twin.compare.plain_image import PlainImage
-from mitsim.twin.finish.place import Bend, Place
-from mitsim.twin.finish.specimen import image_mask
+from mitsim.twin.finish.find_specimen import image_mask
+from mitsim.twin.finish.specimen import Bend, Specimen
 
 #: reflectance of the twin's plate without texture; the fit determines only its product with the power
 REFLECTANCE = 0.85
@@ -43,12 +43,12 @@ _LARGEST_TEXTURE = 4096
 _APERTURE_PX2 = 1 / 12 + 1 / (6 * _TEXELS_PER_PX**2)
 
 
-def plate(place: Place, sensor: Sensor, texture: Floats | None) -> Scene:
+def plate(specimen: Specimen, sensor: Sensor, texture: Floats | None) -> Scene:
     """Return a rectangle at the specimen, matt white, or with reflectances (rows, columns) from low x and y on."""
     backend.activate()
     mi = backend.mi
-    half = place.cell * place.occupied.shape[::-1] / 2
-    middle = place.low + half
+    half = specimen.cell * specimen.occupied.shape[::-1] / 2
+    middle = specimen.low + half
     to_world = mi.ScalarTransform4f().translate([*middle, 0.0]).scale([*half, 1.0])
     bsdf: dict[str, Any] = {"type": "matt_white", "reflectance": REFLECTANCE}
     if texture is not None:
@@ -56,20 +56,20 @@ def plate(place: Place, sensor: Sensor, texture: Floats | None) -> Scene:
         bitmap = {"type": "bitmap", "data": image, "raw": True, "wrap_mode": "clamp"}
         bsdf = {"type": "diffuse", "reflectance": bitmap}
     where = "the plane of a recording"
-    if place.bend is None or texture is not None:
+    if specimen.bend is None or texture is not None:
         shapes = {"specimen": {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}}
         return scene_from_dict(shapes, sensor.wavelength_nm, where)
     with TemporaryDirectory() as folder:
         file = Path(folder) / "sheet.ply"
-        _sheet(place, place.bend).export(file)
+        _sheet(specimen, specimen.bend).export(file)
         shapes = {"specimen": {"type": "ply", "filename": str(file), "bsdf": bsdf}}
         return scene_from_dict(shapes, sensor.wavelength_nm, where)
 
 
-def _sheet(place: Place, bend: Bend) -> trimesh.Trimesh:
+def _sheet(specimen: Specimen, bend: Bend) -> trimesh.Trimesh:
     """Return the extent of the specimen as a bent mesh, with normals toward the sensor."""
-    extent = place.cell * place.occupied.shape[::-1]
-    x, y = (place.low[axis] + np.linspace(0, extent[axis], _MESH + 1) for axis in (0, 1))
+    extent = specimen.cell * specimen.occupied.shape[::-1]
+    x, y = (specimen.low[axis] + np.linspace(0, extent[axis], _MESH + 1) for axis in (0, 1))
     xy = np.stack(np.meshgrid(x, y), axis=-1)
     vertices = np.concatenate([xy, bend.heights(xy)[..., None]], axis=-1).reshape(-1, 3)
     number = np.arange(len(vertices)).reshape(_MESH + 1, _MESH + 1)
@@ -80,7 +80,7 @@ def _sheet(place: Place, bend: Bend) -> trimesh.Trimesh:
     return mesh
 
 
-def texture_of(place: Place, camera: Camera, electrons: Floats, light: LightOnImagers, name: str) -> Floats:
+def texture_of(specimen: Specimen, camera: Camera, electrons: Floats, light: LightOnImagers, name: str) -> Floats:
     """Return the reflectance (rows, columns) of the plate, up to a factor.
 
     It is the ratio of the recorded image to that of a white plate. Outside the image of the reference camera, the value
@@ -88,7 +88,7 @@ def texture_of(place: Place, camera: Camera, electrons: Floats, light: LightOnIm
 
     Parameters
     ----------
-    place
+    specimen
         Pose and extent of the plate.
     camera
         Camera that took the image.
@@ -109,21 +109,21 @@ def texture_of(place: Place, camera: Camera, electrons: Floats, light: LightOnIm
     lit = white > 0.05 * np.percentile(white, 99)
     ratio = denoised(electrons[inside], lit) / np.where(lit, white, np.nan)
     ratio = np.where(np.isfinite(ratio), ratio, np.nanmedian(ratio))
-    extent = place.cell * place.occupied.shape[::-1]
-    reach = float(np.linalg.norm(place.world_from_sensor.translation))
+    extent = specimen.cell * specimen.occupied.shape[::-1]
+    reach = float(np.linalg.norm(specimen.world_from_sensor.translation))
     texel = reach / float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])) / _TEXELS_PER_PX
     columns, rows = np.minimum(np.ceil(extent / texel).astype(int), _LARGEST_TEXTURE)
-    x = place.low[0] + (np.arange(columns) + 0.5) / columns * extent[0]
-    y = place.low[1] + (np.arange(rows) + 0.5) / rows * extent[1]
+    x = specimen.low[0] + (np.arange(columns) + 0.5) / columns * extent[0]
+    y = specimen.low[1] + (np.arange(rows) + 0.5) / rows * extent[1]
     xs, ys = np.meshgrid(x, y)
-    points = place.world_from_sensor.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1))
+    points = specimen.world_from_sensor.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1))
     pixels = np.nan_to_num(camera.project(points)) - [roi.left, roi.top]
     sharp = ratio - _APERTURE_PX2 / 2 * laplace(ratio, mode="nearest")
     return np.asarray(map_coordinates(sharp, [pixels[..., 1], pixels[..., 0]], order=3, mode="nearest")).clip(0.0)
 
 
 def printed(
-    light: LightOnImagers, place: Place, camera: Camera, electrons: Floats, name: str, plain: PlainImage
+    light: LightOnImagers, specimen: Specimen, camera: Camera, electrons: Floats, name: str, plain: PlainImage
 ) -> LightOnImagers:
     """Return light with the print of the recorded plain image on the specimen of its only camera.
 
@@ -131,7 +131,7 @@ def printed(
     ----------
     light
         Light of a white specimen on the imager of the only camera.
-    place
+    specimen
         Pose and extent of the specimen.
     camera
         Camera that took the image.
@@ -147,7 +147,7 @@ def printed(
     texture_of : the reflectance of the plate instead of the light of its image
     """
     inside, radiance = light.rois[name].slices, light.radiance[name]
-    there = image_mask(place, camera)[inside]
+    there = image_mask(specimen, camera)[inside]
     white = radiance[list(plain.images)].max(axis=0).astype(float)
     ratio = np.where(there & (white > 0), denoised(electrons[inside], there) / np.where(white > 0, white, 1.0), 0.0)
     ratio /= max(float(np.percentile(ratio[there], 95)), 1e-12)

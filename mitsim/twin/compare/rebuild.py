@@ -1,10 +1,10 @@
 """Rebuild a real capture as a simulated one, its twin.
 
-Signal chain: real capture -> plane of the specimen, its extent and its bend (:mod:`mitsim.twin.finish.specimen`) -> a
-matt white sheet there (:mod:`mitsim.twin.compare.plate`) -> light of the sensor file's projector, pattern and room on
-the cameras of the capture (:mod:`mitsim.capture.simulated.simulate`) -> light scaled to the recorded median grey level
-of the specimen in the plain image (:mod:`mitsim.twin.compare.plain_image`) -> exposure by the file's imager -> capture
-of source ``simulated``.
+Signal chain: real capture -> plane of the specimen, its extent and its bend (:mod:`mitsim.twin.finish.find_specimen`)
+-> a matt white sheet there (:mod:`mitsim.twin.compare.plate`) -> light of the sensor file's projector, pattern and room
+on the cameras of the capture (:mod:`mitsim.capture.simulated.simulate`) -> light scaled to the recorded median grey
+level of the specimen in the plain image (:mod:`mitsim.twin.compare.plain_image`) -> exposure by the file's imager ->
+capture of source ``simulated``.
 
 *Taken from the recording*: cameras and rectification, pose and bend of the sheet, light code and number of frames,
 exposure if known, median grey level. *Taken from the sensor file*: projector, dot pattern, imager, blur. The scale is a
@@ -44,8 +44,8 @@ from mitsim.sensor.sensor import Sensor
 from mitsim.twin.compare.plain_image import median_level, plain_image
 from mitsim.twin.compare.plate import REFLECTANCE, plate, printed, texture_of
 from mitsim.twin.finish.electrons import chip_of, linearised
-from mitsim.twin.finish.place import Place
-from mitsim.twin.finish.specimen import MARGIN_PX, image_mask
+from mitsim.twin.finish.find_specimen import MARGIN_PX, image_mask
+from mitsim.twin.finish.specimen import Specimen
 
 #: rays per pixel
 SAMPLES = 16
@@ -68,7 +68,7 @@ def check_technology(real: Capture, sensor: Sensor, where: str) -> None:
 
 
 def rebuild(
-    real: Capture, sensor: Sensor, place: Place, where: str, *, projector_on: bool = True, seed: int = 1
+    real: Capture, sensor: Sensor, specimen: Specimen, where: str, *, projector_on: bool = True, seed: int = 1
 ) -> Capture:
     """Simulate a real capture with a plane in place of its specimen.
 
@@ -78,8 +78,8 @@ def rebuild(
         Recorded capture.
     sensor
         Supplies projector, pattern and imager in place of those of the device.
-    place
-        Pose and extent of the specimen, from :func:`mitsim.twin.finish.specimen.specimen_place`.
+    specimen
+        Pose and extent of the specimen, from :func:`mitsim.twin.finish.find_specimen.find_specimen`.
     where
         Name of the recorded capture in messages.
     projector_on
@@ -107,22 +107,22 @@ def rebuild(
     if not projector_on:
         size = twin_sensor.projector.optics.height, twin_sensor.projector.optics.width
         simulated.patterns = ProjectedPatterns(np.ones((1, *size), np.float32), twin_sensor.projector)
-    pose, around = place.world_from_sensor, place.corners()
+    pose, around = specimen.world_from_sensor, specimen.corners()
     noise = Noise() if projector_on else Noise.without("speckle")  # room light has no speckle
 
     def lit(texture: Floats | None) -> LightOnImagers:
-        scene = plate(place, twin_sensor, texture)
+        scene = plate(specimen, twin_sensor, texture)
         return simulated.light(scene, pose, rendering=Rendering(samples=SAMPLES), seed=seed, around=around, noise=noise)
 
     light, with_print = lit(None), projector_on and not plain.has_dots and len(real.rig.cameras) == 1
     with_print &= not isinstance(twin_sensor.pattern, AmplitudeModulation)
     electrons = linearised(plain.of(real.images[name]), chip)
     if with_print:
-        light = printed(light, place, real.rig.cameras[name], electrons, name, plain)
+        light = printed(light, specimen, real.rig.cameras[name], electrons, name, plain)
     if not projector_on:
-        texture = texture_of(place, real.rig.cameras[name], electrons, light, name)
+        texture = texture_of(specimen, real.rig.cameras[name], electrons, light, name)
         light = lit(texture / texture.max())
-    scale = _scale(simulated, light, place, real, where, seed)
+    scale = _scale(simulated, light, specimen, real, where, seed)
     scaled = replace(light, radiance={key: values * np.float32(scale) for key, values in light.radiance.items()})
     capture = simulated.expose(scaled, seed)
     power = scale * sensor.projector.flux * REFLECTANCE
@@ -138,7 +138,7 @@ def rebuild(
         "recorded_by": real.sensor,
         "serial": real.serial,
         "power_times_reflectance_w": power if projector_on else None,
-        "off_plane_mm": place.off_plane,
+        "off_plane_mm": specimen.off_plane,
         "taken": taken,
     }
     return capture
@@ -170,14 +170,14 @@ def like(real: Capture, sensor: Sensor, where: str) -> Sensor:
 
 
 def _scale(
-    simulated: SimulatedSensor, light: LightOnImagers, place: Place, real: Capture, where: str, seed: int
+    simulated: SimulatedSensor, light: LightOnImagers, specimen: Specimen, real: Capture, where: str, seed: int
 ) -> float:
     """Return the factor of the light, by bisection, with which the specimen's median level is the recorded one.
 
     Levels have their noise: where a pattern has two levels, few pixels are near the median, and noise moves it.
     """
     name, plain = next(iter(real.rig.cameras)), plain_image(real)
-    roi, there = light.rois[name], image_mask(place, real.rig.cameras[name], MARGIN_PX)
+    roi, there = light.rois[name], image_mask(specimen, real.rig.cameras[name], MARGIN_PX)
     if not there.any():
         raise InputError(
             "REAL", "specimen", "no pixels", "a specimen in the image", "use a larger --window, or a nearer view"

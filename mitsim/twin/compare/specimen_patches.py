@@ -1,7 +1,7 @@
 """Metrics of a specimen in one capture, in patches of 40 px: grey levels, points and their noise.
 
 Signal chain, image: plain image of the reference camera (:mod:`mitsim.twin.compare.plain_image`), pixels on the
-specimen (:func:`mitsim.twin.finish.specimen.image_mask`) -> local mean and deviation, crossings of the local mean,
+specimen (:func:`mitsim.twin.finish.find_specimen.image_mask`) -> local mean and deviation, crossings of the local mean,
 changes of sign between neighbouring pixels -> values of every patch.
 
 Signal chain, cloud: pixels on the specimen, on the cloud's grid -> points and statuses of every patch; plane of the
@@ -31,9 +31,9 @@ from mitsim.decoding.cloud import Geometry, Settings, capture_cloud
 from mitsim.decoding.matching.row_error import row_error
 from mitsim.decoding.matching.stereo import StereoGeometry
 from mitsim.twin.compare.plain_image import plain_image
+from mitsim.twin.finish.find_specimen import MARGIN_PX, feet_of, image_mask, on_specimen
 from mitsim.twin.finish.fine_detail import finest_detail
-from mitsim.twin.finish.place import Place
-from mitsim.twin.finish.specimen import MARGIN_PX, feet_of, image_mask, on_specimen
+from mitsim.twin.finish.specimen import Specimen
 
 PATCH_PX = 40
 
@@ -89,7 +89,7 @@ class SpecimenPatches:
 
 
 def specimen_patches(
-    capture: Capture, settings: Settings, geometry: Geometry, place: Place, window_px: int
+    capture: Capture, settings: Settings, geometry: Geometry, specimen: Specimen, window_px: int
 ) -> SpecimenPatches:
     """Compute the patches of a capture's specimen.
 
@@ -101,7 +101,7 @@ def specimen_patches(
         Settings of its decoder.
     geometry
         Geometry of its decoder.
-    place
+    specimen
         Pose and extent of the specimen, in the sensor frame of the capture.
     window_px
         Side of the window of local mean and deviation [px].
@@ -111,7 +111,7 @@ def specimen_patches(
     patch_rows : the row errors alone
     """
     camera, image = capture.rig.reference, reference_levels(capture).astype(float)
-    on_image = image_mask(place, camera, MARGIN_PX)
+    on_image = image_mask(specimen, camera, MARGIN_PX)
     mean = uniform_filter(image, window_px)
     deviation = np.sqrt(np.maximum(uniform_filter(image**2, window_px) - mean**2, 0.0))
     across = (image[:, 1:] > mean[:, 1:]) != (image[:, :-1] > mean[:, :-1])
@@ -123,9 +123,9 @@ def specimen_patches(
 
     crossings = of_image(np.pad(across.astype(float), ((0, 0), (1, 0))))
     grid = geometry.grid
-    cloud, on_grid, grid_corners = _cloud_patches(capture, settings, geometry, place)
+    cloud, on_grid, grid_corners = _cloud_patches(capture, settings, geometry, specimen)
     status = _tiles(np.where(on_grid, cloud.status.astype(float), np.nan), grid_corners)
-    recovered = _tiles(np.where(on_grid, points_on_specimen(cloud, place), np.nan), grid_corners)
+    recovered = _tiles(np.where(on_grid, points_on_specimen(cloud, specimen), np.nan), grid_corners)
     points = np.where(on_grid[..., None], cloud.points, np.nan).astype(float) - grid.origin
     tiles = np.stack([_tiles(points[..., axis], grid_corners) for axis in range(3)], axis=-1)
     noise = ray_noise_std(tiles)
@@ -157,7 +157,7 @@ def specimen_patches(
 
 
 def patch_rows(
-    capture: Capture, settings: Settings, geometry: StereoGeometry, place: Place
+    capture: Capture, settings: Settings, geometry: StereoGeometry, specimen: Specimen
 ) -> tuple[Floats, Floats, Floats]:
     """Return row errors (Q,) [px] of the patches of a pair's cloud.
 
@@ -171,14 +171,14 @@ def patch_rows(
         Settings of its decoder.
     geometry
         Rectified geometry of its pair of cameras.
-    place
+    specimen
         Pose and extent of the specimen.
 
     See Also
     --------
     specimen_patches : all quantities of the patches
     """
-    cloud, on_grid, corners = _cloud_patches(capture, settings, geometry, place)
+    cloud, on_grid, corners = _cloud_patches(capture, settings, geometry, specimen)
     valid = _tiles(np.where(on_grid, cloud.valid.astype(float), np.nan), corners)
     usable = np.nansum(valid, axis=-1) >= _LEAST_FOR_ROWS * np.isfinite(valid).sum(axis=-1)
     off = _tiles(np.where(cloud.valid, _disparity(cloud, geometry), np.nan), corners)
@@ -190,21 +190,21 @@ def patch_rows(
 
 
 def _cloud_patches(
-    capture: Capture, settings: Settings, geometry: Geometry, place: Place
+    capture: Capture, settings: Settings, geometry: Geometry, specimen: Specimen
 ) -> tuple[PointCloud, NDArray[np.bool_], list[tuple[int, int]]]:
     """Return the cloud of a specimen, its pixels (H, W) on the grid, and the corners of its patches."""
     grid = geometry.grid
-    on_grid = on_specimen(place, grid.origin, grid.rays(), grid.angular_pitch, MARGIN_PX)
+    on_grid = on_specimen(specimen, grid.origin, grid.rays(), grid.angular_pitch, MARGIN_PX)
     cloud = capture_cloud(capture, settings, geometry, roi=Roi.around(on_grid))
     return cloud, on_grid, patch_corners(on_grid, PATCH_PX, LEAST_ON)
 
 
-def points_on_specimen(cloud: PointCloud, place: Place) -> NDArray[np.bool_]:
+def points_on_specimen(cloud: PointCloud, specimen: Specimen) -> NDArray[np.bool_]:
     """Return which pixels (H, W) have a point on the specimen: within 1 % of its distance along their ray."""
-    start = float(place.world_from_sensor.points(cloud.grid.origin)[2])
-    feet, reach, _ = feet_of(place.world_from_sensor, cloud.grid.origin, cloud.grid.rays())
-    if place.bend is not None:
-        reach = reach * (1 - place.bend.heights(feet) / start)
+    start = float(specimen.world_from_sensor.points(cloud.grid.origin)[2])
+    feet, reach, _ = feet_of(specimen.world_from_sensor, cloud.grid.origin, cloud.grid.rays())
+    if specimen.bend is not None:
+        reach = reach * (1 - specimen.bend.heights(feet) / start)
     distance = np.linalg.norm(cloud.points.astype(float) - cloud.grid.origin, axis=-1)
     return np.asarray(np.abs(distance - reach) <= FALSE_SHARE_OF_DISTANCE * reach) & cloud.valid
 
@@ -220,14 +220,14 @@ def reference_levels(capture: Capture) -> NDArray[np.unsignedinteger[Any]]:
     return plain_image(capture).of(next(iter(capture.images.values())))
 
 
-def contrast_window(capture: Capture, place: Place) -> int:
+def contrast_window(capture: Capture, specimen: Specimen) -> int:
     """Return the odd side [px] of a window for local means, in which several dots of any size lie.
 
     It is 2.5 times the mean run of bright and dark pixels in the specimen's rows. The threshold is the mean of 31 px.
     """
     image = reference_levels(capture).astype(float)
     bright = image > uniform_filter(image, _WINDOWS[1])
-    there = image_mask(place, capture.rig.reference, MARGIN_PX)[:, 1:]
+    there = image_mask(specimen, capture.rig.reference, MARGIN_PX)[:, 1:]
     changes = np.count_nonzero((bright[:, 1:] != bright[:, :-1]) & there)
     run = float(np.count_nonzero(there) / changes) if changes else float(_WINDOWS[1])
     return int(np.clip(_RUNS * run, *_WINDOWS)) // 2 * 2 + 1

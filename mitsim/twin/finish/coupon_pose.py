@@ -1,8 +1,8 @@
 """Estimate the pose of the sensor over a flat coupon from the points that the coupon gave.
 
 Signal chain: cloud and the window of its pixels that shows the coupon -> plane through most of the points there
-(:func:`mitsim.twin.finish.place.found_place`) -> a frame in that plane: origin where the middle of the window meets it,
-x along the window's rows, z along the normal, toward the sensor.
+(:func:`mitsim.twin.finish.specimen.specimen_in_cloud`) -> a frame in that plane: origin where the middle of the window
+meets it, x along the window's rows, z along the normal, toward the sensor.
 
 The plane is that of the points, so the offset of the points from the true surface is not seen.
 """
@@ -17,7 +17,7 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
 from characterisation.region_of_interest import Roi
 from mitsim.sensor.transforms import Transform
-from mitsim.twin.finish.place import found_place
+from mitsim.twin.finish.specimen import specimen_in_cloud
 
 #: least cosine of the incidence: a plane seen at 85 deg, beyond the limit of a campaign's orientations
 _LEAST_COSINE = 0.087
@@ -48,7 +48,7 @@ def pose_over_coupon(cloud: PointCloud, window: Roi, where: str) -> Transform:
     outside[window.slices] = False
     points, status = cloud.points.copy(), cloud.status.copy()
     points[outside], status[outside] = np.nan, Status.NO_SURFACE
-    plane = found_place(replace(cloud, points=points, status=status), where).world_from_sensor
+    plane = specimen_in_cloud(replace(cloud, points=points, status=status), where).world_from_sensor
     normal = plane.rotation[2]  # in the sensor frame
     middle = window.top + window.height // 2
     columns = np.array([window.left, window.left + window.width // 2, window.right - 1])

@@ -51,8 +51,8 @@ def compare_dots(view: CouponView, renderer: WhiteCouponRenderer) -> Dots:
     light has no dots.
     """
     camera = renderer.sensor.rig.cameras[view.camera]
-    roi = coupon_roi(camera, view.place)
-    spectrum = np.fft.fft2(renderer.white(view.place, view.camera, roi, "first") * view.exposure_s)
+    roi = coupon_roi(camera, view.specimen)
+    spectrum = np.fft.fft2(renderer.white(view.specimen, view.camera, roi, "first") * view.exposure_s)
     rows, columns = view.rows - roi.top, view.columns - roi.left
     pairs, none = _neighbours(view), np.zeros(len(view.unit))
 

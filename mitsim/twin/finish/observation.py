@@ -33,7 +33,7 @@ from mitsim.sensor.imager import Imager
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.sensor import Sensor
 from mitsim.twin.finish.electrons import PixelNoise, chip_of, linearised, pixel_noise
-from mitsim.twin.finish.place import Place
+from mitsim.twin.finish.specimen import Specimen
 from mitsim.twin.finish.white_coupon import Pattern, WhiteCouponRenderer, coupon_roi
 
 #: margin inside the coupon's edge that its blur may reach [px]
@@ -58,7 +58,7 @@ class CouponView:
       there is none, or if it was subtracted.
     - ``toward_camera``, ``toward_projector`` (N, 3): unit directions, in the frame of the coupon.
     - ``noise`` of a pixel's mean.
-    - ``whole``: number of blocks on the coupon, saturated ones included; ``place`` of the coupon.
+    - ``whole``: number of blocks on the coupon, saturated ones included; the coupon is the ``specimen``.
     - ``why_no_block``: reason why there is no block on the coupon, "" otherwise.
     """
 
@@ -78,7 +78,7 @@ class CouponView:
     toward_projector: Floats = field(repr=False)
     noise: PixelNoise = field(repr=False)
     whole: int
-    place: Place = field(repr=False)
+    specimen: Specimen = field(repr=False)
     why_no_block: str = ""
 
     @property
@@ -109,10 +109,10 @@ class CouponView:
 
 @dataclass(frozen=True)
 class CouponCapture:
-    """A capture of a coupon: its ``place``, the ``index`` of the capture, and its name ``where`` in messages."""
+    """A capture of a coupon, its ``specimen``; the ``index`` of the capture, and its name ``where`` in messages."""
 
     capture: Capture
-    place: Place
+    specimen: Specimen
     index: int
     where: str
 
@@ -130,7 +130,7 @@ def observe(
     Parameters
     ----------
     coupon_capture
-        Capture, and place of the coupon in it.
+        Capture, and the coupon in it.
     renderer
         Renders the white coupon; its sensor has the cameras of the capture.
     block_px
@@ -145,7 +145,12 @@ def observe(
     InputError
         If the capture is one of time of flight or has no images, or its exposures or its number of images are wrong.
     """
-    sensor, capture, place, where = renderer.sensor, coupon_capture.capture, coupon_capture.place, coupon_capture.where
+    sensor, capture, specimen, where = (
+        renderer.sensor,
+        coupon_capture.capture,
+        coupon_capture.specimen,
+        coupon_capture.where,
+    )
     if isinstance(sensor.pattern, AmplitudeModulation):
         raise InputError(where, "technology", capture.technology, "images of light, not of its correlation")
     if not capture.images:
@@ -160,9 +165,9 @@ def observe(
             raise InputError(
                 where, "images", f"{len(stack)} of {name}", f"as many at each of {len(exposures)} exposures"
             )
-        roi = coupon_roi(sensor.rig.cameras[name], place)
-        white = renderer.white(place, name, roi, pattern)
-        region = _CouponRegion.of(place, sensor, name, roi, white, capture.decoding.read_out.get(name))
+        roi = coupon_roi(sensor.rig.cameras[name], specimen)
+        white = renderer.white(specimen, name, roi, pattern)
+        region = _CouponRegion.of(specimen, sensor, name, roi, white, capture.decoding.read_out.get(name))
         loss, count = renderer.corner_loss(name), len(stack) // len(exposures)
         for number, seconds in enumerate(exposures):
             images = stack[number * count : (number + 1) * count, *roi.slices]
@@ -190,8 +195,8 @@ def observe(
                     region.toward(region.projector_centre, rows, columns),
                     pixel_noise(sensor.imager, chip, count - ambient, float(seconds), ambient),
                     blocks.whole,
-                    place,
-                    "" if blocks.whole else _why_no_block(region, place, block_px),
+                    specimen,
+                    "" if blocks.whole else _why_no_block(region, specimen, block_px),
                 )
             )
     return views
@@ -215,14 +220,14 @@ class _CouponRegion:
 
     @classmethod
     def of(
-        cls, place: Place, sensor: Sensor, name: str, roi: Roi, white: Floats, read_out: Roi | None
+        cls, specimen: Specimen, sensor: Sensor, name: str, roi: Roi, white: Floats, read_out: Roi | None
     ) -> _CouponRegion:
         """Intersect the view rays of a region with the plane of the coupon, and select the pixels inside its edge.
 
         ``read_out`` is the region that the camera ``name`` read out, None for the whole image.
         """
         camera = sensor.rig.cameras[name]
-        pose = place.world_from_sensor
+        pose = specimen.world_from_sensor
         centre, projector_centre = pose.points(camera.centre), pose.points(sensor.projector.optics.centre)
         columns, rows = roi.pixels()
         rays = camera.rays(np.stack([columns, rows], axis=-1).astype(float))
@@ -233,7 +238,7 @@ class _CouponRegion:
         focal = float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
         footprint = reach / (focal * np.where(down, -rays[..., 2], 1.0))
         inside = down & (white > _UNLIT * white.max())
-        inside[inside] = place.contains(points[inside][:, :2], _EDGE_PX * footprint[inside])
+        inside[inside] = specimen.contains(points[inside][:, :2], _EDGE_PX * footprint[inside])
         if read_out is not None:
             inside &= (columns >= read_out.left) & (columns < read_out.right)
             inside &= (rows >= read_out.top) & (rows < read_out.bottom)
@@ -275,9 +280,9 @@ class _Blocks:
         return cls(rows[kept], columns[kept], block.reshape(-1), grid, int(held.sum()))
 
 
-def _why_no_block(region: _CouponRegion, place: Place, width: int) -> str:
+def _why_no_block(region: _CouponRegion, specimen: Specimen, width: int) -> str:
     """Return the reason why a camera has no block on a coupon, in words."""
-    met = np.isfinite(region.points).all(axis=-1) & place.contains(
+    met = np.isfinite(region.points).all(axis=-1) & specimen.contains(
         region.points[..., :2].reshape(-1, 2), np.zeros(region.points[..., 0].size)
     ).reshape(region.points.shape[:2])
     if not met.any():

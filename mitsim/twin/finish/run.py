@@ -1,6 +1,6 @@
 """Fit the finish of a coupon and the power of the projector to captures of the coupon.
 
-Signal chain: capture folders, scene of the coupon -> place of the coupon in each (:mod:`mitsim.twin.finish.specimen`)
+Signal chain: capture folders, scene of the coupon -> its pose in each (:mod:`mitsim.twin.finish.find_specimen`)
 -> views (:mod:`mitsim.twin.finish.observation`) -> fit (:mod:`mitsim.twin.finish.estimate`) -> alpha, Ra-equivalent,
 power [W], residual. If the pattern is not that of the sensor file, its dots are compared, too
 (:mod:`mitsim.twin.finish.dots`).
@@ -30,12 +30,12 @@ from mitsim.sensor.sensor import Sensor
 from mitsim.twin.finish.dots import Dots, compare_dots
 from mitsim.twin.finish.electrons import sensor_of
 from mitsim.twin.finish.estimate import Fit, FittedQuantity, fit_views
+from mitsim.twin.finish.find_specimen import find_coupon
 from mitsim.twin.finish.finish import MetalFinish, metal_finish
 from mitsim.twin.finish.observation import CouponCapture, CouponView, observe
-from mitsim.twin.finish.place import Place
 from mitsim.twin.finish.posterior import FinishPosterior, finish_posterior
 from mitsim.twin.finish.problem import Residual
-from mitsim.twin.finish.specimen import place_of
+from mitsim.twin.finish.specimen import Specimen
 from mitsim.twin.finish.white_coupon import WhiteCouponRenderer, pattern_is_known, with_rig
 
 #: side of a block with a known pattern [px]: several times the length of the grain, which is under 1 px
@@ -54,7 +54,7 @@ class CouponFit:
     - ``sensor``; ``finish``: name of metal and process, or of the diffuse sheet; ``metal``: None for a diffuse sheet.
     - ``fit``: result of the fit.
     - ``dots``: comparison of the dots by view, if the pattern is unknown.
-    - ``captures``: their folders; ``places`` of the coupon in them; ``source`` of the captures.
+    - ``captures``: their folders; the coupon in them as ``specimens``; ``source`` of the captures.
     - ``block_px``: side of a block [px].
     - ``pattern_unknown``: whether the pattern of a capture is not known to be that of the sensor file.
     - ``posterior``: what the captures say of the finish, for ``[unknowns.finish.measured]``; None for a diffuse sheet.
@@ -66,7 +66,7 @@ class CouponFit:
     fit: Fit
     dots: tuple[Dots, ...]
     captures: tuple[str, ...]
-    places: tuple[Place, ...] = field(repr=False)
+    specimens: tuple[Specimen, ...] = field(repr=False)
     block_px: int
     source: str
     pattern_unknown: bool
@@ -199,7 +199,7 @@ def fit_captures(
 
     views: list[CouponView] = []
     dots: list[Dots] = []
-    places: list[Place] = []
+    specimens: list[Specimen] = []
     renderer, calibration = WhiteCouponRenderer(with_rig(chosen, first.rig)), calibration_table(first.rig)
     unknown = False
     for index, folder in enumerate(track(list(captures), "captures", len(captures))):
@@ -210,16 +210,16 @@ def fit_captures(
             renderer, calibration = WhiteCouponRenderer(with_rig(chosen, capture.rig)), calibration_table(capture.rig)
         pattern_known = pattern_is_known(capture, chosen)
         unknown |= not pattern_known
-        place = place_of(capture, renderer.sensor, (sample.width, sample.height), str(folder), roi)
+        specimen = find_coupon(capture, renderer.sensor, (sample.width, sample.height), str(folder), roi)
         lit = capture.source != "simulated" or has_emitters(sample.scene)
-        coupon_capture = CouponCapture(capture, place, index, str(folder))
+        coupon_capture = CouponCapture(capture, specimen, index, str(folder))
         capture_views = observe(
             coupon_capture, renderer, block, pattern="mean" if pattern_known else "level", lit_room=lit
         )
         if not pattern_known and isinstance(chosen.pattern, DotPattern):
             dots += [compare_dots(view, renderer) for view in capture_views if view.size]
         views += capture_views
-        places.append(place)
+        specimens.append(specimen)
     if not sum(view.whole for view in views):
         why = "; ".join(dict.fromkeys(f"{view.camera} of {view.name}: {view.why_no_block}" for view in views[:4]))
         none = f"no block of {block} px on the coupon: {why}"
@@ -237,7 +237,7 @@ def fit_captures(
         fit,
         tuple(dots),
         tuple(str(c) for c in captures),
-        tuple(places),
+        tuple(specimens),
         block,
         first.source,
         unknown,
@@ -287,7 +287,7 @@ def _view_numbers(residual: Residual) -> dict[str, Any]:
         "rms_dn": residual.rms_dn,
         "rms_relative": residual.rms_relative,
         "rms_in_noise": residual.rms_in_noise,
-        "off_plane_mm": view.place.off_plane,
+        "off_plane_mm": view.specimen.off_plane,
     }
 
 

@@ -1,219 +1,259 @@
-"""Find plane, outline and bend of the flat specimen in a capture, and the pixels that show it.
+"""Find plane, outline and bend of a coupon, from the capture's pose, or from its decoded cloud.
 
-Signal chain: capture -> cloud, from its own decoder -> plane of the points in the image region that the user gave, or
-of most points (:mod:`mitsim.twin.finish.place`) -> its outline, and the bend of its points
-(:mod:`mitsim.twin.finish.place`) -> pixels and view rays that meet it.
+Signal chain with a known pose: the coupon's own frame.
+
+Signal chain without a pose: cloud -> plane through most of its points, by RANSAC, then by least squares -> frame with z
+along the normal, toward the sensor -> cells of a grid in the plane that contain points -> holes filled -> largest
+connected region. RANSAC: Fischler & Bolles, Commun. ACM 24, 1981.
+
+The bend of a sheet is a low-order surface over its plane: median heights of square cells -> Legendre polynomials of
+total degree d by least squares, for several d -> the degree with the smallest leave-one-out error. The leave-one-out
+residuals are r_i / (1 - h_ii), with h_ii the leverages (Allen, Technometrics 16 (1974) 125). Allen's PRESS is the sum
+of their squares; the median of the squares is used here, so that a few wrong cells do not choose the degree. A higher
+degree is chosen only if it predicts cells that were not used in its fit, so a flat plate stays flat within its noise.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial.legendre import legvander2d
 from numpy.typing import NDArray
+from scipy import ndimage
 
-from characterisation.features.fits import fit_plane
-from characterisation.features.robust_fit import FitError
 from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
-from characterisation.region_of_interest import Roi
-from mitsim.capture.capture import Capture
-from mitsim.decoding.cloud import Settings, capture_cloud, capture_geometry
-from mitsim.sensor.camera import Camera
-from mitsim.sensor.roi import roi_around
-from mitsim.sensor.sensor import Sensor
+from characterisation.point_cloud import PointCloud
 from mitsim.sensor.transforms import Transform
-from mitsim.twin.finish.place import Bend, Place, fit_bend, found_place, known_place, plane_points
 
-#: margin inside the specimen's outline that is not used [px]: its edge is blurred, and matched with the background
-MARGIN_PX = 15.0
-
-#: least number of points of a plane in the user's region; chosen
-_FEWEST_POINTS = 500
-
-#: about the largest number of points for its fit, which bounds the time; chosen
-_PLANE_POINTS = 20000
-
-#: least cosine between a ray and the normal with which the ray meets the plane
-GRAZING = 1e-6
-
-#: number of cells along the longer side of the specimen
+#: number of cells along the longer side of the recovered points
 _CELLS = 120
+#: largest distance of a point from the plane, as a share of its distance from the sensor; a sheet may be bent
+_FLAT = 0.01
+_TRIALS = 200
+_ROUNDS = 3
+#: least number of points in a cell, as a share of the 95th percentile of all cells; false matches are sparser
+_DENSE = 0.3
+#: least number of points of a plane
+_FEWEST = 500
+#: total degrees of the bends that are tried
+DEGREES = (1, 2, 3, 4, 5, 6)
+#: number of cells along the longer side for the fit of a bend; chosen
+_BEND_CELLS = 28
+#: least number of points in such a cell, for their median height; chosen
+_BEND_POINTS = 20
 
-#: largest distance from the plane of points that are used for the bend, as a share of the sensor's distance
-_NEAR_PLANE = 0.02
+#: least number of cells for each coefficient of a degree
+_CELLS_PER_TERM = 5
 
 
-def specimen_place(capture: Capture, settings: Settings, roi: Roi | None, where: str) -> Place:
-    """Estimate the plane and the outline of the specimen from the capture's decoded cloud.
+@dataclass(frozen=True)
+class Bend:
+    """Heights over the plane z = 0 of a specimen.
 
-    Parameters
-    ----------
-    capture, settings
-        Capture with images, and the settings of its decoder.
-    roi
-        Region of the reference image [px] that shows only the specimen, also where it has no points. The plane is
-        fitted to its points (:func:`characterisation.features.fits.fit_plane`). Without a region,
-        :func:`mitsim.twin.finish.place.found_place` takes the plane of most points, and the outline of the dense ones.
-    where
-        Name of the capture in messages.
+    - ``middle``, ``half`` (2,) [mm]: centre and half the size of the extent in x and y.
+    - ``coefficients`` (k,) [mm] of the Legendre polynomials up to the total degree ``degree``.
+    - ``rms`` [mm] of the heights at the fitted cells.
+    """
 
-    Returns
-    -------
-    Place
-        Its ``off_plane`` is a robust standard deviation with a region, and the rms distance without one.
+    middle: Floats
+    half: Floats
+    degree: int
+    coefficients: Floats
+    rms: float
+
+    def heights(self, xy: Floats) -> Floats:
+        """Return heights (...) [mm] at points (..., 2) [mm] of the plane; outside the extent, those of its edge."""
+        return np.asarray(_terms((xy - self.middle) / self.half, self.degree) @ self.coefficients)
+
+
+@dataclass(frozen=True)
+class Specimen:
+    """A flat coupon in the plane z = 0 of its own frame, with the normal +z toward the sensor.
+
+    - ``world_from_sensor``: transform from the sensor frame to the frame of the coupon [mm].
+    - ``occupied`` (R, C): cells of the plane that belong to the coupon.
+    - ``low`` (x, y) [mm]: corner of the first cell; ``cell`` (x, y) [mm]: size of a cell.
+    - ``off_plane`` [mm]: scatter of the cloud's points about the plane, NaN if the pose was known.
+    - ``bend``: heights of the coupon over the plane, None for a flat one.
+    """
+
+    world_from_sensor: Transform
+    low: Floats
+    cell: Floats
+    occupied: NDArray[np.bool_]
+    off_plane: float = float("nan")
+    bend: Bend | None = None
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height [mm] of a rectangle, centred at the origin, that contains the coupon."""
+        high = self.low + self.cell * self.occupied.shape[::-1]
+        width, height = 2 * np.maximum(np.abs(self.low), np.abs(high))
+        return float(width), float(height)
+
+    def corners(self) -> Floats:
+        """Return the corners (4, 3) [mm] of the rectangle of all cells, in the sensor frame."""
+        high = self.low + self.cell * self.occupied.shape[::-1]
+        xs, ys = np.meshgrid([self.low[0], high[0]], [self.low[1], high[1]])
+        return self.world_from_sensor.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1).reshape(-1, 3))
+
+    def contains(self, points: NDArray[np.floating], margin: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Return which points (N, 2) [mm] of the plane lie on the coupon, ``margin`` (N,) [mm] or more inside its edge.
+
+        The margin is tested at four positions, in both directions of x and y.
+        """
+        occupied = np.pad(self.occupied, 1)  # all other points lie in its rim
+        columns, rows = occupied.shape[1], occupied.shape[0]
+
+        def cells(axis: int, count: int, shift: NDArray[np.floating] | float) -> NDArray[np.intp]:
+            index = np.floor((points[:, axis] + shift - self.low[axis]) / self.cell[axis])
+            return np.asarray(np.fmax(np.fmin(index, count - 2), -1), np.intp) + 1  # NaN lies outside
+
+        column, row = cells(0, columns, 0.0), cells(1, rows, 0.0) * columns
+        inside = np.ones(len(points), bool)
+        for shift in (margin, -margin):
+            inside &= occupied.take(row + cells(0, columns, shift))
+            inside &= occupied.take(cells(1, rows, shift) * columns + column)
+        return inside
+
+
+def known_specimen(world_from_sensor: Transform, width: float, height: float) -> Specimen:
+    """Return a centred coupon of this size [mm] in the plane z = 0, for a capture with a pose."""
+    size = np.array([width, height])
+    return Specimen(world_from_sensor, -size / 2, size, np.ones((1, 1), bool))
+
+
+def specimen_in_cloud(cloud: PointCloud, where: str) -> Specimen:
+    """Find the plane through most points of a cloud, and the outline of the points in it.
+
+    ``off_plane`` of the result is their rms distance from the plane. Messages name ``where``.
 
     Raises
     ------
     InputError
-        If the capture has no images, the region is not in the image, or too few points lie in one plane.
-
-    See Also
-    --------
-    place_of : the place of a coupon whose pose may be known
+        If too few points lie in one plane.
     """
-    if not capture.images:
-        raise InputError(where, "images", "none", "a capture with images, not only a map of the device")
-    if roi is None:
-        cloud = capture_cloud(capture, settings)
-        flat = found_place(cloud, where)
-        return replace(flat, bend=_bend_of(flat, cloud.points[cloud.valid].astype(float)))
-    camera, geometry = capture.rig.reference, capture_geometry(capture, settings)
-    window = [roi.left, roi.top, roi.width, roi.height]
-    if not roi.fits(camera.width, camera.height):
-        allowed = f"COLUMN ROW WIDTH HEIGHT within {camera.width} x {camera.height} pixels"
-        raise InputError("--window", "", window, allowed)
-    grid = geometry.grid
-    low, high = np.array([roi.left, roi.top]), np.array([roi.right, roi.bottom])
+    points = cloud.points[cloud.valid].astype(float)
+    flat = plane_points(points)
+    if flat.sum() < _FEWEST:
+        raise _no_plane(where, int(flat.sum()))
+    points = points[flat]
+    for _ in range(_ROUNDS):  # outliers tilt the plane until the grid of cells has excluded them
+        pose = _frame(points)
+        local = pose.points(points)
+        low, high = local[:, :2].min(axis=0), local[:, :2].max(axis=0)
+        cell = np.full(2, (high - low).max() / _CELLS)
+        column, row = np.floor((local[:, :2] - low) / cell).astype(int).T
+        occupied = _largest_piece(row, column)
+        if not occupied.any():
+            raise _no_plane(where, 0)
+        points = points[occupied[row, column]]
+    off = pose.points(points)[:, 2]
+    return Specimen(pose, low, cell, occupied, float(np.sqrt(np.mean(off**2))))
 
-    def shown(points: Floats) -> NDArray[np.bool_]:
-        pixels = camera.project(points)
-        return np.asarray(((pixels >= low) & (pixels < high)).all(axis=-1))
 
-    inside = shown(grid.origin + 1000.0 * grid.rays())
-    cloud = capture_cloud(capture, settings, geometry, roi=Roi.around(inside))
-    candidates = cloud.points[inside & cloud.valid].astype(float)
-    # outliers of a decoder lie far away along the rays, and a fit that starts with them would follow the rays
-    points = candidates[plane_points(candidates)]
-    if len(points) < _FEWEST_POINTS:
-        coplanar = f", {len(points)} of them in one plane" if len(candidates) else ""
-        number = f"{len(candidates)} points in {window}{coplanar}"
-        raise InputError("--window", "", number, f"{_FEWEST_POINTS} or more, to find its plane")
-    try:
-        plane = fit_plane(points[:: -(-len(points) // _PLANE_POINTS)], camera.centre)
-    except FitError as error:
-        hint = "give a region that shows a flat specimen, from a less oblique view"
-        raise InputError("--window", "", f"{window}, where {error}", "a plane", hint) from None
-    off = (points - plane.point) @ plane.normal
-    across = np.array([1.0, 0.0, 0.0]) - plane.normal[0] * plane.normal
-    across /= np.linalg.norm(across)
-    axes = np.stack([across, np.cross(plane.normal, across), plane.normal], axis=1)
-    pose = Transform(axes, plane.point).inverse()
-    ring = np.linspace(0.0, 1.0, 33)[:, None]
-    corners = np.array([low, [high[0] - 1, low[1]], high - 1, [low[0], high[1] - 1]], float)
-    rim = np.concatenate(
-        [(1 - ring) * a + ring * b for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+def plane_points(points: Floats) -> NDArray[np.bool_]:
+    """Return which points (N, 3) [mm] lie near the plane through most of them, by RANSAC (see the module).
+
+    The points are in the frame of the sensor: the limit grows with their distance from the origin.
+    """
+    best = np.zeros(len(points), bool)
+    if len(points) < _FEWEST:
+        return best
+    rng = np.random.default_rng(0)
+    near = _FLAT * np.linalg.norm(points, axis=1)
+    sample = rng.integers(0, len(points), min(len(points), 4000))
+    votes = -1
+    for _ in range(_TRIALS):
+        a, b, c = points[rng.integers(0, len(points), 3)]
+        normal = np.cross(b - a, c - a)
+        length = float(np.linalg.norm(normal))
+        if length < 1e-9:
+            continue
+        count = int((np.abs((points[sample] - a) @ (normal / length)) < near[sample]).sum())
+        if count > votes:
+            votes, best = count, np.abs((points - a) @ (normal / length)) < near
+    return best
+
+
+def _frame(points: Floats) -> Transform:
+    """Return the frame of a coupon from the sensor's: the mean of its points (N, 3) [mm], z toward the sensor."""
+    centre = points.mean(axis=0)
+    axes = np.linalg.svd(points - centre, full_matrices=False)[2]
+    normal = -axes[2] * np.sign(axes[2] @ centre)
+    across = axes[0] if abs(axes[0, 0]) > abs(axes[1, 0]) else axes[1]
+    across = across * np.sign(across[0])
+    return Transform(np.stack([across, np.cross(normal, across), normal], axis=1), centre).inverse()
+
+
+def _largest_piece(row: NDArray[np.int64], column: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return the largest connected region of the cells (R, C) that are dense with points, with its holes filled."""
+    count = np.zeros((row.max() + 1, column.max() + 1))
+    np.add.at(count, (row, column), 1)
+    dense = np.pad(count > _DENSE * np.percentile(count[count > 0], 95), 3)
+    dense = ndimage.binary_fill_holes(ndimage.binary_closing(dense, iterations=2))
+    pieces, piece_count = ndimage.label(ndimage.binary_opening(dense, iterations=2)[3:-3, 3:-3])
+    return np.asarray(
+        pieces == int(np.argmax(np.bincount(pieces.ravel())[1:])) + 1 if piece_count else np.zeros_like(dense)
     )
-    feet, _, cosine = feet_of(pose, camera.centre, camera.sensor_from_camera.directions(camera.rays(rim)))
-    feet = feet[cosine > GRAZING]
-    first, extent = feet.min(axis=0), np.ptp(feet, axis=0)
-    cell = np.full(2, extent.max() / _CELLS)
-    columns, rows = np.ceil(extent / cell).astype(int)
-    xs, ys = np.meshgrid(first[0] + (np.arange(columns) + 0.5) * cell[0], first[1] + (np.arange(rows) + 0.5) * cell[1])
-    occupied = shown(pose.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1)))
-    place = Place(pose, first, cell, occupied, float(1.482602218505602 * np.median(np.abs(off))))
-    return replace(place, bend=_bend_of(place, points))
 
 
-def place_of(capture: Capture, sensor: Sensor, size: tuple[float, float], where: str, roi: Roi | None = None) -> Place:
-    """Return the place of a coupon in a capture.
-
-    Parameters
-    ----------
-    capture, sensor
-        Capture of the coupon, and the sensor whose decoder and imager it is read with.
-    size
-        Width and height of the coupon [mm].
-    where
-        Name of the capture in messages.
-    roi
-        Image region that shows the coupon. Without it the place follows from the capture's pose, otherwise from the
-        plane of its cloud.
-
-    Raises
-    ------
-    InputError
-        If no plane is found, or the sensor is behind the coupon.
-
-    See Also
-    --------
-    specimen_place : the estimate without a pose
-    """
-    if roi is not None:
-        return specimen_place(capture, sensor.settings, roi, where)
-    if capture.world_from_sensor is None:
-        imager = sensor.imager if sensor.imager.bits == capture.bits else None
-        return found_place(capture_cloud(capture, sensor.settings, imager=imager), where)
-    place = known_place(capture.world_from_sensor, *size)
-    if place.world_from_sensor.translation[2] <= 0:
-        raise InputError(where, "world_from_sensor", "a sensor behind the coupon", "a sensor position with z over 0")
-    return place
+def _no_plane(where: str, count: int) -> InputError:
+    return InputError(
+        where,
+        "pose",
+        f"null, and {count} points of its cloud in a plane",
+        f"a world_from_sensor, or {_FEWEST} points side by side in a plane",
+        "decode the capture to see which points are missing: mitsim decode",
+    )
 
 
-def _bend_of(place: Place, points: Floats) -> Bend | None:
-    """Return the bend of the points (n, 3) [mm], in the sensor frame, on a place's cells; None for too few."""
-    local = place.world_from_sensor.points(points)
-    near = np.abs(local[:, 2]) < _NEAR_PLANE * np.linalg.norm(place.world_from_sensor.translation)
-    inside = np.zeros(len(local), bool)
-    inside[near] = place.contains(local[near, :2], np.zeros(int(near.sum())))
-    return fit_bend(local[inside]) if inside.sum() >= _FEWEST_POINTS else None
+def fit_bend(points: Floats) -> Bend | None:
+    """Fit the bend of points (n, 3) [mm] in the frame of their plane, with z along its normal; None for too few."""
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    cell = float((high - low).max()) / _BEND_CELLS
+    if not cell > 0:
+        return None
+    centres, heights = _cell_medians(points, low, cell)
+    if len(heights) < _CELLS_PER_TERM * 3:
+        return None
+    middle, half = (low + high) / 2, np.maximum((high - low) / 2, cell)
+    best: tuple[float, int, Floats] | None = None
+    for degree in DEGREES:
+        terms = _terms((centres - middle) / half, degree)
+        if len(heights) < _CELLS_PER_TERM * terms.shape[1]:
+            break
+        q, r = np.linalg.qr(terms)
+        coefficients = np.linalg.solve(r, q.T @ heights)
+        left_out = (heights - terms @ coefficients) / (1 - np.minimum((q**2).sum(axis=1), 0.99))
+        # the median square, not the sum: a false match in a cell must not choose the degree
+        error = float(np.median(left_out**2))
+        if best is None or error < best[0]:
+            best = error, degree, coefficients
+    assert best is not None
+    _, degree, coefficients = best
+    rms = float(np.sqrt(np.mean((_terms((centres - middle) / half, degree) @ coefficients) ** 2)))
+    return Bend(middle, half, degree, coefficients, rms)
 
 
-def on_specimen(place: Place, origin: Floats, rays: Floats, pitch: float, margin_px: float) -> NDArray[np.bool_]:
-    """Return which view rays meet the specimen, (...), at least a margin inside its outline.
-
-    Parameters
-    ----------
-    place
-        Plane and outline of the specimen.
-    origin, rays
-        Common origin (3,) [mm] and unit vectors (..., 3) of the rays, in the sensor frame.
-    pitch
-        Angle between neighbouring rays [rad].
-    margin_px
-        Margin [px].
-
-    See Also
-    --------
-    image_mask : The same for the pixels of a camera.
-    """
-    points, reach, cosine = feet_of(place.world_from_sensor, origin, rays)
-    down = cosine > GRAZING
-    inside = np.zeros(rays.shape[:-1], bool)
-    margin = margin_px * pitch * reach[down] / cosine[down]
-    inside[down] = place.contains(points[down], margin)
-    return inside
+def _cell_medians(points: Floats, low: Floats, cell: float) -> tuple[Floats, Floats]:
+    """Return the centres (m, 2) of the cells with enough points, and their median heights (m,), all in mm."""
+    columns, rows = np.floor((points[:, :2] - low) / cell).astype(int).T
+    number = rows * (columns.max() + 1) + columns
+    order = np.lexsort((points[:, 2], number))
+    labels, first, counts = np.unique(number[order], return_index=True, return_counts=True)
+    kept = counts >= _BEND_POINTS
+    labels, first, counts = labels[kept], first[kept], counts[kept]
+    heights = points[order, 2][first + counts // 2]
+    row, column = np.divmod(labels, columns.max() + 1)
+    return low + (np.stack([column, row], axis=1) + 0.5) * cell, heights
 
 
-def feet_of(pose: Transform, origin: Floats, rays: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return where rays meet the plane z = 0 of a frame.
-
-    The results are x and y (..., 2) [mm] in the frame of the plane, the distance along the ray [mm], and the cosine to
-    the normal. Points and distances are NaN for rays that miss the plane. ``pose`` takes the sensor frame, that of
-    ``origin`` (3,) [mm] and ``rays`` (..., 3), to the frame of the plane.
-    """
-    start, directions = pose.points(origin), pose.directions(rays)
-    cosine = -directions[..., 2]
-    reach = start[2] / np.where(cosine > GRAZING, cosine, np.nan)
-    return start[:2] + reach[..., None] * directions[..., :2], reach, cosine
-
-
-def image_mask(place: Place, camera: Camera, margin_px: float = 0.0) -> NDArray[np.bool_]:
-    """Return which pixels (H, W) of a camera's raw image show the specimen, a margin [px] inside its outline."""
-    mask = np.zeros((camera.height, camera.width), bool)
-    roi = roi_around(camera, place.corners(), 1) or Roi.whole(camera.width, camera.height)
-    columns, rows = roi.pixels()
-    rays = camera.sensor_from_camera.directions(camera.rays(np.stack([columns, rows], axis=-1).astype(float)))
-    pitch = 1.0 / float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
-    mask[rows, columns] = on_specimen(place, camera.centre, rays, pitch, margin_px)
-    return mask
+def _terms(points: Floats, degree: int) -> Floats:
+    """Return Legendre polynomials (..., k) up to the total degree ``degree`` at points (..., 2) in -1..1."""
+    inside = np.clip(points, -1.0, 1.0)
+    every = legvander2d(inside[..., 0], inside[..., 1], [degree, degree])
+    power = np.add.outer(np.arange(degree + 1), np.arange(degree + 1)).reshape(-1)
+    return np.asarray(every[..., power <= degree])

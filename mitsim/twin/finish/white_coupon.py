@@ -26,7 +26,7 @@ from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.roi import roi_around
 from mitsim.sensor.sensor import Sensor
-from mitsim.twin.finish.place import Place
+from mitsim.twin.finish.specimen import Specimen
 
 #: image in place of a sensor's patterns: the mean of all patterns; a uniform image of their mean level; the first one
 Pattern = Literal["mean", "level", "first"]
@@ -48,12 +48,12 @@ class WhiteCouponRenderer:
         """Return the relative illumination of a camera's lens (H, W) [1], None if it is uniform."""
         return self._simulated.corner_loss[camera]
 
-    def white(self, place: Place, camera: str, roi: Roi, pattern: Pattern) -> Floats:
+    def white(self, specimen: Specimen, camera: str, roi: Roi, pattern: Pattern) -> Floats:
         """Return electrons per second (h, w) [e-/s] in a region that shows a Lambertian coupon of reflectance 1.
 
         Parameters
         ----------
-        place
+        specimen
             Pose and size of the coupon.
         camera
             Name of the camera.
@@ -65,9 +65,9 @@ class WhiteCouponRenderer:
         if pattern not in self._lit:
             self._lit[pattern] = self._projected(pattern)
         self._simulated.patterns = self._lit[pattern]
-        scene = lambertian_coupon(*place.size, self.sensor.wavelength_nm)
+        scene = lambertian_coupon(*specimen.size, self.sensor.wavelength_nm)
         radiance = self._simulated.radiance(
-            scene, place.world_from_sensor, camera, Rendering(samples=self.samples, depth=1), seed=0, roi=roi
+            scene, specimen.world_from_sensor, camera, Rendering(samples=self.samples, depth=1), seed=0, roi=roi
         )
         return np.asarray(radiance[0], np.float64) * self.sensor.electrons()
 
@@ -101,6 +101,6 @@ def with_rig(sensor: Sensor, rig: Rig) -> Sensor:
     return replace(sensor, rig=replace(rig, projector=sensor.rig.projector))
 
 
-def coupon_roi(camera: Camera, place: Place) -> Roi:
+def coupon_roi(camera: Camera, specimen: Specimen) -> Roi:
     """Return the region of a camera's image that holds a coupon and a margin of 12 px."""
-    return roi_around(camera, place.corners(), _MARGIN_PX) or Roi.whole(camera.width, camera.height)
+    return roi_around(camera, specimen.corners(), _MARGIN_PX) or Roi.whole(camera.width, camera.height)

@@ -24,8 +24,8 @@ from mitsim.capture.capture import Capture
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.sensor import Sensor
 from mitsim.twin.compare.specimen_patches import contrast_window
-from mitsim.twin.finish.place import Place
-from mitsim.twin.finish.specimen import MARGIN_PX, image_mask
+from mitsim.twin.finish.find_specimen import MARGIN_PX, image_mask
+from mitsim.twin.finish.specimen import Specimen
 from mitsim.twin.sensor.estimate import scaled, unscaled
 from mitsim.twin.sensor.figures import TERMS, SpecimenField, field_figures
 from mitsim.twin.sensor.moments import MomentFit, Prior, match_moments
@@ -118,7 +118,7 @@ _DRAWS = DotDraws()
 def fit_dots(
     capture: Capture,
     sensor: Sensor,
-    place: Place,
+    specimen: Specimen,
     parameters: Sequence[Parameter],
     where: str,
     *,
@@ -133,7 +133,7 @@ def fit_dots(
         Capture of a flat sheet.
     sensor
         With the capture's own cameras and exposure, from :func:`mitsim.twin.compare.rebuild.like`.
-    place
+    specimen
         Pose and extent of the sheet.
     parameters
         Parameters to vary, without those of the room.
@@ -151,15 +151,15 @@ def fit_dots(
     """
     name, camera = next(iter(capture.rig.cameras.items()))
     seed = draws.seed
-    field = SpecimenField.of(camera, image_mask(place, camera, MARGIN_PX), PATCH_PX)
+    field = SpecimenField.of(camera, image_mask(specimen, camera, MARGIN_PX), PATCH_PX)
     if len(field.corners) < FEWEST_PATCHES:
         seen = f"{len(field.corners)} patches of {PATCH_PX} px of it"
         raise InputError(where, "specimen", seen, f"{FEWEST_PATCHES} or more", "a larger --window, or a nearer view")
     roi = field.roi
-    window = contrast_window(capture, place)
+    window = contrast_window(capture, specimen)
     black = sensor.imager.black_level
     real = field_figures(capture.images[name][0][roi.slices].astype(float), field, window, black)
-    simulator = SpecimenSimulator(sensor, place, roi)
+    simulator = SpecimenSimulator(sensor, specimen, roi)
     unit = simulator.projector_irradiance(sensor, seed)
     free_parameters = list(parameters)
     if room is None:

@@ -20,9 +20,9 @@ from mitsim.sensor.point_spread import point_spread
 from mitsim.sensor.sensor import Sensor
 from mitsim.twin.compare.denoise import denoised
 from mitsim.twin.finish.electrons import linearised
+from mitsim.twin.finish.find_specimen import MARGIN_PX, image_mask
 from mitsim.twin.finish.fine_detail import FINEST, MEDIAN_SQUARE, finest_detail
-from mitsim.twin.finish.place import Place
-from mitsim.twin.finish.specimen import MARGIN_PX, image_mask
+from mitsim.twin.finish.specimen import Specimen
 from mitsim.twin.sensor.estimate import FittedKey, Undetermined
 from mitsim.twin.sensor.input_captures import InputCapture
 from mitsim.twin.sensor.photon_transfer import (
@@ -66,7 +66,7 @@ class ImagerFit:
     repeated: bool = False
 
 
-def fit_imager(groups: list[list[InputCapture]], sensor: Sensor, places: dict[str, Place]) -> ImagerFit:
+def fit_imager(groups: list[list[InputCapture]], sensor: Sensor, specimens: dict[str, Specimen]) -> ImagerFit:
     """Fit the noise of the reference camera's imager."""
     repeated = [group for group in groups if len(group) > 1]
     dark = [group for group in groups if group[0].kind == "dark"]
@@ -77,18 +77,18 @@ def fit_imager(groups: list[list[InputCapture]], sensor: Sensor, places: dict[st
     imager, curve = _with_curve(imager, groups, sensor)
     estimates += curve
     if repeated:
-        masked = [(_images(group), _specimen_mask(group[0], places)) for group in repeated]
+        masked = [(_images(group), _specimen_mask(group[0], specimens)) for group in repeated]
         line = repeated_line([Repeats.of(images, mask, _PIXELS) for images, mask in masked], imager)
         if line is not None:
             names = tuple(source.name for group in repeated for source in group)
             imager, noise_estimates = _with_line(
                 replace(imager, row_noise=0.0), line, names, "photon transfer of repeats"
             )
-            imager, fixed, undetermined = _with_fixed(imager, sensor.imager, repeated, places)
+            imager, fixed, undetermined = _with_fixed(imager, sensor.imager, repeated, specimens)
             return ImagerFit(imager, (*estimates, *noise_estimates, *fixed), tuple(undetermined), repeated=True)
     for group in groups:
         if group[0].kind == "off":
-            from_one_image = _from_one_image(group[0], imager, places)
+            from_one_image = _from_one_image(group[0], imager, specimens)
             if from_one_image is not None:
                 imager, noise_estimates = from_one_image
                 return ImagerFit(imager, (*estimates, *noise_estimates))
@@ -159,11 +159,11 @@ def _correlation(smoothing: float) -> float:
     return product / energy
 
 
-def _specimen_mask(source: InputCapture, places: dict[str, Place]) -> NDArray[np.bool_]:
+def _specimen_mask(source: InputCapture, specimens: dict[str, Specimen]) -> NDArray[np.bool_]:
     camera = source.capture.rig.reference
     if source.kind == "dark":
         return np.ones((camera.height, camera.width), bool)
-    return image_mask(places[source.name], camera, MARGIN_PX)
+    return image_mask(specimens[source.name], camera, MARGIN_PX)
 
 
 def _with_curve(imager: Imager, groups: list[list[InputCapture]], sensor: Sensor) -> tuple[Imager, list[FittedKey]]:
@@ -209,7 +209,7 @@ def _with_line(
 
 
 def _with_fixed(
-    imager: Imager, before: Imager, repeated: list[list[InputCapture]], places: dict[str, Place]
+    imager: Imager, before: Imager, repeated: list[list[InputCapture]], specimens: dict[str, Specimen]
 ) -> tuple[Imager, list[FittedKey], list[Undetermined]]:
     """Estimate DSNU from dark repeats, PRNU from repeats in uniform light."""
     estimates: list[FittedKey] = []
@@ -224,7 +224,7 @@ def _with_fixed(
             undetermined.append(Undetermined(key, before.dsnu if kind == "dark" else before.prnu, determined_by))
             continue
         group = groups[0]
-        level, variance, spread = fixed_variance(_images(group), _specimen_mask(group[0], places), imager)
+        level, variance, spread = fixed_variance(_images(group), _specimen_mask(group[0], specimens), imager)
         if kind == "off":
             variance -= imager.dsnu**2
         root = float(np.sqrt(max(variance, 0.0)))
@@ -237,9 +237,9 @@ def _with_fixed(
 
 
 def _from_one_image(
-    source: InputCapture, imager: Imager, places: dict[str, Place]
+    source: InputCapture, imager: Imager, specimens: dict[str, Specimen]
 ) -> tuple[Imager, list[FittedKey]] | None:
-    image, mask = source.image, _specimen_mask(source, places)
+    image, mask = source.image, _specimen_mask(source, specimens)
     names, method = (source.name,), "finest detail of one image by level, including its fixed pattern"
     estimates = []
     bare = without_fixed_pattern(imager)

@@ -17,8 +17,8 @@ from mitsim.sensor.vignetting import camera_illumination
 from mitsim.twin.compare.plate import REFLECTANCE
 from mitsim.twin.compare.rebuild import like
 from mitsim.twin.finish.electrons import chip_of, linearised
-from mitsim.twin.finish.place import Place
-from mitsim.twin.finish.specimen import MARGIN_PX, image_mask
+from mitsim.twin.finish.find_specimen import MARGIN_PX, image_mask
+from mitsim.twin.finish.specimen import Specimen
 from mitsim.twin.sensor.estimate import FittedKey
 from mitsim.twin.sensor.figures import SpecimenField
 from mitsim.twin.sensor.input_captures import InputCapture
@@ -39,7 +39,7 @@ class RoomFit:
     estimates: tuple[FittedKey, ...]
 
 
-def fit_room(input_captures: list[InputCapture], sensor: Sensor, places: dict[str, Place]) -> RoomFit | None:
+def fit_room(input_captures: list[InputCapture], sensor: Sensor, specimens: dict[str, Specimen]) -> RoomFit | None:
     """Fit the light of the room to captures with the projector off; None if none shows enough of a sheet."""
     rows, values = [], []
     for source in input_captures:
@@ -56,7 +56,7 @@ def fit_room(input_captures: list[InputCapture], sensor: Sensor, places: dict[st
             / np.pi
         )
         irradiance = electrons / scale / (1.0 if loss is None else loss)
-        field = SpecimenField.of(camera, image_mask(places[source.name], camera, MARGIN_PX), _PATCH_PX)
+        field = SpecimenField.of(camera, image_mask(specimens[source.name], camera, MARGIN_PX), _PATCH_PX)
         corners = field.corners + np.array([field.roi.top, field.roi.left])
         if not len(corners):
             continue

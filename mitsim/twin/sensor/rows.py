@@ -20,7 +20,7 @@ from mitsim.capture.capture import Capture
 from mitsim.decoding.cloud import Settings, capture_geometry
 from mitsim.decoding.matching.stereo import StereoGeometry
 from mitsim.twin.compare.specimen_patches import patch_rows
-from mitsim.twin.finish.place import Place
+from mitsim.twin.finish.specimen import Specimen
 
 #: least number of patches for a line; chosen
 _FEWEST = 6
@@ -31,7 +31,7 @@ _MAD_TO_SIGMA = 1.482602218505602
 
 
 def row_turns(
-    capture: Capture, settings: Settings, place: Place, prior: tuple[float, float]
+    capture: Capture, settings: Settings, specimen: Specimen, prior: tuple[float, float]
 ) -> dict[str, tuple[float, float]]:
     """Return the rotations of a pair's second camera [mrad] with standard uncertainties, from its row errors.
 
@@ -41,7 +41,7 @@ def row_turns(
     ----------
     capture, settings
         Capture of a pair of cameras, and the settings of its decoder.
-    place
+    specimen
         Pose and extent of the specimen.
     prior
         Standard deviations of rotation and roll before the measurement [mrad].
@@ -49,7 +49,7 @@ def row_turns(
     geometry = capture_geometry(capture, settings)
     if not isinstance(geometry, StereoGeometry) or capture.technology == "structured_light":
         return {}
-    errors, columns, rows = patch_rows(capture, settings, geometry, place)
+    errors, columns, rows = patch_rows(capture, settings, geometry, specimen)
     focal, matrix = float(geometry.rectification.matrix_right[0, 0]), geometry.rectification.matrix_right
     x, y = (columns - matrix[0, 2]) / focal, (rows - matrix[1, 2]) / focal
     used = np.isfinite(errors)

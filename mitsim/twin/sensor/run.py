@@ -25,8 +25,8 @@ from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.sensor import Sensor
 from mitsim.twin.compare.rebuild import like
-from mitsim.twin.finish.place import Place
-from mitsim.twin.finish.specimen import specimen_place
+from mitsim.twin.finish.find_specimen import find_specimen
+from mitsim.twin.finish.specimen import Specimen
 from mitsim.twin.sensor.dots import DotDraws, DotsFit, fit_dots
 from mitsim.twin.sensor.estimate import FittedKey, Undetermined, pooled
 from mitsim.twin.sensor.input_captures import InputCapture, read_input_captures, repeats
@@ -122,20 +122,20 @@ def fit_sensor(
     )
     lit = [group[0] for group in groups if group[0].kind != "dark"]
     off_captures, on_captures = ([source for source in lit if source.kind == kind] for kind in ("off", "on"))
-    places = {source.name: _place(source, roi) for source in lit}
-    imager = fit_imager(groups, base, places)
+    specimens = {source.name: _specimen(source, roi) for source in lit}
+    imager = fit_imager(groups, base, specimens)
     estimates = list(imager.estimates)
     base = replace(base, imager=imager.imager)
-    room = fit_room(off_captures, base, places) if off_captures and on_captures else None
+    room = fit_room(off_captures, base, specimens) if off_captures and on_captures else None
     estimates += room.estimates if room is not None else []
-    dots = _dots(on_captures, base, places, imager, room, DotDraws(draws, seed))
+    dots = _dots(on_captures, base, specimens, imager, room, DotDraws(draws, seed))
     shared, undetermined = _combined_estimates(dots, base, imager, room)
     estimates += shared
     if isinstance(base.pattern, LightCode):
         coded: list[FittedKey] = []
         for source in on_captures:
             capture_sensor = replace(like(source.capture, base, source.name), imager=base.imager)
-            coded += fit_stripes(source, capture_sensor, places[source.name])
+            coded += fit_stripes(source, capture_sensor, specimens[source.name])
         keys = {estimate.key for estimate in estimates}  # repeats and the dark before a single image
         estimates += [estimate for estimate in pooled(coded) if estimate.key not in keys]
     if not imager.repeated and any(estimate.key in _NOISE for estimate in estimates):
@@ -143,7 +143,7 @@ def fit_sensor(
     turned, assumed, method = list[FittedKey](), chosen.unknowns.calibration, "row errors over the field"
     for source in lit:
         settings, _ = decoder_settings(source.capture)
-        turns = row_turns(source.capture, settings, places[source.name], (assumed.row_mrad, assumed.roll_mrad))
+        turns = row_turns(source.capture, settings, specimens[source.name], (assumed.row_mrad, assumed.roll_mrad))
         for key, pair in turns.items():
             turned.append(FittedKey(f"misalignment.{key}", *pair, "mrad", (source.name,), method))
     estimates += pooled(turned)
@@ -172,19 +172,19 @@ def _check_exposure(sensor: Sensor, source: InputCapture) -> Sensor:
     return sensor
 
 
-def _place(source: InputCapture, roi: Roi | None) -> Place:
+def _specimen(source: InputCapture, roi: Roi | None) -> Specimen:
     settings, _ = decoder_settings(source.capture)
-    place = specimen_place(source.capture, settings, roi, source.name)
-    distance = float(np.linalg.norm(place.world_from_sensor.translation))
-    bend = "flat" if place.bend is None else f"bent by {place.bend.rms:.2g} mm rms"
+    specimen = find_specimen(source.capture, settings, roi, source.name)
+    distance = float(np.linalg.norm(specimen.world_from_sensor.translation))
+    bend = "flat" if specimen.bend is None else f"bent by {specimen.bend.rms:.2g} mm rms"
     say(f"{source.name}: a sheet at {distance:.0f} mm, {bend}")
-    return place
+    return specimen
 
 
 def _dots(
     input_captures: list[InputCapture],
     base: Sensor,
-    places: dict[str, Place],
+    specimens: dict[str, Specimen],
     imager: ImagerFit,
     room: RoomFit | None,
     draws: DotDraws,
@@ -200,13 +200,13 @@ def _dots(
         sensor = replace(like(source.capture, base, source.name), imager=base.imager, room=base.room)
         if not imager.known:
             sensor = replace(sensor, imager=without_fixed_pattern(sensor.imager))
-        place, terms = places[source.name], None if room is None else room.terms
+        specimen, terms = specimens[source.name], None if room is None else room.terms
         sensor = _check_exposure(sensor, source)
-        dots_fit = fit_dots(source.capture, sensor, place, parameters, source.name, room=terms, draws=draws)
+        dots_fit = fit_dots(source.capture, sensor, specimen, parameters, source.name, room=terms, draws=draws)
         if not imager.known and not {parameter.key for parameter in dots_fit.parameters} & _NOISE:
             # the noise stays that of the file, and so does the fixed pattern beside it
             sensor, dot_parameters = replace(sensor, imager=base.imager), [p for p in parameters if p.key not in _NOISE]
-            dots_fit = fit_dots(source.capture, sensor, place, dot_parameters, source.name, room=terms, draws=draws)
+            dots_fit = fit_dots(source.capture, sensor, specimen, dot_parameters, source.name, room=terms, draws=draws)
             dots_fit = replace(dots_fit, undetermined=(FULL_WELL, READ_NOISE, *dots_fit.undetermined))
         out[source.name], fit = dots_fit, dots_fit.moment_fit
         say(

@@ -30,7 +30,7 @@ from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.vignetting import camera_illumination
 from mitsim.twin.compare.plate import REFLECTANCE, plate
-from mitsim.twin.finish.place import Place
+from mitsim.twin.finish.specimen import Specimen
 
 #: rays per pixel; chosen
 _SAMPLES = 16
@@ -45,14 +45,14 @@ MARGIN_PX = 12
 class SpecimenSimulator:
     """The reference camera of a sensor in front of a specimen; ``part`` is the evaluated window of its image."""
 
-    def __init__(self, sensor: Sensor, place: Place, roi: Roi) -> None:
+    def __init__(self, sensor: Sensor, specimen: Specimen, roi: Roi) -> None:
         name, camera = next(iter(sensor.rig.cameras.items()))
-        self.name, self.camera, self.place = name, camera, place
+        self.name, self.camera, self.specimen = name, camera, specimen
         left, top = max(roi.left - MARGIN_PX, 0), max(roi.top - MARGIN_PX, 0)
         right, bottom = min(roi.right + MARGIN_PX, camera.width), min(roi.bottom + MARGIN_PX, camera.height)
         self.roi = Roi.between(left, top, right, bottom)
         self.inner = Roi(roi.left - self.roi.left, roi.top - self.roi.top, roi.width, roi.height).slices
-        self._scene: Scene = plate(place, sensor, None)
+        self._scene: Scene = plate(specimen, sensor, None)
         self._kept: dict[Any, NDArray[np.float32]] = {}
         self._device: SimulatedSensor | None = None
         rays = camera.rays_to_fold(np.stack(self.roi.pixels(), axis=-1).astype(float))
@@ -109,7 +109,7 @@ class SpecimenSimulator:
                 rig=Rig({self.name: self.camera}, sensor.rig.projector),
             )
             simulated = self._of(bare_sensor)
-            pose = self.place.world_from_sensor
+            pose = self.specimen.world_from_sensor
             rng = np.random.default_rng(np.random.SeedSequence([seed, 2]))
             speckle = draw_speckle(
                 self._scene, bare_sensor, self.camera, simulated.pixel_rays(self.name), pose, self.roi, rng

@@ -22,8 +22,8 @@ from mitsim.sensor.light_code import LightCode, roles
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.twin.finish.electrons import linearised
-from mitsim.twin.finish.place import Place
-from mitsim.twin.finish.specimen import MARGIN_PX, image_mask
+from mitsim.twin.finish.find_specimen import MARGIN_PX, image_mask
+from mitsim.twin.finish.specimen import Specimen
 from mitsim.twin.sensor.defocus import Defocus, fit_defocus, fitted_blur
 from mitsim.twin.sensor.estimate import FittedKey
 from mitsim.twin.sensor.input_captures import InputCapture
@@ -91,20 +91,20 @@ def stripes_of(source: InputCapture) -> StripeImages | None:
     return StripeImages(white, black, every, np.array(widths), np.array(across))
 
 
-def fit_stripes(source: InputCapture, sensor: Sensor, place: Place) -> list[FittedKey]:
+def fit_stripes(source: InputCapture, sensor: Sensor, specimen: Specimen) -> list[FittedKey]:
     """Fit one capture of stripes; the sensor must have the capture's own cameras and exposure."""
     seen = stripes_of(source)
     if seen is None:
         return []
     camera = source.capture.rig.reference
-    mask = image_mask(place, camera, MARGIN_PX)
+    mask = image_mask(specimen, camera, MARGIN_PX)
     full = 2**source.capture.bits - 1
     clear = mask & (maximum_filter(seen.white, 3) < _UNSATURATED * full)
     spread = maximum_filter(seen.white, _EVEN_PX) - minimum_filter(seen.white, _EVEN_PX)
     even = clear & (spread < np.maximum(_EVEN_SHARE * seen.white, 4.0))
     imager, levels = _levels(source, sensor.imager, seen, even)
     imager, noise = _noise(source, imager, seen, even)
-    return levels + noise + _blur(source, imager, place, seen, even)
+    return levels + noise + _blur(source, imager, specimen, seen, even)
 
 
 def _levels(
@@ -149,7 +149,7 @@ def _noise(
 
 
 def _blur(
-    source: InputCapture, chip: Imager, place: Place, seen: StripeImages, even: NDArray[np.bool_]
+    source: InputCapture, chip: Imager, specimen: Specimen, seen: StripeImages, even: NDArray[np.bool_]
 ) -> list[FittedKey]:
     """Estimate the blur of camera and projector together from the modulation of stripes of every width, by blocks."""
     white, black = linearised(seen.white, chip), linearised(seen.black, chip)
@@ -157,7 +157,7 @@ def _blur(
     usable = even & (seen.white - seen.black > _LEAST_DN)
     if usable.sum() < 500:
         return []
-    scales = _pixels_per_stripe(source, place)
+    scales = _pixels_per_stripe(source, specimen)
     pairs = np.stack([linearised(seen.pairs[:, side], chip) for side in (0, 1)], axis=1)
     off = np.abs(pairs[:, 0] - pairs[:, 1])
     focus = fit_defocus(source, white, black, pairs, seen.widths)
@@ -197,12 +197,12 @@ def _focus(source: InputCapture, focus: Defocus, scale: float) -> list[FittedKey
     ]
 
 
-def _pixels_per_stripe(source: InputCapture, place: Place) -> tuple[float, float]:
+def _pixels_per_stripe(source: InputCapture, specimen: Specimen) -> tuple[float, float]:
     """Return the camera pixels per projector pixel, along columns and rows, at the centre of the specimen."""
     camera, projector = source.capture.rig.reference, source.capture.rig.projector
     assert projector is not None
-    pose: Transform = place.world_from_sensor.inverse()
-    middle = place.low + place.cell * place.occupied.shape[::-1] / 2
+    pose: Transform = specimen.world_from_sensor.inverse()
+    middle = specimen.low + specimen.cell * specimen.occupied.shape[::-1] / 2
     steps = np.array([[0, 0, 0], [1.0, 0, 0], [0, 1.0, 0]]) + np.array([*middle, 0.0])
     points = pose.points(steps)
     seen, sent = camera.project(points), projector.project(points)

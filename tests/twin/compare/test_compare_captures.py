@@ -29,7 +29,7 @@ from mitsim.twin.compare.compared_quantities import QUANTITIES
 from mitsim.twin.compare.rebuild import check_technology, projector_was_on, rebuild
 from mitsim.twin.compare.specimen_patches import PATCH_PX, specimen_patches
 from mitsim.twin.finish.electrons import linearised, pixel_noise
-from mitsim.twin.finish.specimen import image_mask, specimen_place
+from mitsim.twin.finish.find_specimen import find_specimen, image_mask
 from tests.smaller_sensors import narrow_search
 
 SIZE, DISTANCE = 190.0, 480.0
@@ -84,8 +84,8 @@ def real(n10_module):
 
 
 @pytest.fixture(scope="module")
-def place(n10_module, real):
-    return specimen_place(real, n10_module.settings, None, "real")
+def specimen(n10_module, real):
+    return find_specimen(real, n10_module.settings, None, "real")
 
 
 @pytest.fixture(scope="module")
@@ -95,12 +95,12 @@ def again(n10_module):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def patches_of_real(real, place):
+def patches_of_real(real, specimen):
     """The patches of the recorded capture are those of its first comparison."""
     of_any, of_real = compare_module.specimen_patches, {}
 
     def once(capture, settings, geometry, at, window_px):
-        if capture is not real or at is not place:
+        if capture is not real or at is not specimen:
             return of_any(capture, settings, geometry, at, window_px)
         if window_px not in of_real:
             of_real[window_px] = of_any(capture, settings, geometry, at, window_px)
@@ -140,37 +140,37 @@ def changed(n10_module):
     }
 
 
-def compared(real, other, place, sensor):
-    return compare_captures(real, other, place, sensor.settings, "simulated")
+def compared(real, other, specimen, sensor):
+    return compare_captures(real, other, specimen, sensor.settings, "simulated")
 
 
 def rows(comparison):
     return {row.quantity: row for row in comparison.rows}
 
 
-def test_a_plate_is_found_where_it_stands(n10_module, place):
+def test_a_plate_is_found_where_it_stands(n10_module, specimen):
     truth = pose(n10_module).inverse()  # sensor from world: where the plate's frame lies
-    found = place.world_from_sensor.inverse()
+    found = specimen.world_from_sensor.inverse()
     # 230 mm plate, some 4 10^4 points of 0.3 mm noise: angle to 0.3 / (66 sqrt(4e4 / A)) rad, A = 30 px^2, 1e-4; the
     # plate's own plane is seen at 0.1 mm
     assert found.rotation[:, 2] @ truth.rotation[:, 2] > np.cos(np.radians(0.1))
     assert abs((found.translation - truth.translation) @ truth.rotation[:, 2]) < 0.15
 
 
-def test_all_of_a_named_window_is_specimen(n10_module, real, place):
+def test_all_of_a_named_window_is_specimen(n10_module, real, specimen):
     part = Roi(250, 150, 200, 150)
-    named = specimen_place(real, n10_module.settings, part, "real")
+    named = find_specimen(real, n10_module.settings, part, "real")
     mask = image_mask(named, real.rig.reference)
     wanted = np.zeros_like(mask)
     wanted[150:300, 250:450] = True
     # cells of 1/120 of the window: its rim is one cell wide
     assert np.count_nonzero(mask ^ wanted) < 2 * (200 + 150) * 200 / 120 * 1.5
-    normals = [each.world_from_sensor.inverse().rotation[:, 2] for each in (named, place)]
+    normals = [each.world_from_sensor.inverse().rotation[:, 2] for each in (named, specimen)]
     assert normals[0] @ normals[1] > np.cos(np.radians(0.1))
 
 
-def test_the_same_plate_with_another_seed_agrees(n10_module, real, place, again):
-    found = compared(real, again, place, n10_module)
+def test_the_same_plate_with_another_seed_agrees(n10_module, real, specimen, again):
+    found = compared(real, again, specimen, n10_module)
     told = {name: (row.difference, row.uncertainty) for name, row in rows(found).items() if row.verdict == "differs"}
     assert not told
     assert found.agrees
@@ -179,10 +179,10 @@ def test_the_same_plate_with_another_seed_agrees(n10_module, real, place, again)
 
 
 @pytest.mark.parametrize("change", MOVED)
-def test_a_change_shows_in_the_right_quantity(n10_module, real, place, changed, change):
+def test_a_change_shows_in_the_right_quantity(n10_module, real, specimen, changed, change):
     if change == "noise":  # beside speckle, which is grain of every pixel too, it would not stand out
         real = as_recorded(taken(replace(n10_module, linewidth_nm=None), 1))
-    found = rows(compared(real, taken(changed[change], 2), place, n10_module))
+    found = rows(compared(real, taken(changed[change], 2), specimen, n10_module))
     differing = {name for name, row in found.items() if row.verdict == "differs"}
     assert MOVED[change] <= differing
     others = set().union(*(names for other, names in MOVED.items() if other != change)) - MOVED[change]
@@ -192,7 +192,7 @@ def test_a_change_shows_in_the_right_quantity(n10_module, real, place, changed, 
     elif change == "noise":
         # the dots' own edges stay, so squares are compared: twice the noise n adds 3 n^2. n is EMVA's, and that of some
         # level between the dark and the bright of the dots
-        imager, inside = n10_module.imager, image_mask(place, real.rig.reference, 15)
+        imager, inside = n10_module.imager, image_mask(specimen, real.rig.reference, 15)
         levels = np.percentile(real.images["left"][0][inside], [10, 90])
         variance = pixel_noise(imager, imager, 1, real.decoding.exposure_s, False).variance(linearised(levels, imager))
         added = np.sqrt((found["finest detail"].simulated ** 2 - found["finest detail"].real ** 2) / 3)
@@ -203,12 +203,12 @@ def test_a_change_shows_in_the_right_quantity(n10_module, real, place, changed, 
         assert "median grey level" in others - differing
 
 
-def test_finest_detail_is_the_standard_deviation_of_white_noise(n10_module, real, place, rng):
+def test_finest_detail_is_the_standard_deviation_of_white_noise(n10_module, real, specimen, rng):
     noisy = {
         name: rng.normal(120.0, 6.0, stack.shape).clip(0, 255).round().astype(np.uint8)
         for name, stack in real.images.items()
     }
-    seen = specimen_patches(replace(real, images=noisy), n10_module.settings, stereo_geometry(real.rig), place, 15)
+    seen = specimen_patches(replace(real, images=noisy), n10_module.settings, stereo_geometry(real.rig), specimen, 15)
     # quantisation adds 1/12; of some 15000 pixels 25 weights leave a tenth independent: a median to 1.2 / sqrt(1500)
     assert np.median(seen.finest) == pytest.approx(np.hypot(6.0, np.sqrt(1 / 12)), rel=3 * 0.031)
     # of a window of 15 x 15: sqrt(224 / 225) of the deviation, over the mean
@@ -225,23 +225,23 @@ def wrong_rig(n10_module):
     return replace(n10_module.rig, cameras={**cameras, "right": replace(cameras["right"], matrix=matrix)})
 
 
-def test_rows_of_the_right_image_that_are_off_are_found(n10_module, real, place, wrong_rig):
+def test_rows_of_the_right_image_that_are_off_are_found(n10_module, real, specimen, wrong_rig):
     """A simulation with the wrong calibration with which the recording is decoded."""
     twin = taken(replace(n10_module, rig=wrong_rig), 2)
-    row = rows(compared(replace(real, rig=replace(wrong_rig, projector=None)), twin, place, n10_module))
+    row = rows(compared(replace(real, rig=replace(wrong_rig, projector=None)), twin, specimen, n10_module))
     # Bouguet's rectification keeps the scale: what is 0.4 px in the raw image is so in the rectified one
     assert row["vertical error"].verdict == "differs"
     assert abs(row["vertical error"].real) == pytest.approx(0.4, abs=0.08)
     assert abs(row["vertical error"].simulated) < 0.03
 
 
-def test_a_simulated_capture_of_another_calibration_is_refused(n10_module, real, place, again, wrong_rig):
+def test_a_simulated_capture_of_another_calibration_is_refused(n10_module, real, specimen, again, wrong_rig):
     """Before, "found 29 patches; allowed: 6 or more", a ValueError of NumPy, or a comparison of other pixels."""
     left = again.rig.reference
     wide = replace(left, matrix=left.matrix * np.array([[0.8], [0.8], [1.0]]))
     for rig in (replace(again.rig, cameras={**again.rig.cameras, "left": wide}), wrong_rig):
         with pytest.raises(InputError, match="twin: calibration: found that of another unit; allowed: that of REAL"):
-            compare_captures(real, replace(again, rig=rig), place, n10_module.settings, "twin")
+            compare_captures(real, replace(again, rig=rig), specimen, n10_module.settings, "twin")
 
 
 def test_a_rebuilt_capture_is_as_bright_and_agrees(n10_module, changed, tmp_path):
@@ -282,21 +282,21 @@ def test_a_comparison_with_the_capture_of_the_fit_says_so(n10_module, real, agai
     assert told[1] == ""
 
 
-def test_a_texture_stands_in_where_the_projector_was_off(n10_module, real, place):
-    twin = rebuild(real, n10_module, place, "real", projector_on=False, seed=4)
-    found = rows(compare_captures(real, twin, place, n10_module.settings, "twin", projector_on=False))
+def test_a_texture_stands_in_where_the_projector_was_off(n10_module, real, specimen):
+    twin = rebuild(real, n10_module, specimen, "real", projector_on=False, seed=4)
+    found = rows(compare_captures(real, twin, specimen, n10_module.settings, "twin", projector_on=False))
     assert found["contrast"].verdict == "not comparable"
     # lens and pixels blurred the recording already; a second time would take a sixth of the contrast of these dots
     assert found["contrast"].simulated == pytest.approx(found["contrast"].real, rel=0.08)
-    inside = image_mask(place, real.rig.reference, 15)
+    inside = image_mask(specimen, real.rig.reference, 15)
     ours, theirs = (each.images["left"][0][inside].astype(float) for each in (real, twin))
     # the texture lies where it was seen: a shift of 2 px, or a turned image, would leave nothing of this
     assert np.corrcoef(ours, theirs)[0, 1] > 0.8
     assert found["F"].simulated > 0.9
 
 
-def test_what_needs_a_pattern_is_not_compared_where_one_had_none(n10_module, real, place, again):
-    found = compare_captures(real, again, place, n10_module.settings, "twin", projector_on=False)
+def test_what_needs_a_pattern_is_not_compared_where_one_had_none(n10_module, real, specimen, again):
+    found = compare_captures(real, again, specimen, n10_module.settings, "twin", projector_on=False)
     for quantity in QUANTITIES:
         row = rows(found).get(quantity.name)
         if row is not None and quantity.needs_pattern:
@@ -365,20 +365,20 @@ def test_a_capture_that_mitsim_rendered_needs_another_to_compare_with(n10_module
         validate_captures(path, None, tmp_path, None, None, None, 1)
 
 
-def test_a_simulated_capture_of_another_place_is_refused(n10_module, real, place):
+def test_a_simulated_capture_of_another_place_is_refused(n10_module, real, specimen):
     near = replace(
-        place,
+        specimen,
         world_from_sensor=replace(
-            place.world_from_sensor, translation=place.world_from_sensor.translation * np.array([1.0, 1.0, 0.9])
+            specimen.world_from_sensor, translation=specimen.world_from_sensor.translation * np.array([1.0, 1.0, 0.9])
         ),
     )
     with pytest.raises(InputError, match=r"twin: pose: found a specimen .* % nearer or farther"):
         compared_twin = rebuild(real, n10_module, near, "real")
-        compare_captures(real, compared_twin, place, n10_module.settings, "twin")
+        compare_captures(real, compared_twin, specimen, n10_module.settings, "twin")
 
 
-def test_a_specimen_of_few_patches_is_refused(n10_module, real, place, again):
-    small = replace(place, occupied=np.zeros_like(place.occupied))
+def test_a_specimen_of_few_patches_is_refused(n10_module, real, specimen, again):
+    small = replace(specimen, occupied=np.zeros_like(specimen.occupied))
     small.occupied[:2, :2] = True
     with pytest.raises(InputError, match=rf"REAL: specimen: found 0 patches of {PATCH_PX} px"):
         compare_captures(real, again, small, n10_module.settings, "twin")

@@ -10,14 +10,14 @@ from characterisation.coupon.discs import disc_offsets
 from characterisation.coupon.patches import Coupon, measure_patches
 from mitsim.sensor.transforms import look_at
 from mitsim.twin.compare.specimen_patches import points_on_specimen
-from mitsim.twin.finish.place import Bend, known_place
+from mitsim.twin.finish.specimen import Bend, known_specimen
 from tests.seen_shapes import GRID, cloud_of, plane
 
 
 def test_one_definition_of_f_for_comparisons_and_coupons(rng):
     """Before, a comparison counted false points as recovered, and an acceptance test of the same cloud did not."""
     truth = look_at((150.0, -100.0, 580.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 0.0)
-    from_sensor = known_place(truth, 4000.0, 4000.0)
+    from_sensor = known_specimen(truth, 4000.0, 4000.0)
     at, normal = truth.inverse().points(np.zeros(3)), truth.inverse().directions(np.array([0.0, 0.0, 1.0]))
     on_it = plane(at, normal)
     shift = rng.choice([-0.011, -0.009, 0.0, 0.009, 0.011, np.nan], on_it.shape)

@@ -23,7 +23,7 @@ from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, p
 from mitsim.sensor.preset import load_sensor
 from mitsim.twin.compare.captures_run import validate_captures
 from mitsim.twin.compare.plain_image import plain_image
-from mitsim.twin.finish import specimen
+from mitsim.twin.finish import find_specimen
 
 SIZE, DISTANCE = 70.0, 500.0
 
@@ -153,9 +153,9 @@ def test_a_window_without_a_plane_that_can_be_seen_is_one_message(david, folder,
     cloud = PointCloud(
         points, np.full(points.shape[:2], Status.VALID, np.uint8), grid, "s", "device", np.array([1.0, 0, 0])
     )
-    monkeypatch.setattr(specimen, "capture_cloud", lambda *args, **kwargs: cloud)
+    monkeypatch.setattr(find_specimen, "capture_cloud", lambda *args, **kwargs: cloud)
     with pytest.raises(
         InputError,
         match=r"--window: found .* points are seen at grazing incidence from the sensor, .*; allowed: a plane",
     ):
-        specimen.specimen_place(capture, david.settings, Roi(20, 20, 300, 200), "real")
+        find_specimen.find_specimen(capture, david.settings, Roi(20, 20, 300, 200), "real")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsim.twin.finish.place import fit_bend
+from mitsim.twin.finish.specimen import fit_bend
 
 
 def points(rng, heights, sigma):

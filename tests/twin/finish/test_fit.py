@@ -36,12 +36,12 @@ from mitsim.sensor.unknowns import UnknownsTable
 from mitsim.twin.finish.dots import compare_dots
 from mitsim.twin.finish.electrons import PixelNoise, linearised, pixel_noise
 from mitsim.twin.finish.estimate import fit_views
+from mitsim.twin.finish.find_specimen import find_coupon
 from mitsim.twin.finish.finish import ALPHA_RANGE, metal_finish
 from mitsim.twin.finish.observation import CouponCapture, CouponView, observe
-from mitsim.twin.finish.place import found_place, known_place
 from mitsim.twin.finish.posterior import finish_posterior
 from mitsim.twin.finish.run import KNOWN_BLOCK_PX, UNKNOWN_BLOCK_PX, fit_captures
-from mitsim.twin.finish.specimen import place_of
+from mitsim.twin.finish.specimen import known_specimen, specimen_in_cloud
 from mitsim.twin.finish.white_coupon import WhiteCouponRenderer
 
 REAL_DATA = Path(os.environ.get("MITSIM_REAL_DATA") or Path(__file__).resolve().parents[3].parent / "shared" / "real")
@@ -166,13 +166,13 @@ def test_a_plane_is_found_in_a_cloud_with_other_things_in_it(rng):
     status[off & ~stray] = Status.AMBIGUOUS
     points[off & ~stray] = np.nan
     cloud = PointCloud(points.astype(np.float32), status, grid, "test", "simulated")
-    place = found_place(cloud, "cloud")
-    assert place.world_from_sensor.rotation[2] == pytest.approx(normal, abs=2e-3)
+    specimen = specimen_in_cloud(cloud, "cloud")
+    assert specimen.world_from_sensor.rotation[2] == pytest.approx(normal, abs=2e-3)
     # noise 0.3 mm, and the stray points that happen to be near the plane
-    assert place.off_plane == pytest.approx(0.3, rel=0.2)
-    assert place.occupied.sum() * place.cell.prod() == pytest.approx(160 * 120 * 0.9**2, rel=0.1)
+    assert specimen.off_plane == pytest.approx(0.3, rel=0.2)
+    assert specimen.occupied.sum() * specimen.cell.prod() == pytest.approx(160 * 120 * 0.9**2, rel=0.1)
     with pytest.raises(InputError, match="points of its cloud in a plane"):
-        found_place(replace(cloud, points=np.full_like(cloud.points, np.nan)), "cloud")
+        specimen_in_cloud(replace(cloud, points=np.full_like(cloud.points, np.nan)), "cloud")
 
 
 # the estimator --------------------------------------------------------------------------------------------------
@@ -214,7 +214,7 @@ def plain_views(ground):
                 lamp,
                 pixel_noise(IMAGER, IMAGER, 1, 0.0, False),
                 (side // 8) ** 2,
-                known_place(pose, 100.0, 100.0),
+                known_specimen(pose, 100.0, 100.0),
             )
         )
     return views
@@ -357,15 +357,15 @@ def test_alpha_and_power_are_recovered_from_noisy_captures(captures, tmp_path):
 
 def test_a_saturated_block_and_its_neighbours_are_left_out(n10, bench, captures):
     capture = read_capture(captures[1])
-    place = known_place(capture.world_from_sensor, 120.0, 120.0)
-    whole = observe(CouponCapture(capture, place, 0, "capture"), bench, KNOWN_BLOCK_PX, pattern="mean")[0]
+    specimen = known_specimen(capture.world_from_sensor, 120.0, 120.0)
+    whole = observe(CouponCapture(capture, specimen, 0, "capture"), bench, KNOWN_BLOCK_PX, pattern="mean")[0]
     assert whole.censored == 0.0
     middle = np.flatnonzero((whole.grid == np.median(whole.grid, axis=0).astype(int)).all(axis=1))[0]
     pixel = np.flatnonzero(whole.block == middle)[0]
     images = {name: stack.copy() for name, stack in capture.images.items()}
     images["left"][0, whole.rows[pixel], whole.columns[pixel]] = 255
     left = observe(
-        CouponCapture(replace(capture, images=images), place, 0, "capture"), bench, KNOWN_BLOCK_PX, pattern="mean"
+        CouponCapture(replace(capture, images=images), specimen, 0, "capture"), bench, KNOWN_BLOCK_PX, pattern="mean"
     )[0]
     assert left.size == whole.size - 9
     assert left.censored == pytest.approx(9 / whole.size)
@@ -375,9 +375,9 @@ def test_a_saturated_block_and_its_neighbours_are_left_out(n10, bench, captures)
 def test_nothing_but_saturation_is_refused(captures, ground, bench):
     capture = read_capture(captures[0])
     white = {name: np.full_like(stack, 255) for name, stack in capture.images.items()}
-    place = known_place(capture.world_from_sensor, 120.0, 120.0)
+    specimen = known_specimen(capture.world_from_sensor, 120.0, 120.0)
     views = observe(
-        CouponCapture(replace(capture, images=white), place, 0, "capture"), bench, KNOWN_BLOCK_PX, pattern="mean"
+        CouponCapture(replace(capture, images=white), specimen, 0, "capture"), bench, KNOWN_BLOCK_PX, pattern="mean"
     )
     with pytest.raises(InputError, match=r"0 of \d+ blocks on the coupon free of saturation"):
         fit_views(views, ground)
@@ -386,16 +386,16 @@ def test_nothing_but_saturation_is_refused(captures, ground, bench):
 @pytest.mark.parametrize(
     ("spoil", "why"),
     [
-        (lambda place: replace(place, low=place.low + 1000.0), "the coupon is not in the image"),
-        (lambda place: replace(place, cell=place.cell / 40, low=place.low / 40), "has two edges: it is too small"),
-        (lambda place: replace(place, cell=place.cell / 9, low=place.low / 9), "fill half of no block of 32 x 32 px"),
+        (lambda coupon: replace(coupon, low=coupon.low + 1000.0), "the coupon is not in the image"),
+        (lambda coupon: replace(coupon, cell=coupon.cell / 40, low=coupon.low / 40), "has two edges: it is too small"),
+        (lambda coupon: replace(coupon, cell=coupon.cell / 9, low=coupon.low / 9), "half of no block of 32 x 32 px"),
     ],
 )
 def test_a_coupon_without_a_block_says_why(captures, bench, spoil, why):
     """It was "0 of 0 blocks on the coupon free of saturation", whatever the cause."""
     capture = read_capture(captures[0])
-    place = spoil(known_place(capture.world_from_sensor, 120.0, 120.0))
-    views = observe(CouponCapture(capture, place, 0, "capture"), bench, UNKNOWN_BLOCK_PX, pattern="mean")
+    specimen = spoil(known_specimen(capture.world_from_sensor, 120.0, 120.0))
+    views = observe(CouponCapture(capture, specimen, 0, "capture"), bench, UNKNOWN_BLOCK_PX, pattern="mean")
     assert {view.whole for view in views} == {0}
     assert all(why in view.why_no_block for view in views)
 
@@ -404,14 +404,14 @@ def test_a_window_names_the_coupon_whatever_the_pose_says(captures, bench):
     """A part of the first image; the plane of its points is that of the coupon within 0.3 mm."""
     capture = read_capture(captures[0])
     camera = capture.rig.reference
-    known = known_place(capture.world_from_sensor, 120.0, 120.0)
+    known = known_specimen(capture.world_from_sensor, 120.0, 120.0)
     low, high = (f(camera.project(known.corners()), axis=0).astype(int) for f in (np.min, np.max))
     middle, half = (low + high) // 2, (high - low) // 5
     part = Roi(*(middle - half).tolist(), *(2 * half).tolist())
-    place = place_of(replace(capture, world_from_sensor=None), bench.sensor, (120.0, 120.0), "capture", part)
-    there = capture.world_from_sensor.points(place.world_from_sensor.inverse().points(np.zeros((1, 3))))
+    specimen = find_coupon(replace(capture, world_from_sensor=None), bench.sensor, (120.0, 120.0), "capture", part)
+    there = capture.world_from_sensor.points(specimen.world_from_sensor.inverse().points(np.zeros((1, 3))))
     assert abs(there[0, 2]) < 0.3
-    views = observe(CouponCapture(capture, place, 0, "capture"), bench, KNOWN_BLOCK_PX, pattern="mean")
+    views = observe(CouponCapture(capture, specimen, 0, "capture"), bench, KNOWN_BLOCK_PX, pattern="mean")
     assert views[0].whole > 20
     pixels = np.stack([views[0].columns, views[0].rows], axis=-1)
     assert (pixels >= (part.left, part.top)).all()
@@ -434,8 +434,8 @@ def test_dots_of_another_pattern_are_as_bright_and_sharp_as_the_file_says(n10, b
         around=pose.inverse().points(CORNERS),
         noise=Noise.without("speckle"),
     )
-    place = known_place(pose, 120.0, 120.0)
-    views = observe(CouponCapture(capture, place, 0, "sheet"), bench, UNKNOWN_BLOCK_PX, pattern="level")
+    specimen = known_specimen(pose, 120.0, 120.0)
+    views = observe(CouponCapture(capture, specimen, 0, "sheet"), bench, UNKNOWN_BLOCK_PX, pattern="level")
     for view in views:
         dots = compare_dots(view, bench)
         assert dots.power == pytest.approx(0.873, abs=0.042)
@@ -461,8 +461,8 @@ def test_a_capture_without_a_pose_is_placed_by_its_cloud(n10, scenes, tmp_path):
     )
     write_capture(replace(capture, world_from_sensor=None), tmp_path / "lost")
     found = fit_captures([tmp_path / "lost"])
-    assert 0.4 < found.places[0].off_plane < 0.9
-    height = found.places[0].world_from_sensor.translation[2]
+    assert 0.4 < found.specimens[0].off_plane < 0.9
+    height = found.specimens[0].world_from_sensor.translation[2]
     assert height == pytest.approx(600 * math.cos(math.radians(12)), abs=1)
     power, uncertainty = found.power
     assert abs(power - 0.85) < 3 * uncertainty + 0.005
@@ -529,8 +529,8 @@ def test_the_recorded_sheet_and_what_is_left_of_it(scenes, tmp_path):
     folder = write_capture(read_ensenso(recording), tmp_path / "sheet")
     found = fit_captures([folder], "ensenso-n35", scenes / "coupon" / "matt_white.xml")
     assert found.source == "device"
-    assert 1.5 < found.places[0].off_plane < 2.7
-    assert found.places[0].world_from_sensor.translation[2] == pytest.approx(435, abs=5)
+    assert 1.5 < found.specimens[0].off_plane < 2.7
+    assert found.specimens[0].world_from_sensor.translation[2] == pytest.approx(435, abs=5)
     power, uncertainty = found.power
     assert power == pytest.approx(0.47, abs=0.05)
     assert 0.05 < uncertainty < 0.2

@@ -17,7 +17,7 @@ from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.sensor_file import RoomTable
 from mitsim.sensor.transforms import Transform, look_at
-from mitsim.twin.finish.place import Place, known_place
+from mitsim.twin.finish.specimen import Specimen, known_specimen
 from mitsim.twin.sensor import dots
 from mitsim.twin.sensor.dots import DotDraws, DotsFit
 from mitsim.twin.sensor.estimate import scaled
@@ -98,9 +98,9 @@ def unit(seed: int) -> Sensor:
     return replace(sensor, pattern=pattern, projector=lamp, imager=chip, room=room)
 
 
-def place() -> Place:
+def specimen() -> Specimen:
     """Of the sheet, as large as the view."""
-    return known_place(POSE, 2 * HALF, 2 * HALF)
+    return known_specimen(POSE, 2 * HALF, 2 * HALF)
 
 
 @cache
@@ -129,7 +129,7 @@ def parameters(smoothing: bool = False) -> list[Parameter]:
     ]
 
 
-def small_fit(capture: Capture, sensor: Sensor, at: Place, varied: list[Parameter], draws: DotDraws) -> DotsFit:
+def small_fit(capture: Capture, sensor: Sensor, at: Specimen, varied: list[Parameter], draws: DotDraws) -> DotsFit:
     """The fit in patches of 24 px, since the images are small."""
     with mock.patch.multiple(dots, PATCH_PX=24, MARGIN_PX=2.0):
         return dots.fit_dots(capture, sensor, at, varied, "unit", draws=draws)
@@ -141,7 +141,7 @@ def standard_errors(seed: int, draws: int = 3) -> tuple[DotsFit, dict[str, float
     # which dots the unit has is not known to the fit: another draw of them each time
     other = small_sensor().pattern.model_copy(update={"seed": 50_000 + 37 * seed})
     sensor = replace(small_sensor(), pattern=other)
-    found = small_fit(capture_of(truth, seed), sensor, place(), parameters(), DotDraws(draws, 7 + seed))
+    found = small_fit(capture_of(truth, seed), sensor, specimen(), parameters(), DotDraws(draws, 7 + seed))
     values, spreads = found.in_file_units()
     errors = {}
     for parameter, value, spread in zip(found.parameters, values, spreads, strict=True):

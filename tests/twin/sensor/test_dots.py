@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from characterisation.files.errors import InputError
-from mitsim.twin.finish.place import known_place
+from mitsim.twin.finish.specimen import known_specimen
 from mitsim.twin.sensor import specimen_simulator
 from mitsim.twin.sensor.dots import DotDraws, field_misfits
 from mitsim.twin.sensor.parameters import FLUX
-from tests.twin.sensor.small_unit import capture_of, place, small_fit, small_sensor, standard_errors, unit
+from tests.twin.sensor.small_unit import capture_of, small_fit, small_sensor, specimen, standard_errors, unit
 
 
 def test_intervals_of_dots_hold_the_truth_as_often_as_they_say(monkeypatch):
@@ -40,7 +40,7 @@ def test_the_misfit_of_a_feature_is_its_root_mean_square_over_the_patches():
 def test_what_an_image_shows_is_found_whatever_the_file_says():
     """Power and room are wrong by a factor in the file, and come out near the truth."""
     truth = unit(7)
-    found = small_fit(capture_of(truth, 7), small_sensor(), place(), [FLUX], DotDraws(1, 3))
+    found = small_fit(capture_of(truth, 7), small_sensor(), specimen(), [FLUX], DotDraws(1, 3))
     values, spreads = found.in_file_units()
     assert found.parameters[0] is FLUX and spreads[0] > 0
     # full well, dots and corners are held at the file's, up to a third off: the power's share is what is left
@@ -50,6 +50,6 @@ def test_what_an_image_shows_is_found_whatever_the_file_says():
 
 def test_a_sheet_that_is_too_small_is_one_message():
     capture = capture_of(unit(1), 1)
-    tiny = known_place(place().world_from_sensor, 30.0, 30.0)
+    tiny = known_specimen(specimen().world_from_sensor, 30.0, 30.0)
     with pytest.raises(InputError, match=r"unit: specimen: found \d+ patches .* allowed: 8 or more"):
         small_fit(capture, small_sensor(), tiny, [FLUX], DotDraws())
