@@ -287,11 +287,11 @@ class Run:
         """Return the cloud of a checked view, decoded from its rendered images."""
         cloud, grid = self.cloud("rendered", view), self.predicted(view).grid
         if (cloud.grid.height, cloud.grid.width) != (grid.height, grid.width):
-            found, path = (
+            size, path = (
                 f"{cloud.grid.height} x {cloud.grid.width} pixels",
                 self.folder / f"clouds/rendered_{view:04d}.ply",
             )
-            raise InputError(path, "grid", found, f"{grid.height} x {grid.width}, as the predicted cloud")
+            raise InputError(path, "grid", size, f"{grid.height} x {grid.width}, as the predicted cloud")
         return cloud
 
     def capture(self, view: int) -> Capture:
@@ -313,10 +313,10 @@ def read_run(folder: str | Path) -> Run:
         raise InputError(folder, "", "no such folder", _MADE_BY)
     table = read_json_object(folder / "run.json", _MADE_BY, "mitsim run writes it last: let the run finish")
     about = validate(folder / "run.json", table, RunDocument)
-    own = about.files
-    check_own(folder, own, ("map.nc", "samples.nc", "scores.nc", "checks.nc", "statement.json"))
+    digests = about.files
+    check_own(folder, digests, ("map.nc", "samples.nc", "scores.nc", "checks.nc", "statement.json"))
     performance_map = PerformanceMap.load(folder / "map.nc")
-    sampled = "samples.nc" in own if own else (folder / "samples.nc").exists()
+    sampled = "samples.nc" in digests if digests else (folder / "samples.nc").exists()
     patches = read_dataset(folder / "samples.nc", _PATCHES) if sampled else None
     if patches is not None and (patches["sample_number"].values >= patches.sizes["sample"]).any():
         raise InputError(folder / "samples.nc", "sample_number", "a number without a sample", "numbers of the samples")
@@ -326,10 +326,10 @@ def read_run(folder: str | Path) -> Run:
         raise InputError(folder / "scores.nc", "minimum_points", repr(least)[:80], "a whole number of points")
     checks = read_dataset(folder / "checks.nc", _CHECKS)
     for name, data in (("scores.nc", scores), ("checks.nc", checks)):
-        found = [str(measurement) for measurement in data["measurement"].values]
-        if found != list(about.measurements):
+        measurements = [str(measurement) for measurement in data["measurement"].values]
+        if measurements != list(about.measurements):
             allowed = f"{', '.join(about.measurements)}, as in run.json"
-            raise InputError(folder / name, "measurement", ", ".join(found), allowed)
+            raise InputError(folder / name, "measurement", ", ".join(measurements), allowed)
     seen = {str(feature) for feature in scores["feature"].values}
     for name, entry in about.measurements.items():
         if absent := sorted(set(entry.faces) - seen):
@@ -342,7 +342,7 @@ def read_run(folder: str | Path) -> Run:
             raise InputError(folder / name, key, missing[0], "views of scores.nc")
     for name in ("possible", "uncertainty_possible"):
         scores[name] = scores[name].astype(bool)  # netCDF has no booleans
-    stated = "statement.json" in own or not own
+    stated = "statement.json" in digests or not digests
     statement = read_statement(folder / "statement.json") if stated else None
     if statement is not None and not set(statement.measurements) <= set(about.measurements):
         names, allowed = ", ".join(statement.measurements), f"{', '.join(about.measurements)}, as in run.json"
