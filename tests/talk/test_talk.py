@@ -101,6 +101,33 @@ def copied(kept: Path, folder: Path, names: tuple[str, ...]) -> Path:
     return folder
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            'measurement = "pillar1_radius", sample = "m',
+            'measurement = "pilar1_radius", sample = "m',
+            "examples.measur",
+        ),
+        (
+            'measurement = "pillar1_radius", sample = "R',
+            'measurement = "pilar1_radius", sample = "R',
+            "sphere.measurem",
+        ),
+        ('sample = "matt white"', 'sample = "mat white"', "examples.sample: .*'matt white'"),
+        ("trials = 2", 'trials = 2\nshown_feature = "pillar2_axis"', "shown_feature: .*pillar1, .*'pillar2'"),
+        ("distances_mm = [600]", "distances_mm = [450]", r"coupons\.shown_distance_mm: found 600\.0; allowed: 450"),
+    ],
+)
+def test_a_name_that_a_slide_shows_is_checked_before_work(tmp_path: Path, old: str, new: str, message: str) -> None:
+    path = small_talk(tmp_path)
+    text = path.read_text(encoding="utf-8")
+    assert text.count(old) == 1
+    path.write_text(text.replace(old, new), encoding="utf-8")
+    with pytest.raises(InputError, match=message):
+        read_talk(path)
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Make the small talk once; return its file and its output folder."""
