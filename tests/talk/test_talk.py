@@ -11,8 +11,9 @@ from PIL import Image
 
 from characterisation.files.errors import InputError
 from mitsim.capture.folder import write_capture
+from mitsim.sensor.transforms import Transform
 from mitsim.talk.make import make, results_known
-from mitsim.talk.measured import measured_errors
+from mitsim.talk.measured import _nearest, measured_errors
 from mitsim.talk.page import write_talk
 from mitsim.talk.results import Results
 from mitsim.talk.talk_file import read_talk
@@ -126,6 +127,17 @@ def test_a_name_that_a_slide_shows_is_checked_before_work(tmp_path: Path, old: s
     path.write_text(text.replace(old, new), encoding="utf-8")
     with pytest.raises(InputError, match=message):
         read_talk(path)
+
+
+def test_a_capture_belongs_to_the_view_of_its_standoff(tmp_path: Path) -> None:
+    talk = read_talk(small_talk(tmp_path))
+    assert {view.standoff for view in talk.views} == {520.0, 600.0}
+    small = Transform.from_degrees([0.5, 0, 1], [2, 1, 3])
+    for view in talk.views:
+        assert _nearest(talk, view.world_from_sensor @ small, tmp_path) is view
+    away = Transform(np.eye(3), np.array([0.0, 0.0, -250.0]))
+    with pytest.raises(InputError, match=r"0\.0 deg and (170|250) mm from the nearest view"):
+        _nearest(talk, talk.views[0].world_from_sensor @ away, tmp_path)
 
 
 @pytest.fixture(scope="module")
