@@ -7,13 +7,13 @@ from typing import Annotated
 
 import typer
 
-from characterisation.files.errors import InputError
 from mitsim.cli import options
 from mitsim.running.progress import say
 from mitsim.running.time_limit import TimeLimit, ending_in_order, stopped_by_user
 
 
 def talk(
+    context: typer.Context,
     file: Annotated[Path, typer.Argument(metavar="TALK", help="Talk TOML file: sensor, samples, views.")],
     output: options.Out,
     kept: Annotated[
@@ -40,8 +40,8 @@ def talk(
     Example: mitsim study talk scenes/talk/talk.toml -o runs/talk --processes 2
     """
     limit = TimeLimit(None if minutes is None else 60 * minutes)
-    if kept and fresh:
-        raise InputError("--fresh", "", "--kept", "only one of the two")
+    if kept:
+        options.refuse_unused(context, "--kept", "only one of the two", "fresh", "minutes", "scheduler", "processes")
     options.start(variant)
     from mitsim.talk.make import make, results_known
     from mitsim.talk.measured import measured_errors
