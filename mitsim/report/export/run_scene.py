@@ -96,6 +96,8 @@ def numbers_of(views: str, available: Sequence[int]) -> list[int]:
     """
     if views == "all":
         return sorted(available)
+    if not available:
+        raise InputError("--views", "", repr(views), "best or all: there are no views")
     allowed = f"best, all, or comma-separated numbers of views from {min(available)} to {max(available)}"
     try:
         chosen = sorted({int(word) for word in views.split(",")})
