@@ -32,6 +32,7 @@ from scipy.spatial.distance import pdist
 from characterisation.files.atomic_io import atomic_folder
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
 from mitsim.decoding.cloud import capture_cloud, capture_geometry, decoder_settings
@@ -309,10 +310,8 @@ def _info(silhouette: NDArray[np.bool_], visible: NDArray[np.bool_], valid: NDAr
 
 def _box(mask: NDArray[np.bool_]) -> list[int]:
     """Return x, y, width, height of a mask; four times -1 if it is empty."""
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    if not len(rows):
-        return [-1, -1, -1, -1]
-    return [int(columns[0]), int(rows[0]), int(columns[-1] - columns[0] + 1), int(rows[-1] - rows[0] + 1)]
+    box = Roi.around(mask)
+    return [-1, -1, -1, -1] if box is None else [box.left, box.top, box.width, box.height]
 
 
 def _camera_file(grid: ViewGrid, scale: float) -> dict[str, Any]:
