@@ -200,9 +200,7 @@ def clouds(
         if beside is not None:
             document |= {"beside": beside_document(simulated or "", *beside)}
         print(json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False))
-    elif request.empty and of_task is None:
-        pass
-    else:
+    elif not request.empty or of_task is not None:
         print(result_tables(paths, results, over))
         if beside is not None:
             from mitsim.cli.simulated_beside import beside_table

@@ -302,9 +302,7 @@ def keep_finished(folder: Path, overwrite: bool, last: str) -> None:
     InputError
         If the file exists and ``overwrite`` is false.
     """
-    if not (folder / last).exists():
-        return
-    if not overwrite and _is_finished(folder / last):
+    if not overwrite and (folder / last).exists() and _is_finished(folder / last):
         hint = "to repeat the run, add --overwrite (it reuses finished trials); to rewrite its page, use mitsim report"
         raise InputError("--output", "", f"{folder}, a finished run", "a folder without one", hint)
 

@@ -43,7 +43,7 @@ def talk(
     if kept:
         options.refuse_unused(context, "--kept", "only one of the two", "fresh", "minutes", "scheduler", "processes")
     options.start(variant)
-    from mitsim.talk.make import make, results_known
+    from mitsim.talk.make import make, missing_results
     from mitsim.talk.measured import measured_errors
     from mitsim.talk.page import write_talk
     from mitsim.talk.results import Results
@@ -56,7 +56,7 @@ def talk(
     errors = {} if measured is None else measured_errors(chosen, measured)
     with ending_in_order():
         if kept:
-            missing = results_known(chosen, results, tuple(errors))
+            missing = missing_results(chosen, results, tuple(errors))
         else:
             workers = options.requested_workers(scheduler, processes)
             missing = make(chosen, results, output, workers, limit, tuple(errors))

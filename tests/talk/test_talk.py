@@ -12,7 +12,7 @@ from PIL import Image
 from characterisation.files.errors import InputError
 from mitsim.capture.folder import write_capture
 from mitsim.sensor.transforms import Transform
-from mitsim.talk.make import make, results_known
+from mitsim.talk.make import make, missing_results
 from mitsim.talk.measured import _nearest, measured_errors
 from mitsim.talk.page import write_talk
 from mitsim.talk.results import Results
@@ -196,7 +196,7 @@ def test_missing_results_are_named_on_the_page(made: tuple[Path, Path], tmp_path
     path, output = made
     kept = copied(output / "kept", tmp_path / "kept", ("tilts", "trials_matt_white", "scores_matt_white"))
     talk, results = read_talk(path), Results(kept, any_version=True)
-    missing = results_known(talk, results)
+    missing = missing_results(talk, results)
     assert set(missing) == {file.stem for file in (output / "kept").iterdir()} - {file.stem for file in kept.iterdir()}
     page = write_talk(talk, results, tmp_path, missing).read_text(encoding="utf-8")
     assert page.count("Not made yet") >= 6
