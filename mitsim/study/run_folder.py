@@ -26,6 +26,7 @@ from mitsim.scene.surface.lay import LayLeftOut
 from mitsim.study.remedies.entries import RemediesEntry
 from mitsim.study.run_files import AGAIN, TASK, check_own
 from mitsim.study.statement_file import PartialDocument, StatementDocument, read_statement
+from mitsim.study.virtual.race import ALL
 
 _MADE_BY = "a folder made by mitsim run"
 
@@ -215,7 +216,7 @@ class RunDocument(PartialDocument):
     @property
     def leader(self) -> int | None:
         """Return the number of the best view for all measurements together; None if no view was raced."""
-        return self.leaders.get("all measurements")
+        return self.leaders.get(ALL)
 
 
 @dataclass(frozen=True)
@@ -243,7 +244,7 @@ class Run:
     @property
     def clouds(self) -> list[int]:
         """Return the numbers of the views with a predicted cloud, ascending."""
-        return [int(view) for view in self.scores["view"].values if self.has(f"clouds/predicted_{int(view):04d}.ply")]
+        return [int(view) for view in self.scores["view"].values if self.has_cloud("predicted", int(view))]
 
     def has(self, name: str) -> bool:
         """Return whether a file belongs to this run: ``run.json`` names it, or it exists and ``run.json`` is old and
@@ -251,9 +252,13 @@ class Run:
         """
         return name in self.about.files if self.about.files else (self.folder / name).exists()
 
+    def has_cloud(self, kind: str, view: int) -> bool:
+        """Return whether a view has a ``predicted`` or ``rendered`` cloud."""
+        return self.has(_cloud_name(kind, view))
+
     def cloud(self, kind: str, view: int) -> PointCloud:
         """Return the ``predicted`` or ``rendered`` cloud of a view."""
-        name = f"clouds/{kind}_{view:04d}.ply"
+        name = _cloud_name(kind, view)
         self.check(name)
         return read_cloud(self.folder / name)
 
@@ -289,7 +294,7 @@ class Run:
         if (cloud.grid.height, cloud.grid.width) != (grid.height, grid.width):
             size, path = (
                 f"{cloud.grid.height} x {cloud.grid.width} pixels",
-                self.folder / f"clouds/rendered_{view:04d}.ply",
+                self.folder / _cloud_name("rendered", view),
             )
             raise InputError(path, "grid", size, f"{grid.height} x {grid.width}, as the predicted cloud")
         return cloud
@@ -298,6 +303,10 @@ class Run:
         """Return the images of a checked view."""
         self.check(f"captures/view_{view:04d}/capture.json")
         return read_capture(self.folder / "captures" / f"view_{view:04d}")
+
+
+def _cloud_name(kind: str, view: int) -> str:
+    return f"clouds/{kind}_{view:04d}.ply"
 
 
 def read_run(folder: str | Path) -> Run:
