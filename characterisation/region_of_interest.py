@@ -48,10 +48,16 @@ class Roi:
         return cls(int(left), int(top), int(right) - int(left), int(bottom) - int(top))
 
     @classmethod
-    def around(cls, mask: NDArray[np.bool_]) -> Roi | None:
-        """Return the smallest region that holds all pixels of a mask (H, W), None if the mask has none."""
+    def around(cls, mask: NDArray[np.bool_], margin: int = 0) -> Roi | None:
+        """Return the smallest region that holds all pixels of a mask (H, W), None if the mask has none.
+
+        It is larger by a ``margin`` [px] on each side, but for what lies outside the mask's image.
+        """
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-        return cls.between(columns[0], rows[0], columns[-1] + 1, rows[-1] + 1) if len(rows) else None
+        if not len(rows):
+            return None
+        box = cls.between(columns[0] - margin, rows[0] - margin, columns[-1] + 1 + margin, rows[-1] + 1 + margin)
+        return box.overlap(cls.whole(mask.shape[1], mask.shape[0]))
 
     @property
     def right(self) -> int:

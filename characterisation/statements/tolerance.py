@@ -57,9 +57,5 @@ def tolerance_of(task: Task, measurement: str) -> Tolerance | None:
     if size is None:
         return None
     rule = task.decision_of(measurement)
-    if isinstance(asked.tolerance, tuple):
-        lower, upper = asked.limits
-        return Tolerance(-math.inf if asked.one_sided else lower, upper, size, rule)
-    if asked.one_sided:
-        return Tolerance(-math.inf, asked.nominal + size, size, rule)
-    return plus_minus(asked.nominal, size, rule)
+    lower, upper = asked.limits
+    return Tolerance(-math.inf if asked.one_sided else lower, upper, size, rule)

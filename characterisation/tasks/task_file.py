@@ -188,11 +188,9 @@ class Measurement(Document):
 
     @property
     def one_sided(self) -> bool:
-        """Return whether the tolerance has no lower limit.
-
-        Measured values are never negative, so a lower limit of 0 or less has no effect.
-        """
-        return self.zone or (self.deviations is not None and self.nominal + self.deviations[0] <= 0)
+        """Return whether the tolerance has no lower limit (:func:`effective_deviations`)."""
+        found = effective_deviations(self.nominal, self.tolerance)
+        return self.zone or (found is not None and found[0] is None)
 
     @property
     def limits(self) -> tuple[float, float]:
@@ -200,6 +198,19 @@ class Measurement(Document):
         if self.deviations is None:
             return -np.inf, np.inf
         return self.nominal + self.deviations[0], self.nominal + self.deviations[1]
+
+
+def effective_deviations(
+    nominal: float, tolerance: float | tuple[float, float] | None
+) -> tuple[float | None, float] | None:
+    """Return the lower and upper deviation of a tolerance; the lower is None where it has no effect.
+
+    Measured values are never negative, so a lower limit of 0 or less has no effect; None without a tolerance.
+    """
+    if tolerance is None:
+        return None
+    lower, upper = tolerance if isinstance(tolerance, tuple) else (-tolerance, tolerance)
+    return (lower if nominal + lower > 0 else None), upper
 
 
 class Task(Document):

@@ -166,6 +166,8 @@ def _check_feature(path: str | Path, task: Task, name: str) -> None:
     if feature.kind == "mid_plane":
         first, second = (task.features[parent].nominal() for parent in feature.of or ())
         assert isinstance(first, Plane) and isinstance(second, Plane)
+        if len(set(feature.of or ())) < 2:
+            raise InputError(path, f"{location}.of", list(feature.of or ()), "different features")
         if np.linalg.norm(np.cross(first.normal, second.normal)) > ASKEW:
             raise InputError(path, f"{location}.of", ", ".join(feature.of or ()), "two planes that are nearly parallel")
     if feature.outline_mm is not None:

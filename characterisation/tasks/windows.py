@@ -91,7 +91,7 @@ class WindowPlan:
     pairs: Sequence[tuple[PairKind, str, str]] = ()
 
     def check(self) -> None:
-        """Check that every pair names two features of the plan that have this measurement.
+        """Check that every pair names two different features of the plan that have this measurement.
 
         Raises
         ------
@@ -104,6 +104,8 @@ class WindowPlan:
                     names = list(self.features)
                     allowed = ", ".join(names) or "the name of a --plane, --sphere or --cylinder"
                     raise InputError(f"--{kind}", "", repr(name), allowed, nearest(name, names))
+            if first == second:
+                raise InputError(f"--{kind}", "", f"{first},{second}", "two different features")
             shapes = self.features[first][0], self.features[second][0]
             if _pair_function(kind, *shapes) is None:
                 raise InputError(

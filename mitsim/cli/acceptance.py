@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 
 def acceptance(
+    context: typer.Context,
     clouds: options.Clouds,
     plane: Annotated[
         list[str] | None,
@@ -75,6 +76,10 @@ def acceptance(
     if not (artefacts.planes or artefacts.spheres):
         command = "mitsim measure acceptance"
         raise InputError(command, "", "no artefact", "--plane or --sphere", f"see {command} --help")
+    if simulated is None:
+        options.refuse_unused(context, "no --simulated", "--simulated SENSOR", "seed", "variant")
+    if not artefacts.planes:
+        options.refuse_unused(context, "no --plane", "a --plane, whose sub-pixel RMS needs it", "baseline")
     chosen = tuple(topic) if topic else None
     input_clouds = [read_cloud(path, sensor, topic=chosen, frame=frame, unit=unit) for path in cloud_paths(clouds)]
     results = [cloud_figures(input_cloud.cloud, artefacts, baseline) for input_cloud in input_clouds]

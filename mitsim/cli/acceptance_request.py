@@ -73,6 +73,8 @@ def read_artefacts(planes: Sequence[str], spheres: Sequence[str], spacings: Sequ
             if name not in balls:
                 allowed = f"{_SPACING}, {', '.join(balls) or 'each a --sphere'}"
                 raise InputError("--spacing", "", repr(text), allowed, nearest(name, list(balls)))
+        if first == second:
+            raise InputError("--spacing", "", repr(text), "two different spheres")
         try:
             value = float(last)
         except ValueError:

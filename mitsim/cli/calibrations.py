@@ -14,6 +14,7 @@ from mitsim.running.progress import say
 
 
 def rig(
+    context: typer.Context,
     sensor: Annotated[
         str,
         typer.Argument(
@@ -67,6 +68,8 @@ def rig(
     if ("/" in sensor or "\\" in sensor) and not Path(sensor).exists():
         raise InputError(sensor, "", "no such file or folder", "a sensor, a folder of images, or a file of corners")
     if _is_recorded(sensor):
+        allowed = "no such option, or a sensor: it is of virtual calibrations"
+        options.refuse_unused(context, "recorded corners", allowed, "poses", "drift", "check", "seed")
         _recorded(Path(sensor), output, board)
         return
 
@@ -110,6 +113,7 @@ def rig(
 
 
 def verify(
+    context: typer.Context,
     capture: Annotated[Path, typer.Argument(help="Capture folder that shows a board or a plate of dots.")],
     board: Annotated[
         str | None, typer.Option(help="Chequerboard: COLUMNSxROWSxSQUARE_MM:GRADE, grade glass, composite or paper.")
@@ -150,6 +154,8 @@ def verify(
 
     if (board is None) == (dots is None):
         raise InputError("--board", "", "neither it nor --dots" if board is None else "--dots too", "one of both")
+    if dots is None:
+        options.refuse_unused(context, "no --dots", "--dots PITCH: it is the uncertainty of their pitch", "printed")
     numbers = [] if dots is None else _plate_numbers(dots)
     read = read_capture(capture)
     chosen = sensor_of(read, sensor, capture)

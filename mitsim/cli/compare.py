@@ -14,6 +14,7 @@ from mitsim.running.progress import say
 
 
 def compare(
+    context: typer.Context,
     real: Annotated[
         Path,
         typer.Argument(
@@ -56,6 +57,8 @@ def compare(
 
     if projector not in (None, "on", "off"):
         raise InputError("--projector", "", repr(projector), "on or off")
+    if simulated is not None:
+        options.refuse_unused(context, "a capture SIMULATED", "no such option: nothing is simulated", "sensor")
     options.check_folder(output)
     if not real.is_dir() or not (real / "capture.json").exists():
         real = _imported(real, output / "recorded", frame, calibration)

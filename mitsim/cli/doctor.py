@@ -60,6 +60,9 @@ dr, mi = backend.dr, backend.mi
 assert abs(float(dr.sum(dr.minimum(dr.arange(mi.Float, 8), 3.0))[0]) - 18.0) < 1e-6
 """
 
+#: time after which a trial kernel that does not end is given up [s]; chosen
+_PATIENCE_S = 300.0
+
 
 @dataclass(frozen=True)
 class MachineFinding:
@@ -101,12 +104,14 @@ def _renderer() -> list[MachineFinding]:
     except MissingEnvironmentError as error:
         return [*out, MachineFinding("renderer", "missing", "no Mitsuba variant can run", str(error))]
     # in a separate process: a library that aborts ends its process
-    trial = subprocess.run(
-        [sys.executable, "-c", _TRIAL, variant], capture_output=True, text=True, timeout=300, check=False
-    )
-    if trial.returncode == 0:
-        return [*out, MachineFinding("renderer", "ok", f"{variant}, a trial kernel ran")]
-    reason = (trial.stderr.strip().splitlines() or [f"it ended with code {trial.returncode}"])[-1]
+    command = [sys.executable, "-c", _TRIAL, variant]
+    try:
+        trial = subprocess.run(command, capture_output=True, text=True, timeout=_PATIENCE_S, check=False)
+        if trial.returncode == 0:
+            return [*out, MachineFinding("renderer", "ok", f"{variant}, a trial kernel ran")]
+        reason = (trial.stderr.strip().splitlines() or [f"it ended with code {trial.returncode}"])[-1]
+    except subprocess.TimeoutExpired:
+        reason = f"a trial kernel did not end within {_PATIENCE_S:g} s"
     return [*out, MachineFinding("renderer", "missing", f"{variant} failed: {reason}", backend.HELP)]
 
 

@@ -27,6 +27,7 @@ Views = Annotated[
 
 
 def cloud(
+    context: typer.Context,
     cloud: Annotated[Path, typer.Argument(help="PLY file that mitsim wrote.")],
     output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(CLOUD_SUFFIXES)}.")],
     pose: Annotated[
@@ -56,6 +57,12 @@ def cloud(
     part_from_sensor = None if pose is None else read_pose(pose, view)
     if frame == "part" and part_from_sensor is None:
         raise InputError("--in", "", "part, without --pose", "a JSON file with the sensor's pose", "give --pose FILE")
+    if pose is None:
+        options.refuse_unused(context, "no --pose", "--pose poses.json", "view")
+    if suffix in (".e57", ".mcap"):
+        options.refuse_unused(context, suffix, "no such option: it is of .ply and .pcd", "frame", "unit")
+    elif suffix == ".ply" and frame == "sensor":
+        options.refuse_unused(context, "points in the sensor frame", "--in part", "pose")
     read = read_cloud(cloud)
     options.check_file(output)
     if suffix == ".e57":
@@ -121,6 +128,7 @@ def run(
 
 
 def results(
+    context: typer.Context,
     folder: Annotated[Path, typer.Argument(help="Folder of mitsim run, or of mitsim study choose (best sensor).")],
     output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(RESULT_SUFFIXES)}.")],
     task: Annotated[
@@ -144,6 +152,9 @@ def results(
     from mitsim.report.export.results import read_results, write_results_csv, write_results_json
 
     suffix = _suffix(output, RESULT_SUFFIXES)
+    if suffix != ".xml":
+        of_a_certificate = "laboratory", "country", "responsible", "customer", "serial"
+        options.refuse_unused(context, suffix, "a certificate: .xml", *of_a_certificate)
     folder = _run_in(folder)
     run_results = read_results(folder, task)
     options.check_file(output)

@@ -86,6 +86,7 @@ def finish(
 
 
 def sensor_(
+    context: typer.Context,
     captures: Annotated[
         list[Path] | None,
         typer.Argument(
@@ -132,8 +133,8 @@ def sensor_(
     if output.suffix != ".toml":
         raise InputError("--output", "", str(output), "a .toml file")
     options.check_file(output)
-    if study is None and (campaign is not None or minutes is not None):
-        raise InputError("--campaign" if campaign is not None else "--minutes", "", "no --study", "--study study.toml")
+    if study is None:
+        options.refuse_unused(context, "no --study", "--study study.toml", "campaign", "minutes", "yes")
     journey = None if study is None else read_journey(study, campaign, output, minutes, options.asking(yes))
     if journey is not None:
         say("step 1 of 3: the fit; its first message of every capture states the time of a round")

@@ -9,16 +9,16 @@ from typing import Annotated, Literal
 import typer
 
 from characterisation.files.atomic_io import write_json
-from characterisation.files.errors import InputError
 from mitsim.cli import options
 from mitsim.cli.devices import mount
 from mitsim.running.progress import say, track
 
-#: what workers are allowed with, and why
-_ONE_AT_A_TIME = ("not with a [device]", "a device takes one capture at a time")
+#: why a campaign with a device has no workers, and what is allowed
+_ONE_AT_A_TIME = ("a campaign with a [device]", "no such option: a device takes one capture at a time")
 
 
 def make(
+    context: typer.Context,
     campaign: Annotated[Path, typer.Argument(help="Campaign TOML file.")],
     output: options.Out,
     sensor: options.SensorOption = "ensenso-n10",
@@ -54,12 +54,13 @@ def make(
     from mitsim.report.findings import spread_in_words
     from mitsim.sensor.preset import load_sensor
 
-    if captures is not None and scheduler is not None:
-        raise InputError("--scheduler", "", scheduler, "not with --captures", "existing captures need no cluster")
+    if captures is not None:
+        allowed = "no such option: existing captures need no workers"
+        options.refuse_unused(context, "--captures", allowed, "scheduler", "processes")
     file, chosen = read_toml(campaign, CampaignFile), load_sensor(sensor)
     live = None if file.device is None else plan_live(campaign, file, chosen)
     if live is not None:
-        options.check_no_workers(scheduler, processes, *_ONE_AT_A_TIME)
+        options.refuse_unused(context, *_ONE_AT_A_TIME, "scheduler", "processes")
     plan = plan_campaign(campaign, file, chosen) if live is None else live.campaign
     options.check_folder(output)
     if compact is not None:
@@ -169,6 +170,7 @@ def predict(
 
 
 def validate(
+    context: typer.Context,
     map_file: options.MapFile,
     campaign: Annotated[Path, typer.Argument(help="Campaign TOML file with the coupons to capture.")],
     output: options.Out,
@@ -221,7 +223,7 @@ def validate(
     performance_map = PerformanceMap.load(path)
     file, chosen = read_toml(campaign, CampaignFile), load_sensor(sensor)
     if file.device is not None:
-        options.check_no_workers(scheduler, processes, *_ONE_AT_A_TIME)
+        options.refuse_unused(context, *_ONE_AT_A_TIME, "scheduler", "processes")
     live = None if file.device is None else held_out_live(campaign, file, chosen, performance_map)
     plan = held_out_campaign(campaign, chosen, performance_map) if live is None else live.campaign
     shots = held_out_shots(plan, poses, seed)

@@ -22,6 +22,7 @@ _WINDOW = "NAME=COLUMN,ROW,WIDTH,HEIGHT"
 
 
 def clouds(
+    context: typer.Context,
     inputs: options.Clouds,
     plane: Annotated[
         list[str] | None,
@@ -133,10 +134,17 @@ def clouds(
         window,
     )
     places_in = read_frame(points_in)
-    if task is None and places_in.file is None and view is not None:
-        raise InputError("--view", "", "no --task", "a task for the scene: --task task.toml")
-    if task is None and (option := _given(scene=scene, pose=pose, correct=correct)):
-        raise InputError(f"--{option}", "", "no --task", "a task for the scene: --task task.toml")
+    if task is None:
+        of_a_task = "scene", "pose", "correct", "define", *(("view",) if places_in.file is None else ())
+        options.refuse_unused(context, "no --task", "a task for the scene: --task task.toml", *of_a_task)
+    if simulated is None:
+        options.refuse_unused(context, "no --simulated", "--simulated SENSOR", "seed")
+    if simulated is None and task is None:
+        options.refuse_unused(context, "no --task and no --simulated", "one of them", "variant")
+    if not dots:
+        options.refuse_unused(context, "no --dots", "--dots NAME=PITCH", "bright_dots")
+    if not request.plan.features:
+        options.refuse_unused(context, "no feature", "--plane, --sphere or --cylinder", "points_in")
     if task is not None and scene is None:
         raise InputError("--scene", "", "none", "the scene of the task's part: --scene part.xml")
     if request.empty and task is None and picture is None:
@@ -192,9 +200,7 @@ def clouds(
         if beside is not None:
             document |= {"beside": beside_document(simulated or "", *beside)}
         print(json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False))
-    elif request.empty and of_task is None:
-        pass
-    else:
+    elif not request.empty or of_task is not None:
         print(result_tables(paths, results, over))
         if beside is not None:
             from mitsim.cli.simulated_beside import beside_table
@@ -209,11 +215,6 @@ def clouds(
         say(summary(results))
     if not all(result.possible for cloud_results in results for result in cloud_results):
         raise typer.Exit(1)
-
-
-def _given(**options: Any) -> str | None:
-    """Return the name of the first option that was given."""
-    return next((name for name, value in options.items() if value is not None), None)
 
 
 def _task(

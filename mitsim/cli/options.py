@@ -175,19 +175,27 @@ def start(variant: str | None) -> None:
     backend.activate(variant)
 
 
-def check_no_workers(scheduler: str | None, processes: int, allowed: str, hint: str) -> None:
-    """Check that no options ask for workers.
+def refuse_unused(context: typer.Context, found: str, allowed: str, *names: str) -> None:
+    """Refuse options of the running command that the user gave although they have no effect.
 
     Parameters
     ----------
-    scheduler, processes
-        Values of ``--scheduler`` and ``--processes``.
-    allowed, hint
-        Where workers are allowed, and why only there.
+    context
+        The context of the command.
+    found, allowed
+        Why they have no effect, such as ``no --task``, and what gives them one.
+    names
+        Names of their parameters.
+
+    Raises
+    ------
+    InputError
+        For the first of them that is on the command line, whatever its value.
     """
-    if scheduler is not None or processes != 1:
-        option, value = ("--scheduler", scheduler) if scheduler is not None else ("--processes", str(processes))
-        raise InputError(option, "", value, allowed, hint)
+    for parameter in context.command.params:
+        source = context.get_parameter_source(parameter.name or "")
+        if parameter.name in names and source is not None and source.name == "COMMANDLINE":
+            raise InputError(max(parameter.opts, key=len), "", found, allowed)
 
 
 def requested_workers(scheduler: str | None, processes: int) -> Executor | None:
@@ -294,9 +302,7 @@ def keep_finished(folder: Path, overwrite: bool, last: str) -> None:
     InputError
         If the file exists and ``overwrite`` is false.
     """
-    if not (folder / last).exists():
-        return
-    if not overwrite and _is_finished(folder / last):
+    if not overwrite and (folder / last).exists() and _is_finished(folder / last):
         hint = "to repeat the run, add --overwrite (it reuses finished trials); to rewrite its page, use mitsim report"
         raise InputError("--output", "", f"{folder}, a finished run", "a folder without one", hint)
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 
 def check(
+    context: typer.Context,
     scene: options.Scene,
     position: Annotated[
         tuple[float, float, float] | None,
@@ -59,6 +60,12 @@ def check(
 
     Example: mitsim check scenes/two_pillars/two_pillars.xml --task scenes/two_pillars/task.toml -o preview.png
     """
+    if position is None:
+        options.refuse_unused(context, "no --position", "--position X Y Z", "target")
+    if pose is not None:
+        options.refuse_unused(context, "--pose", "no such option: the pose has it", "roll")
+    else:
+        options.refuse_unused(context, "no --pose", "--pose poses.json", "view")
     options.start(variant)
     import json as json_module
 
@@ -132,6 +139,7 @@ def _inspected(
 
 
 def part(
+    context: typer.Context,
     file: Annotated[Path, typer.Argument(help="STEP file, or a mesh: STL, OBJ, PLY, OFF, 3MF or glTF.")],
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Scene folder to write.")] = None,
     units: Annotated[
@@ -186,13 +194,24 @@ def part(
     """
     from mitsim.scene.authoring.fineness import fineness_for
     from mitsim.scene.authoring.part_folder import Finishing, described, write_part
+    from mitsim.scene.authoring.read_mesh import STEP
     from mitsim.scene.authoring.read_step import Fineness
 
+    if not edit:
+        options.refuse_unused(context, "no --edit", "--edit", "port")
     if edit and file.suffix.lower() == ".xml":
+        of_a_new_scene = "output", "units", "metal", "process", "roughness", "finish", "reflectance", "gloss"
+        allowed = "no such option, or a STEP file or mesh: --edit keeps the folder of a scene"
+        options.refuse_unused(context, file.name, allowed, *of_a_new_scene, "angle", "chord")
         _edit(file, sensor, port)
         return
     if output is None:
         raise InputError("--output", "", "nothing", "a folder to write: -o scenes/NAME")
+    if file.suffix.lower() in STEP:
+        options.refuse_unused(context, file.name, "a mesh: a STEP file has its own faces", "angle")
+    else:
+        allowed = "a STEP file: a mesh has its own triangles"
+        options.refuse_unused(context, file.name, allowed, "chord", *(() if edit else ("sensor",)))
     if sensor is not None and chord is not None:
         raise InputError("--chord", "", f"{chord:g} together with --sensor", "one of the two")
     fine = fineness_for(sensor) if sensor else Fineness() if chord is None else Fineness(chord)

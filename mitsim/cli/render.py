@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 
 def render(
+    context: typer.Context,
     scene: options.Scene,
     output: options.Out,
     position: Annotated[
@@ -80,7 +81,10 @@ def render(
         found = "both --position and --many" if many else "neither --position nor --many"
         raise InputError("--position", "", found, "one of them: a position, or a plan")
     if many is None:
-        options.check_no_workers(scheduler, processes, "only with --many", "a single capture runs in this process")
+        allowed = "--many: a single capture runs in this process"
+        options.refuse_unused(context, "no --many", allowed, "scheduler", "processes")
+    else:
+        options.refuse_unused(context, "--many", "no such option: the plan has the views", "target", "roll")
     options.start(variant)
     from mitsim.sensor.noise_sources import Noise
     from mitsim.study.many_captures import CaptureJob, CaptureSettings, digest_of, origin_of

@@ -7,13 +7,13 @@ from typing import Annotated
 
 import typer
 
-from characterisation.files.errors import InputError
 from mitsim.cli import options
 from mitsim.running.progress import say
 from mitsim.running.time_limit import TimeLimit, ending_in_order, stopped_by_user
 
 
 def talk(
+    context: typer.Context,
     file: Annotated[Path, typer.Argument(metavar="TALK", help="Talk TOML file: sensor, samples, views.")],
     output: options.Out,
     kept: Annotated[
@@ -40,10 +40,10 @@ def talk(
     Example: mitsim study talk scenes/talk/talk.toml -o runs/talk --processes 2
     """
     limit = TimeLimit(None if minutes is None else 60 * minutes)
-    if kept and fresh:
-        raise InputError("--fresh", "", "--kept", "only one of the two")
+    if kept:
+        options.refuse_unused(context, "--kept", "only one of the two", "fresh", "minutes", "scheduler", "processes")
     options.start(variant)
-    from mitsim.talk.make import make, results_known
+    from mitsim.talk.make import make, missing_results
     from mitsim.talk.measured import measured_errors
     from mitsim.talk.page import write_talk
     from mitsim.talk.results import Results
@@ -56,7 +56,7 @@ def talk(
     errors = {} if measured is None else measured_errors(chosen, measured)
     with ending_in_order():
         if kept:
-            missing = results_known(chosen, results, tuple(errors))
+            missing = missing_results(chosen, results, tuple(errors))
         else:
             workers = options.requested_workers(scheduler, processes)
             missing = make(chosen, results, output, workers, limit, tuple(errors))

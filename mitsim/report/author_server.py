@@ -119,9 +119,11 @@ class AuthorServer:
             for name, text in texts.items():
                 write_text(self.folder / name, text)
             findings = self.check()
-        except InputError as error:
+        except BaseException as error:
             for name, data in before.items():  # restore the files, since the new scene does not load
                 _restore(self.folder / name, data)
+            if not isinstance(error, InputError):
+                raise
             return 422, {"fault": str(error)}
         self.saved += 1
         self.done = request.get("done") is True

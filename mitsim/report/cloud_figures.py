@@ -17,6 +17,7 @@ from characterisation.plots.clouds import REASONS as STATUS_WORDS
 from characterisation.plots.clouds import depth_limits
 from characterisation.plots.style import FIELD, SEQUENTIAL, drawing
 from characterisation.point_cloud import PointCloud, Status
+from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.capture.picture import STRETCH_EXPONENT, grey_limits
 from mitsim.report.findings import reason_shares
@@ -26,6 +27,9 @@ from mitsim.sensor.camera import Camera
 from mitsim.sensor.png import encode_png
 
 LARGEST_WIDTH_PX = 800
+
+#: margin around the part in a picture of its clouds [px]; chosen
+_MARGIN_PX = 8
 
 #: meaning and colour of each status
 REASONS = {status: STATUS_WORDS[status.name] for status in Status}
@@ -83,17 +87,6 @@ def shrink(image: NDArray[np.unsignedinteger]) -> NDArray[np.float64]:
     return np.asarray(blocks.mean(axis=(1, 3)))
 
 
-def window(predicted: PointCloud, margin: int = 8) -> tuple[slice, slice]:
-    """Return the rows and columns of the grid in which the part can be visible, with a margin [px]."""
-    rows, columns = np.nonzero(predicted.status != Status.NO_SURFACE)
-    if not len(rows):
-        return slice(0, predicted.grid.height), slice(0, predicted.grid.width)
-    return (
-        slice(max(int(rows.min()) - margin, 0), int(rows.max()) + margin + 1),
-        slice(max(int(columns.min()) - margin, 0), int(columns.max()) + margin + 1),
-    )
-
-
 def draw_status(axes: Axes, status: NDArray[np.uint8], **options: Any) -> None:
     """Draw the status (H, W) of pixels in the colours of :data:`REASONS`."""
     colours = ListedColormap([REASONS[status][1] for status in Status])
@@ -104,7 +97,8 @@ def draw_status(axes: Axes, status: NDArray[np.uint8], **options: Any) -> None:
 
 def cloud_figure(predicted: PointCloud, decoded: PointCloud) -> Figure:
     """Draw the distance along the view ray [mm] and the status of every pixel of both clouds, cropped to the part."""
-    cut = window(predicted)
+    part = Roi.around(predicted.status != Status.NO_SURFACE, _MARGIN_PX)
+    cut = (part or Roi.whole(predicted.grid.width, predicted.grid.height)).slices
     clouds = {"predicted": predicted, "decoded": decoded}
     distances = [np.linalg.norm(cloud.points[cut] - cloud.grid.origin, axis=-1) for cloud in clouds.values()]
     present = sorted({Status(int(s)) for cloud in clouds.values() for s in np.unique(cloud.status[cut])})

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from markupsafe import Markup, escape
 
 from characterisation.tasks.decision_table import BIAS_SUBTRACTED
+from characterisation.tasks.task_file import effective_deviations
 from mitsim.report.placement_figure import VERDICTS
 from mitsim.running.numbers import MINUS, NONE, accepted_text, beside, count, listed, percent, quantity, unit_symbol
 
@@ -159,12 +160,14 @@ def exact(value: float, unit: str) -> str:
 
 def tolerance_words(tolerance: float | tuple[float, float] | None, nominal: float, unit: str) -> str:
     """Write a tolerance: ``±0.4 mm``, ``+0.1 −0.2 mm``; ``up to 0.6°`` if no value is below; a dash for None."""
-    if tolerance is None:
+    deviations = effective_deviations(nominal, tolerance)
+    if deviations is None:
         return NONE
-    if isinstance(tolerance, tuple):
-        lower, upper = tolerance
-        return f"{upper:+g} {lower:+g}".replace("-", MINUS) + _suffix(unit)
-    text = f"up to {nominal + tolerance:g}" if nominal - tolerance <= 0 else f"±{tolerance:g}"
+    lower, upper = deviations
+    if lower is None:
+        text = f"up to {nominal + upper:g}"
+    else:
+        text = f"±{upper:g}" if lower == -upper else f"{upper:+g} {lower:+g}".replace("-", MINUS)
     return text + _suffix(unit)
 
 

@@ -25,6 +25,7 @@ from characterisation.tasks.covariance import LEAST_CHANCE, PERSISTENT_REACH_PX,
 from mitsim.report import findings
 from mitsim.report.agreement import Agreement, agreement, chance_level
 from mitsim.report.cloud_figures import REASONS
+from mitsim.report.first_rows import exact
 from mitsim.report.first_screen import of_run
 from mitsim.report.page_pictures import camera_view, cloud_picture, map_pictures, measurement_pictures
 from mitsim.report.pose_texts import expected_texts, pose_of_view, pose_texts
@@ -34,15 +35,13 @@ from mitsim.report.view_sphere import view_sphere
 from mitsim.running.numbers import NONE, count, listed, percent, quantity, rounded, two_digits
 from mitsim.study.run_folder import Run, RunnerUp, read_run
 from mitsim.study.scene_geometry import read_scene_geometry
+from mitsim.study.virtual.race import ALL
 
 #: rows of the ranked table; scores.csv holds all views
 TOP = 10
 
 #: largest number of rolls that are listed individually
 MOST_LISTED = 8
-
-#: key of the result for all measurements together in run.json
-ALL = "all measurements"
 
 #: how a user can recover missing points, by their status
 REMEDIES: dict[Status, str] = {
@@ -159,7 +158,7 @@ def _spread(views: list[int], number: int) -> list[int]:
 def _answer(run: Run, name: str) -> dict[str, Any]:
     """Return the best view of one measurement from the race, or from the screening if none was raced."""
     entry, scores = run.about.measurements[name], run.scores.sel(measurement=name)
-    nominal = f"{entry.nominal:g}{'°' if entry.unit == 'deg' else ' ' + entry.unit}"
+    nominal = exact(entry.nominal, entry.unit)
     best = run.about.leaders.get(name, findings.best_view(run.scores, name))
     row: dict[str, Any] = {"name": name, "features": ", ".join(entry.features), "nominal": nominal, "best": best}
     if best is None:

@@ -2,12 +2,12 @@
 
 Signal chain: folder of a run or of a comparison of sensors -> declaration (:mod:`mitsim.report.declaration`) and
 picture of the part in the colours of its verdicts -> pages of PDF by matplotlib, which needs no browser. A table that
-does not fit on one page continues on the next, and the facts and the lines to sign follow it.
+does not fit on one page continues on the next, as do notes and facts; the lines to sign follow.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
@@ -137,14 +137,19 @@ def sheet_figures(declaration: Declaration, geometry: SceneGeometry | None) -> l
             _picture(page.figure, grid, declaration, geometry)
             page.place -= height
         _table(page, here, columns)
-        while rows or below > page.room:
-            page = Page()
-            pages.append(page)
-            page.write(f"{declaration.title}, continued", 11, weight="bold")
-            page.place -= 0.1
-            _table(page, _taken(rows, page.room, columns) or [rows.pop(0) for _ in rows[:1]], columns)
-        _facts(page, declaration, layout.facts)
-        _sign(page)
+
+        def continued() -> Page:
+            pages.append(Page())
+            pages[-1].write(f"{declaration.title}, continued", 11, weight="bold")
+            pages[-1].place -= 0.1
+            return pages[-1]
+
+        while rows:
+            page = continued()
+            _table(page, _taken(rows, page.room, columns) or [rows.pop(0)], columns)
+        if below > page.room:
+            page = continued()
+        _sign(_facts(page, declaration, layout.facts, continued))
         for number, sheet_page in enumerate(pages, 1):
             _foot(sheet_page, number, len(pages))
     return [sheet_page.figure for sheet_page in pages]
@@ -290,16 +295,28 @@ def _facts_height(declaration: Declaration, size: float) -> float:
     return lines * size * LINE + _FACT_GAP * len(declaration.facts) + notes * small * LINE + 0.11
 
 
-def _facts(page: Page, declaration: Declaration, size: float) -> None:
+def _facts(page: Page, declaration: Declaration, size: float, continued: Callable[[], Page]) -> Page:
+    """Write notes and facts, on ``continued`` pages where one has no room, and return the page to sign."""
+
+    def write(text: str, size: float, colour: str = INK, name: str = "", left: float = 0.0) -> None:
+        nonlocal page
+        for number, line in enumerate(wrapped(text, size, ACROSS - left)):
+            if page.room < size * LINE:
+                page = continued()
+            if name and number == 0:
+                page.put(0, name, size, MUTED)
+            page.put(left, line, size, colour)
+            page.place -= size * LINE
+
     page.place -= 0.05
     for note in _notes(declaration):
-        page.write(note, min(size, _SMALL), MUTED)
+        write(note, min(size, _SMALL), MUTED)
     page.place -= 0.06
     for name, text in declaration.facts:
         if text:
-            page.put(0, name, size, MUTED)
-            page.write(text, size, left=size * _FACT_LEFT, across=ACROSS - size * _FACT_LEFT)
+            write(text, size, name=name, left=size * _FACT_LEFT)
             page.place -= _FACT_GAP
+    return page if page.room > _SIGNATURE - 1e-6 else continued()
 
 
 def _sign(page: Page) -> None:

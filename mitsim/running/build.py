@@ -29,26 +29,26 @@ _LEFT_OUT = (".pyc", ".pyo", ".nc")
 @lru_cache(maxsize=1)
 def own_build() -> dict[str, str]:
     """Return versions by name, and ``source``, a digest of all installed files of mitsim and characterisation."""
-    found = {"mitsim": __version__, "source": _source(), "python": platform.python_version()}
+    versions = {"mitsim": __version__, "source": _source(), "python": platform.python_version()}
     for name in _PACKAGES:
         try:
-            found[name] = importlib.metadata.version(name)
+            versions[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
-            found[name] = "none"
-    return found
+            versions[name] = "none"
+    return versions
 
 
-def differences(own: dict[str, str], other: dict[str, str]) -> str:
+def differences(build: dict[str, str], other: dict[str, str]) -> str:
     """Return all differences between two builds in words; empty if there are none.
 
     The version of Python may differ, since it does not influence any number.
     """
     out = []
-    for name, own_version in own.items():
+    for name, version in build.items():
         other_version = other.get(name, "unknown")
-        if name == "python" or other_version == own_version:
+        if name == "python" or other_version == version:
             continue
-        out.append("other source files" if name == "source" else f"{name} {other_version} in place of {own_version}")
+        out.append("other source files" if name == "source" else f"{name} {other_version} in place of {version}")
     return ", ".join(out)
 
 

@@ -89,15 +89,15 @@ class Cluster:
         """
         if not items:
             return
-        own = own_build()
-        _compare_builds(self.client, self.address, own)
+        build = own_build()
+        _compare_builds(self.client, self.address, build)
         executor = self.client.get_executor(pure=False, retries=DEATHS)
         try:
             running: dict[Any, Item] = {}
             yield from finished_orders(
                 deque(items),
                 running,
-                lambda item: executor.submit(_of_same_build, self.address, own, work, order(item)),
+                lambda item: executor.submit(_of_same_build, self.address, build, work, order(item)),
                 lambda: 0 if len(running) < AHEAD * max(sum(self.client.ncores().values()), 1) else None,
                 _Watch(self.client, self.address).check,
                 _POLL_S,
@@ -166,7 +166,7 @@ def _of_same_build(address: str, build: dict[str, str], work: Callable[[Plain], 
     return work(order)
 
 
-def _compare_builds(client: Any, address: str, own: dict[str, str]) -> None:
+def _compare_builds(client: Any, address: str, local: dict[str, str]) -> None:
     """Wait for a worker, and compare the builds of all workers."""
     watch = _Watch(client, address)
     while not client.ncores():
@@ -179,15 +179,15 @@ def _compare_builds(client: Any, address: str, own: dict[str, str]) -> None:
     for worker, build in builds.items():
         if isinstance(build, OSError):
             continue  # the worker died meanwhile
-        differing = differences(own, build) if isinstance(build, dict) else f"no known build ({_in_a_line(build)})"
+        differing = differences(local, build) if isinstance(build, dict) else f"no known build ({_in_a_line(build)})"
         if differing:
             raise _other_build(address, worker, differing)
 
 
-def _other_build(address: str, worker: str, found: str) -> MissingEnvironmentError:
+def _other_build(address: str, worker: str, difference: str) -> MissingEnvironmentError:
     return MissingEnvironmentError(
-        f"--scheduler {address}: the worker {worker} has {found}: its captures would differ; install the same mitsim "
-        "there, and run the same command again"
+        f"--scheduler {address}: the worker {worker} has {difference}: its captures would differ; install the same "
+        "mitsim there, and run the same command again"
     )
 
 

@@ -81,15 +81,15 @@ def fitting_processes() -> int:
 
 def available_memory() -> int:
     """Return the available memory [bytes] of the machine, or of the container of this process."""
-    found = [8 << 30]
+    available = [8 << 30]
     with contextlib.suppress(OSError, ValueError, StopIteration):
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        found = [1024 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))]
+        available = [1024 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))]
     with contextlib.suppress(OSError, ValueError):
         group = Path("/sys/fs/cgroup")
         limit, used = (int((group / f"memory.{name}").read_text(encoding="ascii")) for name in ("max", "current"))
-        found.append(max(limit - used, 0))
-    return min(found)
+        available.append(max(limit - used, 0))
+    return min(available)
 
 
 def finished_orders(
@@ -108,7 +108,7 @@ def finished_orders(
         Items that wait, and those in work by their futures; both are changed. After an error, ``running`` has the items
         without a result. Their futures are cancelled.
     submit, next_of
-        Start the work on an item; return the place of the next one among those that wait, None without room.
+        Start the work on an item; return the index of the next among those that wait, None without room.
     idle, idle_s
         Called when no item was finished for ``idle_s`` [s].
 
@@ -118,10 +118,10 @@ def finished_orders(
     """
     try:
         while waiting or running:
-            while waiting and (place := next_of()) is not None:
-                item = waiting[place]
+            while waiting and (index := next_of()) is not None:
+                item = waiting[index]
                 running[submit(item)] = item
-                del waiting[place]
+                del waiting[index]
             done = wait(running, idle_s, FIRST_COMPLETED).done
             if not done:
                 idle()
@@ -163,13 +163,13 @@ class Pool:
 
         def next_of() -> int | None:
             nonlocal chosen
-            place, chosen = self._next(waiting, name_of, Counter(worker_of[one] for one in running))
-            return place
+            index, chosen = self._next(waiting, name_of, Counter(worker_of[future] for future in running))
+            return index
 
         def submit(item: Item) -> Future[Result]:
             future = self._ready(chosen).submit(work, order(item))
             name = name_of(item)
-            self._prepared[chosen] = {one for one in self._prepared[chosen] if one[0] == name[0]} | {name}
+            self._prepared[chosen] = {entry for entry in self._prepared[chosen] if entry[0] == name[0]} | {name}
             worker_of[future] = chosen
             return future
 
@@ -197,24 +197,24 @@ class Pool:
         self._prepared.clear()
         for worker in workers:
             worker.shutdown(wait=False, cancel_futures=True)
-        for one in workers if wait else ():
-            one.shutdown()
+        for worker in workers if wait else ():
+            worker.shutdown()
 
     def _next(
         self, waiting: deque[Item], name_of: Callable[[Item], tuple[Hashable, Hashable]], orders: Counter[int]
     ) -> tuple[int | None, int]:
-        """Return the place of the next of the waiting items, and its worker; None without room.
+        """Return the index of the next of the waiting items, and its worker; None without room.
 
         ``orders`` are those in work at each worker. A worker takes what it has prepared, or nobody has; an idle one
         takes any.
         """
         anywhere = set().union(*self._prepared.values())
         free = [worker for worker in range(self.processes) if orders[worker] < AHEAD]
-        for worker in sorted(free, key=lambda one: orders[one]):
+        for worker in sorted(free, key=lambda number: orders[number]):
             mine = self._prepared.get(worker, set())
-            for place, name in enumerate(map(name_of, waiting)):
+            for index, name in enumerate(map(name_of, waiting)):
                 if name in mine or name not in anywhere:
-                    return place, worker
+                    return index, worker
             if not orders[worker]:
                 return 0, worker
         return None, 0
@@ -263,5 +263,5 @@ def results_of(
     if workers is None:
         return [work(order) for order in track(orders, label)]
     made = workers.distribute(range(len(orders)), orders.__getitem__, work)
-    found = dict(track(made, label, len(orders)))
-    return [found[number] for number in range(len(orders))]
+    results = dict(track(made, label, len(orders)))
+    return [results[number] for number in range(len(orders))]

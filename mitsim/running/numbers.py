@@ -21,16 +21,16 @@ def two_digits(value: float) -> str:
         return NONE
     if value == 0:
         return "0"
-    places = 1 - math.floor(math.log10(abs(value)))
-    rounded = round(value, places)
+    decimals = 1 - math.floor(math.log10(abs(value)))
+    rounded = round(value, decimals)
     if rounded:  # rounding up can add a digit: 0.0996 became 0.100
-        places = 1 - math.floor(math.log10(abs(rounded)))
-    return signed(f"{rounded:.{max(places, 0)}f}")
+        decimals = 1 - math.floor(math.log10(abs(rounded)))
+    return signed(f"{rounded:.{max(decimals, 0)}f}")
 
 
-def rounded(value: float, places: int = 0) -> str:
+def rounded(value: float, decimals: int = 0) -> str:
     """Round to a number of decimal places, without a negative zero."""
-    return signed(f"{round(value, places) + 0.0:.{places}f}") if math.isfinite(value) else NONE
+    return signed(f"{round(value, decimals) + 0.0:.{decimals}f}") if math.isfinite(value) else NONE
 
 
 def beside(value: float, uncertainty: float | None) -> str:
@@ -43,8 +43,8 @@ def beside(value: float, uncertainty: float | None) -> str:
 def interval_text(low: float, high: float) -> str:
     """Write the ends of an interval with the decimal places that two digits of half its width need."""
     half = (high - low) / 2 or max(abs(low), abs(high), 1e-12)
-    places = max(0, 1 - math.floor(math.log10(half)))
-    return f"{rounded(low, places)} to {rounded(high, places)}"
+    decimals = max(0, 1 - math.floor(math.log10(half)))
+    return f"{rounded(low, decimals)} to {rounded(high, decimals)}"
 
 
 def accepted_text(low: float, high: float, tolerance: float) -> str:
@@ -52,10 +52,10 @@ def accepted_text(low: float, high: float, tolerance: float) -> str:
 
     ``low`` is -inf for ``up to 0.13``.
     """
-    places = max(0, 2 - math.floor(math.log10(tolerance)), 1 - math.floor(math.log10(min(tolerance, high - low))))
-    unit, near = 10.0**places, 1e-6  # a number that is written with these places stays
-    most = rounded(math.floor(high * unit + near) / unit, places)
-    return f"up to {most}" if math.isinf(low) else f"{rounded(math.ceil(low * unit - near) / unit, places)} to {most}"
+    decimals = max(0, 2 - math.floor(math.log10(tolerance)), 1 - math.floor(math.log10(min(tolerance, high - low))))
+    unit, near = 10.0**decimals, 1e-6  # a number that is written with these decimals stays
+    most = rounded(math.floor(high * unit + near) / unit, decimals)
+    return f"up to {most}" if math.isinf(low) else f"{rounded(math.ceil(low * unit - near) / unit, decimals)} to {most}"
 
 
 def signed(text: str) -> str:

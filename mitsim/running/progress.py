@@ -68,11 +68,11 @@ def time_left(finished_s: Sequence[float], total: int) -> str:
     as kernels and light paths, and workers return several items at once. Therefore the first items that came together
     only bound the time.
     """
-    rest, done = total - len(finished_s), len(finished_s)
-    first = sum(one - finished_s[0] <= _TOGETHER_S for one in finished_s)
+    remaining, done = total - len(finished_s), len(finished_s)
+    first = sum(moment - finished_s[0] <= _TOGETHER_S for moment in finished_s)
     if done == first:
-        return f"at most {finished_s[-1] / done * rest:.0f} s left"
-    return f"{(finished_s[-1] - finished_s[0]) / (done - first) * rest:.0f} s left"
+        return f"at most {finished_s[-1] / done * remaining:.0f} s left"
+    return f"{(finished_s[-1] - finished_s[0]) / (done - first) * remaining:.0f} s left"
 
 
 def _lines(items: Iterable[Item], label: str, total: int | None, report: Callable[[str], None] = say) -> Iterator[Item]:

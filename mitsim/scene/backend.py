@@ -60,6 +60,9 @@ library.LLVMGetVersion(*[ctypes.byref(n) for n in numbers])
 print(numbers[0].value)
 """
 
+#: time after which a library that does not load is given up [s]; chosen
+_PATIENCE_S = 60.0
+
 HELP = (
     f"no libLLVM of version {LLVM_MINIMUM} or later was found, and Mitsuba's CPU variants need one.\n"
     "On x86-64 Linux: pip install karellen-llvm-core. Elsewhere: install LLVM (Debian: apt-get install libllvm19; "
@@ -116,9 +119,11 @@ def _inspect(path: Path, origin: str) -> Llvm:
     match = re.search(r"libLLVM[.-](?:so\.)?(\d+)", path.resolve().name)
     if match and int(match.group(1)) < LLVM_MINIMUM:
         return Llvm(path, int(match.group(1)), origin, f"older than {LLVM_MINIMUM}: it could abort the process")
-    process = subprocess.run(
-        [sys.executable, "-c", _VERSION_SCRIPT, str(path)], capture_output=True, text=True, timeout=60, check=False
-    )
+    command = [sys.executable, "-c", _VERSION_SCRIPT, str(path)]
+    try:
+        process = subprocess.run(command, capture_output=True, text=True, timeout=_PATIENCE_S, check=False)
+    except subprocess.TimeoutExpired:
+        return Llvm(path, 0, origin, f"it does not load within {_PATIENCE_S:g} s")
     if process.returncode != 0:
         fault = (process.stderr.strip().splitlines() or ["it cannot be loaded"])[-1]
         return Llvm(path, 0, origin, fault.removeprefix("OSError: "))

@@ -72,9 +72,9 @@ class CellEntry(PartialDocument):
         """Return the reason why the measurement is impossible; empty if it is possible."""
         if self.by != "none":
             return ""
-        some = "no virtual measurement" if self.without_value == 1 else "only one virtual measurement"
-        what = f"{some} of {self.trials} gave a value" if self.trials else "by screening, no view can make it"
-        return f"{what}: {self.reason}" if self.reason else what
+        count = "no virtual measurement" if self.without_value == 1 else "only one virtual measurement"
+        text = f"{count} of {self.trials} gave a value" if self.trials else "by screening, no view can make it"
+        return f"{text}: {self.reason}" if self.reason else text
 
 
 #: trials of the first round of a comparison; with as many, a standard uncertainty may be 1.4 times as large, and one of
@@ -203,7 +203,7 @@ class ChoiceDocument(PartialDocument):
                 continue
             why = "it can make more measurements"
             if len(sensor.impossible) <= len(best.impossible):
-                mine, other = (two_digits(or_nan(each.ratio)) for each in (best, sensor))
+                mine, other = (two_digits(or_nan(entry.ratio)) for entry in (best, sensor))
                 ratios = f"{mine} times its limit, that of {sensor.name} at {other}"
                 why = f"its worst measurement is at {ratios} times"
             fits = f"{sensor.name} fits {sensor.fits} of {self.toleranced} tolerances, {best.name} {best.fits}"
@@ -259,8 +259,8 @@ def winner_folder(folder: Path) -> Path:
         hint = "run the same mitsim study choose again: it continues"
         raise InputError(folder / CHOICE, "finished", "false", "a finished comparison", hint)
     if not choice.sensors or choice.sensors[0].status != "stated":
-        found, allowed = "no sensor with a statement", "a best sensor that was measured virtually"
-        raise InputError(folder / CHOICE, "sensors", found, allowed, "give mitsim study choose more --minutes")
+        sensors, allowed = "no sensor with a statement", "a best sensor that was measured virtually"
+        raise InputError(folder / CHOICE, "sensors", sensors, allowed, "give mitsim study choose more --minutes")
     return folder / choice.sensors[0].name
 
 

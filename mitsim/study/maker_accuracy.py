@@ -29,12 +29,12 @@ def maker_sigma(sensor: Sensor, measurement: Measurement, distance_mm: float) ->
     """
     if measurement.unit != "mm":
         return None
-    known = list[float]()
+    sigmas = list[float]()
     if sensor.published_accuracy is not None:
-        known.append(sensor.published_accuracy.sigma_mm)
+        sigmas.append(sensor.published_accuracy.sigma_mm)
     if sensor.published_lengths is not None and measurement.nominal > 0:
-        known.append(sensor.published_lengths.one_sigma(distance_mm) * measurement.nominal)
-    finite = [one for one in known if math.isfinite(one)]
+        sigmas.append(sensor.published_lengths.one_sigma(distance_mm) * measurement.nominal)
+    finite = [sigma for sigma in sigmas if math.isfinite(sigma)]
     return min(finite) if finite else None
 
 
@@ -53,10 +53,10 @@ def below_the_maker(rows: Sequence[tuple[str, float | None, float | None]], left
     below = [(name, u, sigma) for name, u, sigma in rows if u is not None and sigma is not None and u < SHARE * sigma]
     if not below:
         return []
-    each = [f"{name} ({two_digits(u)} of {two_digits(sigma)} mm)" for name, u, sigma in below]
-    verb = "is" if len(each) == 1 else "are"
+    entries = [f"{name} ({two_digits(u)} of {two_digits(sigma)} mm)" for name, u, sigma in below]
+    verb = "is" if len(entries) == 1 else "are"
     return [
-        f"{listed(each)} {verb} stated below a tenth of the accuracy that the maker of {sensor} publishes. That figure "
-        "holds for every place in the volume, every unit and day; this statement holds for one view, and leaves out "
-        f"{left_out}. Compare it with captures of your unit before you rely on it"
+        f"{listed(entries)} {verb} stated below a tenth of the accuracy that the maker of {sensor} publishes. That "
+        "figure holds for every place in the volume, every unit and day; this statement holds for one view, and leaves "
+        f"out {left_out}. Compare it with captures of your unit before you rely on it"
     ]

@@ -106,7 +106,7 @@ class CaptureJob:
     def digest(self) -> str:
         """Return the SHA-256 of everything that determines the capture: its origin, and the values of the job."""
         settings = self.settings
-        own = [
+        content = [
             __version__,
             self.origin,
             sorted(settings.parameters.items()),
@@ -121,8 +121,8 @@ class CaptureJob:
             settings.truth,
         ]
         if settings.smoothing_px:
-            own.append(settings.smoothing_px)
-        return hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()
+            content.append(settings.smoothing_px)
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def read_jobs(plan: str | Path, scene: str | Path, sensor: Sensor, common: CaptureSettings) -> list[CaptureJob]:

@@ -73,10 +73,10 @@ class Study:
         InputError
             If the study has no such view.
         """
-        known = {one.number: one for one in self.views}
-        if number not in known:
-            raise InputError(where, "", number, f"{min(known)} to {max(known)}, the views of this study")
-        return known[number]
+        by_number = {view.number: view for view in self.views}
+        if number not in by_number:
+            raise InputError(where, "", number, f"{min(by_number)} to {max(by_number)}, the views of this study")
+        return by_number[number]
 
     @property
     def unknowns(self) -> UnknownsTable:
@@ -154,12 +154,12 @@ def open_study(
         near, far = sensor.working_range_mm
         around = [max(math.floor(standoffs[0] - radius), near), min(math.ceil(standoffs[-1] + radius), far)]
         campaign = read_campaign(folder / file.characterisation.campaign, sensor, around)
-        known = samples_of(
+        samples = samples_of(
             [(sample.finish, sample.roughness, sample.light) for sample in campaign.samples], "the campaign"
         )
         distances = list(campaign.distances)
     else:
-        own = file.characterisation.map or sensor.name
+        map_name = file.characterisation.map or sensor.name
         if not performance_map and not file.characterisation.map and sensor.name not in shipped_maps():
             raise InputError(
                 path,
@@ -168,12 +168,12 @@ def open_study(
                 'map = "map.nc" or campaign = "campaign.toml" in [characterisation]',
                 f"mitsim map make CAMPAIGN --sensor {own_sensor} -o FOLDER writes FOLDER/map.nc",
             )
-        chosen_map = read_map(performance_map or own, sensor, "." if performance_map else folder)
+        chosen_map = read_map(performance_map or map_name, sensor, "." if performance_map else folder)
         distances = chosen_map.data["distance"].values.tolist()
-        known = chosen_map.known
-    _check_finishes(path, scene, task, known)
+        samples = chosen_map.known
+    _check_finishes(path, scene, task, samples)
     if campaign is not None:
-        _check_campaign(scene, known)
+        _check_campaign(scene, samples)
     reach = characterised_range(path, file.views, sensor, standoffs, distances)
     candidates = candidate_views(file.views, sensor, standoffs, scene.centre, triangles(scene), reach, path)
     if chosen_map is not None and mapped:
@@ -240,8 +240,8 @@ def _with_limits(path: str | Path, file: StudyFile, task: Task) -> StudyFile:
     return file.model_copy(update={"set": file.set.model_copy(update={"limits": limits})})
 
 
-def _check_finishes(path: Path, scene: Scene, task: Task, known: Samples) -> None:
-    if MATT_WHITE.name not in known.names:
+def _check_finishes(path: Path, scene: Scene, task: Task, samples: Samples) -> None:
+    if MATT_WHITE.name not in samples.names:
         hint = "the view score is normalised by the values of matt white"
         raise InputError(path, "characterisation", "no matt_white sample", "a campaign that has one", hint)
     for name, finish in zip(scene.names, scene.finishes, strict=True):
@@ -251,13 +251,13 @@ def _check_finishes(path: Path, scene: Scene, task: Task, known: Samples) -> Non
             raise InputError(scene.where, f"shape {name!r}", "a BSDF of no known finish", allowed)
 
 
-def _check_campaign(scene: Scene, known: Samples) -> None:
+def _check_campaign(scene: Scene, samples: Samples) -> None:
     """Reject a finish that the study's own campaign does not characterise."""
-    for name, finish in unknown_finishes(known, seen_finishes(scene)).items():
+    for name, finish in unknown_finishes(samples, seen_finishes(scene)).items():
         raise InputError(
             scene.where,
             f"shape {name!r}",
             f"the finish {finish}",
-            f"the finishes of the campaign: {known.in_words()}",
+            f"the finishes of the campaign: {samples.in_words()}",
             "add a sample to the campaign, or remove [characterisation]: mitsim then offers to characterise it",
         )

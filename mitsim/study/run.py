@@ -145,11 +145,11 @@ def run_within(
     scores = write_raced(session, scores, raced)
     clock.lap("race")
     leaders = list(dict.fromkeys(raced.leaders().values()))
-    stated, rest = None, plan.rest_limit(limit)
+    stated, rest_limit = None, plan.rest_limit(limit)
     if leaders:
         statement_limit = plan.statement_limit(limit)
         stated = session.state(
-            study.view(leaders[0]), None, statement_limit, lambda known: answers.improve(raced, known)
+            study.view(leaders[0]), None, statement_limit, lambda stated_view: answers.improve(raced, stated_view)
         )
         stated = stated if len(stated.statements) and stated.statements[0].trials else None
     if stated is not None:
@@ -159,7 +159,7 @@ def run_within(
     if stated is not None and not limit.over():
         twin = None  # its memory is for the changed studies
         now = Shortfall(session, stated, scores, raced, search)
-        stated, remedies = state_and_mend(session, now, rest, clock)
+        stated, remedies = state_and_mend(session, now, rest_limit, clock)
         twin = session.renderer
     tried = [] if limit.over() else _confirm(session, chosen, search, plan.last_limit(limit))
     chosen = tried[-1].chosen if tried else chosen
@@ -171,8 +171,8 @@ def run_within(
     if twin is not None:
         began = time.monotonic()
         shown = _show(twin, shown, folder, {} if stated is None else {leaders[0]: stated.planned}, pictured)
-        each = (time.monotonic() - began) / max(1, len(shown))
-        residuals += [_residual(twin, number) for number in shown[:1] if pictured.left > _RESIDUAL_PICTURES * each]
+        picture_s = (time.monotonic() - began) / max(1, len(shown))
+        residuals += [_residual(twin, number) for number in shown[:1] if pictured.left > _RESIDUAL_PICTURES * picture_s]
     clock.lap("pictures")
     largest = largest_residual(residuals)
     reported = leaders[:1] or _best(scores)[:1]
@@ -295,10 +295,10 @@ def _residual(renderer: RenderedMeasurements, number: int) -> RenderResidual:
     """Return the render noise of a view without kept light paths, which trials have."""
     study = renderer.study
     pose, camera = study.view(number).world_from_sensor, next(iter(study.sensor.rig.cameras))
-    found = render_residual(renderer.simulated, study.scene, pose, camera, renderer.rendering, seed=study.file.seed)
-    if found.noise > LIMIT:
-        say(f"view {number}: {found}")
-    return warn_above_limit(f"view {number}", found) if found.quadrature > LIMIT else found
+    residual = render_residual(renderer.simulated, study.scene, pose, camera, renderer.rendering, seed=study.file.seed)
+    if residual.noise > LIMIT:
+        say(f"view {number}: {residual}")
+    return warn_above_limit(f"view {number}", residual) if residual.quadrature > LIMIT else residual
 
 
 def _show(
@@ -323,14 +323,14 @@ def _show(
 def _set_record(study: Study, chosen: ViewSet, tried: list[TriedSet]) -> dict[str, Any]:
     table = study.file.set
     assert table is not None
-    limits, known = table.limits, table.pose_known
+    limits, pose_sigma = table.limits, table.pose_known
     return {
         "limits": limits,
         "views": list(chosen.views),
         "exact": chosen.exact,
         "uncertainty": dict(zip(limits, chosen.uncertainty.tolist(), strict=True)),
         "feasible": dict(zip(limits, chosen.feasible.tolist(), strict=True)),
-        "joining": {"kind": table.joining, "position_mm": known[0], "angle_deg": known[1]},
+        "joining": {"kind": table.joining, "position_mm": pose_sigma[0], "angle_deg": pose_sigma[1]},
         "joined": joining_in_words(table),
         "confirmed": confirmed_entry(tried[-1].stated if tried else ()),
         "tried": tried_entries(tried, limits),

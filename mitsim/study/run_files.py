@@ -76,8 +76,8 @@ def claim_folder(folder: str | Path, command: str, digest: str) -> Path | None:
             folder.mkdir(parents=True, exist_ok=True)
             write_json(folder / OWNER, mine)
     except OSError as error:
-        found = f"a folder that cannot be written to ({error.strerror})"
-        raise InputError(folder, "", found, "a writable folder", "choose another with -o") from None
+        fault = f"a folder that cannot be written to ({error.strerror})"
+        raise InputError(folder, "", fault, "a writable folder", "choose another with -o") from None
     return moved
 
 
@@ -98,12 +98,12 @@ def check_own(folder: Path, files: Mapping[str, str], names: Iterable[str]) -> N
         if name not in files:
             continue
         try:
-            found = _sha256(folder / name)
+            digest = _sha256(folder / name)
         except FileNotFoundError:
             raise InputError(folder / name, "", "no such file", "a file that run.json names", AGAIN) from None
         except OSError as error:
             raise InputError(folder / name, "", f"a file that cannot be read ({error.strerror})", "a file") from None
-        if found != files[name]:
+        if digest != files[name]:
             other, allowed = "a file of another run, or a changed one", "the file that run.json names"
             raise InputError(folder / name, "sha256", other, allowed, AGAIN)
 
@@ -124,6 +124,6 @@ def _free_place(folder: Path, name: str) -> Path:
     """Return a free path in a folder: ``name``, or ``name`` with a number."""
     plain = "".join(character for character in name if character.isalnum()) or "unknown"
     number = 1
-    while os.path.lexists(place := folder / (plain if number == 1 else f"{plain}-{number}")):
+    while os.path.lexists(path := folder / (plain if number == 1 else f"{plain}-{number}")):
         number += 1
-    return place
+    return path

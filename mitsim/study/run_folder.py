@@ -26,6 +26,7 @@ from mitsim.scene.surface.lay import LayLeftOut
 from mitsim.study.remedies.entries import RemediesEntry
 from mitsim.study.run_files import AGAIN, TASK, check_own
 from mitsim.study.statement_file import PartialDocument, StatementDocument, read_statement
+from mitsim.study.virtual.race import ALL
 
 _MADE_BY = "a folder made by mitsim run"
 
@@ -215,7 +216,7 @@ class RunDocument(PartialDocument):
     @property
     def leader(self) -> int | None:
         """Return the number of the best view for all measurements together; None if no view was raced."""
-        return self.leaders.get("all measurements")
+        return self.leaders.get(ALL)
 
 
 @dataclass(frozen=True)
@@ -243,7 +244,7 @@ class Run:
     @property
     def clouds(self) -> list[int]:
         """Return the numbers of the views with a predicted cloud, ascending."""
-        return [int(view) for view in self.scores["view"].values if self.has(f"clouds/predicted_{int(view):04d}.ply")]
+        return [int(view) for view in self.scores["view"].values if self.has_cloud("predicted", int(view))]
 
     def has(self, name: str) -> bool:
         """Return whether a file belongs to this run: ``run.json`` names it, or it exists and ``run.json`` is old and
@@ -251,9 +252,13 @@ class Run:
         """
         return name in self.about.files if self.about.files else (self.folder / name).exists()
 
+    def has_cloud(self, kind: str, view: int) -> bool:
+        """Return whether a view has a ``predicted`` or ``rendered`` cloud."""
+        return self.has(_cloud_name(kind, view))
+
     def cloud(self, kind: str, view: int) -> PointCloud:
         """Return the ``predicted`` or ``rendered`` cloud of a view."""
-        name = f"clouds/{kind}_{view:04d}.ply"
+        name = _cloud_name(kind, view)
         self.check(name)
         return read_cloud(self.folder / name)
 
@@ -287,17 +292,21 @@ class Run:
         """Return the cloud of a checked view, decoded from its rendered images."""
         cloud, grid = self.cloud("rendered", view), self.predicted(view).grid
         if (cloud.grid.height, cloud.grid.width) != (grid.height, grid.width):
-            found, path = (
+            size, path = (
                 f"{cloud.grid.height} x {cloud.grid.width} pixels",
-                self.folder / f"clouds/rendered_{view:04d}.ply",
+                self.folder / _cloud_name("rendered", view),
             )
-            raise InputError(path, "grid", found, f"{grid.height} x {grid.width}, as the predicted cloud")
+            raise InputError(path, "grid", size, f"{grid.height} x {grid.width}, as the predicted cloud")
         return cloud
 
     def capture(self, view: int) -> Capture:
         """Return the images of a checked view."""
         self.check(f"captures/view_{view:04d}/capture.json")
         return read_capture(self.folder / "captures" / f"view_{view:04d}")
+
+
+def _cloud_name(kind: str, view: int) -> str:
+    return f"clouds/{kind}_{view:04d}.ply"
 
 
 def read_run(folder: str | Path) -> Run:
@@ -313,10 +322,10 @@ def read_run(folder: str | Path) -> Run:
         raise InputError(folder, "", "no such folder", _MADE_BY)
     table = read_json_object(folder / "run.json", _MADE_BY, "mitsim run writes it last: let the run finish")
     about = validate(folder / "run.json", table, RunDocument)
-    own = about.files
-    check_own(folder, own, ("map.nc", "samples.nc", "scores.nc", "checks.nc", "statement.json"))
+    digests = about.files
+    check_own(folder, digests, ("map.nc", "samples.nc", "scores.nc", "checks.nc", "statement.json"))
     performance_map = PerformanceMap.load(folder / "map.nc")
-    sampled = "samples.nc" in own if own else (folder / "samples.nc").exists()
+    sampled = "samples.nc" in digests if digests else (folder / "samples.nc").exists()
     patches = read_dataset(folder / "samples.nc", _PATCHES) if sampled else None
     if patches is not None and (patches["sample_number"].values >= patches.sizes["sample"]).any():
         raise InputError(folder / "samples.nc", "sample_number", "a number without a sample", "numbers of the samples")
@@ -326,10 +335,10 @@ def read_run(folder: str | Path) -> Run:
         raise InputError(folder / "scores.nc", "minimum_points", repr(least)[:80], "a whole number of points")
     checks = read_dataset(folder / "checks.nc", _CHECKS)
     for name, data in (("scores.nc", scores), ("checks.nc", checks)):
-        found = [str(measurement) for measurement in data["measurement"].values]
-        if found != list(about.measurements):
+        measurements = [str(measurement) for measurement in data["measurement"].values]
+        if measurements != list(about.measurements):
             allowed = f"{', '.join(about.measurements)}, as in run.json"
-            raise InputError(folder / name, "measurement", ", ".join(found), allowed)
+            raise InputError(folder / name, "measurement", ", ".join(measurements), allowed)
     seen = {str(feature) for feature in scores["feature"].values}
     for name, entry in about.measurements.items():
         if absent := sorted(set(entry.faces) - seen):
@@ -342,7 +351,7 @@ def read_run(folder: str | Path) -> Run:
             raise InputError(folder / name, key, missing[0], "views of scores.nc")
     for name in ("possible", "uncertainty_possible"):
         scores[name] = scores[name].astype(bool)  # netCDF has no booleans
-    stated = "statement.json" in own or not own
+    stated = "statement.json" in digests or not digests
     statement = read_statement(folder / "statement.json") if stated else None
     if statement is not None and not set(statement.measurements) <= set(about.measurements):
         names, allowed = ", ".join(statement.measurements), f"{', '.join(about.measurements)}, as in run.json"

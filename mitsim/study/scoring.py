@@ -123,9 +123,9 @@ def _chosen_set(study: Study, search: Search) -> ViewSet | None:
     for (name, limit), reached in zip(table.limits.items(), chosen.feasible, strict=True):
         if not reached:
             say(f"{name}: {limit:g} {study.task.measurements[name].unit} is unreachable, even with all views together")
-    how = "the fewest" if chosen.exact else "not proven the fewest"
+    proof = "the fewest" if chosen.exact else "not proven the fewest"
     say(
-        f"views that measure together: {', '.join(map(str, chosen.views)) or 'none'} ({how}), "
+        f"views that measure together: {', '.join(map(str, chosen.views)) or 'none'} ({proof}), "
         f"{joining_in_words(table)}; the map predicts: {_expected(study, table.limits, chosen)}"
     )
     return chosen

@@ -289,8 +289,8 @@ def score(study: Study) -> xr.Dataset:
     (True, 1)
     """
     if study.performance_map is None:
-        found, hint = "a campaign that was not run", "open the study with performance_map=''"
-        raise InputError(study.path, "characterisation.campaign", found, "a performance map", hint)
+        campaign, hint = "a campaign that was not run", "open the study with performance_map=''"
+        raise InputError(study.path, "characterisation.campaign", campaign, "a performance map", hint)
     return Session(study).screen()[0]
 
 

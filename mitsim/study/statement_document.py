@@ -50,6 +50,6 @@ def _measurement(statement: Statement) -> dict[str, Any]:
     table = {key: value for key, value in asdict(statement).items() if key not in ("measurement", "budget", "decided")}
     table["decision"] = None if statement.decided is None else asdict(statement.decided)
     table["budget"] = [asdict(line) | {"fresh": line.group in FRESH} for line in lines]
-    known = math.isfinite(statement.repeatability) and math.isfinite(statement.standard_uncertainty)
-    table["after_repeats"] = {str(n): statement.after_repeats(n) for n in (1, 4, 16)} if known else {}
+    finite = math.isfinite(statement.repeatability) and math.isfinite(statement.standard_uncertainty)
+    table["after_repeats"] = {str(n): statement.after_repeats(n) for n in (1, 4, 16)} if finite else {}
     return {key: json_values(value) for key, value in table.items()}

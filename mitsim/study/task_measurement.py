@@ -230,14 +230,14 @@ def corrected(result: Result, statement: ViewStatement) -> Result:
         If the statement lacks the measurement, has it in another unit, or has no bias for it.
     """
     if result.name not in statement.measurements:
-        known = ", ".join(statement.measurements)
+        names = ", ".join(statement.measurements)
         raise InputError(
-            statement.path, "measurements", known, f"a statement with {result.name}, a measurement of the task"
+            statement.path, "measurements", names, f"a statement with {result.name}, a measurement of the task"
         )
     correction = statement.measurements[result.name]
     if correction.unit != result.unit or correction.bias is None:
-        found = "no bias" if correction.bias is None else f"bias {correction.bias:g} {correction.unit}"
-        raise InputError(statement.path, f"measurements.{result.name}", found, f"a bias in {result.unit}")
+        bias = "no bias" if correction.bias is None else f"bias {correction.bias:g} {correction.unit}"
+        raise InputError(statement.path, f"measurements.{result.name}", bias, f"a bias in {result.unit}")
     value = result.value - correction.bias
     return replace(
         result,
@@ -272,19 +272,19 @@ def read_pose(path: Path, view: int | None = None) -> Transform:
     matrix = table.get("world_from_sensor")
     if "views" in table:
         try:
-            known = {int(one["view"]): one["part_from_sensor"] for one in table["views"]}
+            poses = {int(entry["view"]): entry["part_from_sensor"] for entry in table["views"]}
         except (KeyError, OverflowError, TypeError, ValueError) as error:
             raise InputError(
                 path, "views", f"entries that cannot be read ({error!r})", "a list as mitsim run writes it"
             ) from None
-        if view not in known:
+        if view not in poses:
             raise InputError(
                 "--view",
                 "",
                 "none" if view is None else view,
-                f"a view of {path}: {min(known, default=0)} to {max(known, default=0)}",
+                f"a view of {path}: {min(poses, default=0)} to {max(poses, default=0)}",
             )
-        matrix = known[view]
+        matrix = poses[view]
     return _pose(path, matrix)
 
 

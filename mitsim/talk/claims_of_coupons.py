@@ -237,13 +237,12 @@ def _multiple_reflections(talk: Talk, results: Results, slide: Slide) -> None:
         for sample in talk.file.samples
         for light in ("direct", "all")
     }
-    datasets = {key: results.get(name) for key, name in names.items()}
-    slide.missing.extend(names[key] for key, dataset in datasets.items() if dataset is None)
-    pairs: dict[str, tuple[xr.Dataset, xr.Dataset]] = {}
-    for sample in talk.file.samples:
-        direct, every = datasets[sample.name, "direct"], datasets[sample.name, "all"]
-        if direct is not None and every is not None:
-            pairs[sample.name] = (direct, every)
+    datasets = collected(results, names, slide)
+    pairs = {
+        sample.name: (datasets[sample.name, "direct"], datasets[sample.name, "all"])
+        for sample in talk.file.samples
+        if (sample.name, "direct") in datasets and (sample.name, "all") in datasets
+    }
     if not pairs:
         return
     words = "F captured over F from the map for the artefact's features, in direct light alone and in all light"

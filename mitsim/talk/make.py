@@ -58,7 +58,7 @@ def trials_name(sample: ArtefactEntry) -> str:
     return f"trials_{sample.key}"
 
 
-def results_known(talk: Talk, results: Results, measured: tuple[str, ...] = ()) -> list[str]:
+def missing_results(talk: Talk, results: Results, measured: tuple[str, ...] = ()) -> list[str]:
     """Return the names of all results of a talk that are missing; ``measured`` samples need no virtual measurements."""
     names = [piece.name for piece in pieces_of(talk)]
     names += [trials_name(sample) for sample in talk.file.samples if sample.key not in measured]
@@ -123,7 +123,7 @@ def make(
             break
     for entry in unfinished:
         _finish(talk, results, entry)
-    return results_known(talk, results, measured)
+    return missing_results(talk, results, measured)
 
 
 def _unfinished(talk: Talk, results: Results, sample: ArtefactEntry, folder: Path) -> _Unfinished | None:

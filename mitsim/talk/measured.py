@@ -73,16 +73,21 @@ def _shown(talk: Talk, capture_folder: Path, folder: Path) -> tuple[ArtefactEntr
 
 
 def _nearest(talk: Talk, pose: Transform, capture_folder: Path) -> View:
-    """Return the candidate view whose pose is nearest to that of a capture."""
+    """Return the candidate view whose pose is nearest to that of a capture, in rotation and position."""
 
     def turned(view: View) -> float:
         between = view.world_from_sensor.rotation.T @ pose.rotation
         return math.degrees(math.acos(min(max((float(np.trace(between)) - 1) / 2, -1.0), 1.0)))
 
-    view = min(talk.views, key=turned)
-    apart = float(np.linalg.norm(pose.translation - view.world_from_sensor.translation))
-    if turned(view) > NEAR_DEG or apart > NEAR_SHARE * view.standoff + math.radians(NEAR_DEG) * view.standoff:
-        offset = f"{turned(view):.1f} deg and {apart:.0f} mm from the nearest view, number {view.number}"
+    def apart(view: View) -> float:
+        return float(np.linalg.norm(pose.translation - view.world_from_sensor.translation))
+
+    def over_limits(view: View) -> float:
+        return max(turned(view) / NEAR_DEG, apart(view) / view.standoff / (NEAR_SHARE + math.radians(NEAR_DEG)))
+
+    view = min(talk.views, key=over_limits)
+    if over_limits(view) > 1:
+        offset = f"{turned(view):.1f} deg and {apart(view):.0f} mm from the nearest view, number {view.number}"
         allowed = f"a pose within {NEAR_DEG:g} deg of a candidate view, at its standoff within {100 * NEAR_SHARE:g} %"
         raise InputError(
             capture_folder / "pose.json", "world_from_sensor", offset, allowed, "poses.json of mitsim study score"

@@ -16,6 +16,7 @@ import xarray as xr
 from scipy import stats
 
 from characterisation.files.arrays import Floats
+from characterisation.region_of_interest import Roi
 from mitsim.maps.data_sheet import Residuals, SheetPiece, measure_piece
 from mitsim.talk.talk_file import sensor_in
 
@@ -111,8 +112,9 @@ def described(residuals: Residuals) -> xr.Dataset:
         for densities in (stats.norm.pdf(values, 0, sigma), two.density(values))
     ]
     gain = 2 * residuals.independent * (likelihoods[1] - likelihoods[0]) - 2 * math.log(max(residuals.independent, 1))
-    rows, columns = np.nonzero(np.isfinite(residuals.image))
-    cut = residuals.image[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+    region = Roi.around(np.isfinite(residuals.image))
+    assert region is not None
+    cut = residuals.image[region.slices]
     step = max(1, -(-max(cut.shape) // _SIDE_PX))
     width = edges[1] - edges[0]
     return xr.Dataset(

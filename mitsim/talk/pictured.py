@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import Status
+from characterisation.region_of_interest import Roi
 from mitsim.maps.prediction import performance
 from mitsim.report.sheet_figures import image_on_grid
 from mitsim.study import StudyFile, open_study
@@ -37,11 +38,8 @@ def picture_of_finish(folder: str, file: StudyFile, number: int) -> xr.Dataset:
     view = study.view(number)
     renderer = RenderedMeasurements(study, study_unknowns(study), rendering_of(study))
     capture, cloud = renderer.at_best_estimates(view)
-    rows, columns = np.nonzero(renderer.predictor.surfaces(study.scene, view.world_from_sensor).shape >= 0)
-    window = (
-        slice(max(rows.min() - _MARGIN_PX, 0), rows.max() + _MARGIN_PX),
-        slice(max(columns.min() - _MARGIN_PX, 0), columns.max() + _MARGIN_PX),
-    )
+    part = Roi.around(renderer.predictor.surfaces(study.scene, view.world_from_sensor).shape >= 0, _MARGIN_PX)
+    window = (part or Roi.whole(cloud.grid.width, cloud.grid.height)).slices
     image = np.nan_to_num(image_on_grid(capture, cloud))
     low, high = np.percentile(image, (0.5, 99.7))
     shown = np.asarray(255 * np.clip((image - low) / max(high - low, 1), 0, 1) ** 0.6, np.uint8)

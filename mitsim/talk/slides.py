@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsim.talk.results import Results
 
+_Key = TypeVar("_Key")
 Verdict = Literal["holds", "holds in part", "does not hold", "shown", "missing"]
 
 
@@ -52,7 +53,7 @@ def verdict(holds: bool, in_part: bool = False) -> Verdict:
     return "holds" if holds else "holds in part" if in_part else "does not hold"
 
 
-def collected(results: Results, names: Mapping[str, str], slide: Slide) -> dict[str, xr.Dataset]:
+def collected(results: Results, names: Mapping[_Key, str], slide: Slide) -> dict[_Key, xr.Dataset]:
     """Return the results of pieces by the keys of ``names``; missing ones are noted in the slide."""
     datasets = {key: results.get(name) for key, name in names.items()}
     slide.missing.extend(names[key] for key, dataset in datasets.items() if dataset is None)

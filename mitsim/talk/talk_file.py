@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,9 +11,10 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from characterisation.files.documents import Document, checked_name, read_toml
-from characterisation.files.errors import InputError
+from characterisation.files.errors import InputError, nearest
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
+from characterisation.tasks.task_reading import read_task
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.sensor import Sensor
 from mitsim.study import CharacterisationTable, Study, StudyFile, open_study
@@ -148,20 +150,26 @@ def read_talk(path: str | Path) -> Talk:
     Raises
     ------
     InputError
-        If a key is wrong, two samples have one name, or an example names a sample that is not there.
+        If a key is wrong, two samples have one name, or a name or distance to show is none of the talk or its task.
     """
     path = Path(path)
     file = read_toml(path, TalkFile)
-    for where, entries in (("samples", file.samples), ("finishes", file.finishes)):
+    for table, entries in (("samples", file.samples), ("finishes", file.finishes)):
         keys = [entry.key for entry in entries]
         if twice := next((key for key in keys if keys.count(key) > 1), None):
-            raise InputError(path, f"{where}.name", f"{twice}, more than once", "a name of its own for each")
-    names = [sample.name for sample in file.samples]
-    for example_entry in (*file.examples, file.sphere):
-        if example_entry.sample not in names:
-            raise InputError(
-                path, "sample", repr(example_entry.sample), ", ".join(names), "of an example or of the sphere"
-            )
+            raise InputError(path, f"{table}.name", f"{twice}, more than once", "a name of its own for each")
+    task, names = read_task(path.absolute().parent / file.task), [sample.name for sample in file.samples]
+    asked: list[tuple[str, object, Sequence[object]]] = [
+        ("shown_feature", file.shown_feature, task.shapes),
+        ("coupons.shown_distance_mm", file.coupons.shown_distance_mm, file.coupons.validated_distances_mm),
+    ]
+    for where, entry in (("sphere", file.sphere), *(("examples", example) for example in file.examples)):
+        asked.append((f"{where}.sample", entry.sample, names))
+        asked.append((f"{where}.measurement", entry.measurement, list(task.measurements)))
+    for where, value, known in asked:
+        if value not in known:
+            allowed = [str(one) for one in known]
+            raise InputError(path, where, repr(value), ", ".join(allowed), nearest(str(value), allowed))
     return Talk(path, file)
 
 

@@ -160,8 +160,8 @@ def candidate_views(
         pose = sight.pose(standoff)
         distance = _first_free(part, box, table.clearance_mm, sensor, pose, steps)
         if math.isnan(distance):
-            place = f"within {table.clearance_mm:g} mm of the part or inside it, as far out as {steps[-1]:g} mm"
-            return f"collision: the body of the sensor is {place}"
+            position = f"within {table.clearance_mm:g} mm of the part or inside it, as far out as {steps[-1]:g} mm"
+            return f"collision: the body of the sensor is {position}"
         if distance != standoff:
             pose = sight.pose(distance)
         if sight.angles is None:
@@ -175,12 +175,12 @@ def candidate_views(
     ends = [*standoffs[1:], math.nextafter(far, math.inf)]
     for sight in track_if_long(_sights(table, sensor, target), "candidate views"):
         for standoff, end in zip(standoffs, ends, strict=True):
-            found = placed(sight, standoff, end)
-            if isinstance(found, str):
-                left_out.append(LeftOut(sight.direction, sight.roll_deg, standoff, found))
+            outcome = placed(sight, standoff, end)
+            if isinstance(outcome, str):
+                left_out.append(LeftOut(sight.direction, sight.roll_deg, standoff, outcome))
                 continue
-            views.append(replace(found, number=len(views)))
-            moved_out += (found.standoff if found.stage_distance is None else found.stage_distance) > standoff
+            views.append(replace(outcome, number=len(views)))
+            moved_out += (outcome.standoff if outcome.stage_distance is None else outcome.stage_distance) > standoff
     if not views:
         raise _no_views_error(where, left_out)
     return Candidates(views, left_out, moved_out, target)
@@ -191,8 +191,8 @@ def _no_views_error(where: str | Path, left_out: list[LeftOut]) -> InputError:
     if not left_out:
         hint = "a finer icosahedron has more directions near the zenith"
         return InputError(where, "views.lowest_elevation_deg", "no direction above it", "at least one", hint)
-    found = f"{len(left_out)} views, all of them impossible"
-    return InputError(where, "views", found, "at least one", f"the first: {left_out[0].reason}")
+    views = f"{len(left_out)} views, all of them impossible"
+    return InputError(where, "views", views, "at least one", f"the first: {left_out[0].reason}")
 
 
 def directions_above(table: ViewsTable) -> Floats:
@@ -235,7 +235,7 @@ def _sights(table: ViewsTable, sensor: Sensor, target: Floats) -> list[_Sight]:
             sights.append(_Sight(direction, roll, pose, angles, reason))
         return sights
     asked = [(direction, roll) for direction in directions for roll in table.rolls_deg]
-    free = [_Sight(*one, partial(_free_pose, table, sensor, target, *one)) for one in asked]
+    free = [_Sight(*pair, partial(_free_pose, table, sensor, target, *pair)) for pair in asked]
     if stage is None:
         return free
     turns = stage_from_sensor(sensor, 1.0).rotation @ np.stack([sight.pose(1.0).rotation.T for sight in free])

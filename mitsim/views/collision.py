@@ -30,7 +30,7 @@ from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.views.table import MARGIN_MM, SensorBody
 
-#: winding number above which a place is inside: half-way from 0 to 1
+#: winding number above which a point is inside: half-way from 0 to 1
 _INSIDE = 0.5
 
 #: corners nearer than this fraction of the part's size are merged
@@ -107,8 +107,8 @@ def obstacle(triangles: Floats) -> Obstacle:
     middles, reach = _middles(triangles)
     size = np.frexp(np.maximum(reach, 1e-3))[1]
     trees = []
-    for one in np.unique(size):
-        members = np.flatnonzero(size == one)
+    for size_class in np.unique(size):
+        members = np.flatnonzero(size == size_class)
         trees.append((cKDTree(middles[members]), members, float(reach[members].max())))
     return Obstacle(triangles, tuple(trees), _solids(triangles))
 
@@ -162,8 +162,8 @@ def is_near(part: Obstacle, box: BodyBox, part_from_sensor: Transform, clearance
     """
     centre = part_from_sensor.points(box.centre)
     reach = float(np.linalg.norm(box.half)) + clearance
-    found = [members[tree.query_ball_point(centre, reach + radius)] for tree, members, radius in part.trees]
-    near = np.concatenate([np.empty(0, np.int64), *found])
+    indices = [members[tree.query_ball_point(centre, reach + radius)] for tree, members, radius in part.trees]
+    near = np.concatenate([np.empty(0, np.int64), *indices])
     local = part_from_sensor.inverse().points(part.triangles[near]) - box.centre
     a, b, c = np.moveaxis(local, 1, 0)  # element-wise: NumPy is slow along axes of length three
     lowest, highest = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
@@ -177,16 +177,16 @@ def is_near(part: Obstacle, box: BodyBox, part_from_sensor: Transform, clearance
     return False
 
 
-def is_inside(part: Obstacle, place: Floats) -> bool:
-    """Return whether a place (3,) [mm], part frame, lies inside a closed solid with outward normals."""
+def is_inside(part: Obstacle, point: Floats) -> bool:
+    """Return whether a point (3,) [mm], part frame, lies inside a closed solid with outward normals."""
     solids = part.solids
-    if not ((place > solids.bounds[0]) & (place < solids.bounds[1])).all():
+    if not ((point > solids.bounds[0]) & (point < solids.bounds[1])).all():
         return False
-    away = solids.middles - place
+    away = solids.middles - point
     squared = np.einsum("ij,ij->i", away, away)
     near = squared <= (_FAR * solids.reach) ** 2
     angles = np.einsum("ij,ij->i", solids.areas, away) / np.where(near, 1.0, squared) ** 1.5
-    total = angles[~near].sum() + _solid_angles(solids.triangles[near] - place).sum()
+    total = angles[~near].sum() + _solid_angles(solids.triangles[near] - point).sum()
     return bool(total / (4 * np.pi) > _INSIDE)
 
 
@@ -195,7 +195,7 @@ def _solid_angles(triangles: Floats) -> Floats:
     a, b, c = np.moveaxis(triangles, 1, 0)
     la, lb, lc = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))
     volume = np.einsum("ij,ij->i", a, np.cross(b, c))
-    ab, bc, ca = ((one * other).sum(axis=1) for one, other in ((a, b), (b, c), (c, a)))
+    ab, bc, ca = ((first * second).sum(axis=1) for first, second in ((a, b), (b, c), (c, a)))
     return np.asarray(2 * np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb))
 
 
@@ -244,8 +244,8 @@ def _segment_distance(p: Floats, u: Floats, q: Floats, v: Floats) -> Floats:
     crossing = below > 1e-12 * a * e  # parallel segments have the same distance everywhere
     s = np.where(crossing, np.clip((b * f - c * e) / np.where(crossing, below, 1.0), 0, 1), 0.0)
     t = np.clip((b * s + f) / e, 0, 1)
-    some = a > 0
-    s = np.where(some, np.clip((b * t - c) / np.where(some, a, 1.0), 0, 1), 0.0)
+    extended = a > 0
+    s = np.where(extended, np.clip((b * t - c) / np.where(extended, a, 1.0), 0, 1), 0.0)
     return np.asarray(np.linalg.norm(r + s[..., None] * u - t[..., None] * v, axis=-1))
 
 

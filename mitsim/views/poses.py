@@ -110,7 +110,7 @@ def _stage_csv(views: Sequence[View], table: ViewsTable) -> str:
     return _csv(head, rows)
 
 
-def _poses_json(found: Candidates, table: ViewsTable, sensor: str) -> str:
+def _poses_json(candidates: Candidates, table: ViewsTable, sensor: str) -> str:
     frames = dict(_FRAMES)
     if table.flange_from_sensor is not None:
         frames["flange"] = "the robot's flange, as in the hand-eye calibration flange_from_sensor"
@@ -124,11 +124,11 @@ def _poses_json(found: Candidates, table: ViewsTable, sensor: str) -> str:
         "convention": "a_from_b is a homogeneous matrix by rows that takes coordinates in frame b to coordinates in "
         "frame a: p_a = a_from_b p_b, columns. So part_from_sensor is the pose of the sensor in the part frame.",
         "frames": frames,
-        "target_mm": found.target.tolist(),
+        "target_mm": candidates.target.tolist(),
     }
     if table.flange_from_sensor is not None:
         document["flange_from_sensor"] = table.flange_from_sensor.transform().matrix().tolist()
-    document["views"] = [_view_json(view, table) for view in found.views]
+    document["views"] = [_view_json(view, table) for view in candidates.views]
     return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 

@@ -53,8 +53,8 @@ def stage_from_sensor(sensor: Sensor, distance: float) -> Transform:
 def resting(stage: PartStage, target: Floats) -> Transform:
     """Return ``stage_from_part`` with all axes at zero, for a part with the target ``target`` (3,) [mm]."""
     at_origin = Transform.from_degrees(stage.part_rotation_deg, (0.0, 0.0, 0.0))
-    place = -at_origin.points(target) if stage.part_position_mm is None else np.array(stage.part_position_mm)
-    return Transform(at_origin.rotation, place)
+    position = -at_origin.points(target) if stage.part_position_mm is None else np.array(stage.part_position_mm)
+    return Transform(at_origin.rotation, position)
 
 
 def stage_from_part(stage: PartStage, target: Floats, angles: Floats) -> Transform:
@@ -104,8 +104,8 @@ def reach_rotations(stage: PartStage, rotations: Floats) -> Reach:
         return np.asarray(np.abs(shown - wanted).max(axis=(1, 2)))
 
     def finished(first: Floats, second: Floats) -> Floats:
-        rest = rotation_about(units[1], -second) @ rotation_about(units[0], -first) @ wanted
-        return np.stack([first, second, _angle(rest, units[2])], axis=1)
+        remainder = rotation_about(units[1], -second) @ rotation_about(units[0], -first) @ wanted
+        return np.stack([first, second, _angle(remainder, units[2])], axis=1)
 
     def candidates() -> Iterator[Floats]:
         for pair in about_two(third, wanted @ units[2], units[0], units[1]):

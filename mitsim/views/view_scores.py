@@ -161,18 +161,18 @@ def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above 
 
     # the rays of the next view are cast while this view is evaluated
     order = scoring_order(views, limit)
-    by_place = dict[int, _ViewScore]()
+    by_index = dict[int, _ViewScore]()
     # the tracked scores come first, so that the last line of progress is printed when they end
     scoring = track(one_ahead([views[i] for i in order], cast, score), "score views", len(views))
-    for (_, view_score), place in zip(scoring, order, strict=False):
-        by_place[place] = view_score
-        if limit is not None and limit.over() and len(by_place) >= FEWEST_VIEWS:
+    for (_, view_score), index in zip(scoring, order, strict=False):
+        by_index[index] = view_score
+        if limit is not None and limit.over() and len(by_index) >= FEWEST_VIEWS:
             break
-    scored = [by_place.get(place) or _not_scored(by_place[order[0]]) for place in range(len(views))]
+    scored = [by_index.get(index) or _not_scored(by_index[order[0]]) for index in range(len(views))]
     columns = (np.array([getattr(view_score, key) for view_score in scored]) for key in _STATISTICS)
     statistics = view_statistics(names, *columns)
     scores = score_views(statistics, task, minimum_points)
-    scores.attrs["views_scored"] = len(by_place)
+    scores.attrs["views_scored"] = len(by_index)
     for name in ("mean_sigma", "n_white", "mean_sigma_white", "n_only_white"):
         scores[name] = statistics[name]
     uncertainty, chance = (
@@ -238,12 +238,12 @@ def apart_in_words(scores: xr.Dataset) -> str:
 
 
 def scoring_order(views: Sequence[View], limit: TimeLimit | None) -> list[int]:
-    """Return the places of views in the order in which they are scored: far apart if time may not suffice for all."""
+    """Return the indices of views in the order in which they are scored: far apart if time may not suffice for all."""
     return list(range(len(views))) if limit is None or limit.end is None else _far_apart(views)
 
 
 def _far_apart(views: Sequence[View]) -> list[int]:
-    """Return the places of all views, each as far as possible from those before it in direction, roll and distance."""
+    """Return the indices of all views, each as far as possible from those before it in direction, roll and distance."""
     poses = [view.world_from_sensor.matrix() for view in views]
     reach = max(float(np.linalg.norm(pose[:3, 3])) for pose in poses)
     rows = np.array([[*pose[:3, :3].ravel(), *(pose[:3, 3] / reach)] for pose in poses])
@@ -312,8 +312,8 @@ def _score_view(
     inputs = expected_inputs(task, points, minimum_points)
     measurements = [expected_measurement(task, name, inputs) for name in task.measurements]
     return _ViewScore(
-        np.array([one.count for one in as_mapped.values()]),
-        np.array([one.mean_sigma for one in as_mapped.values()]),
+        np.array([expectation.count for expectation in as_mapped.values()]),
+        np.array([expectation.mean_sigma for expectation in as_mapped.values()]),
         n_white * thinning,
         sigma_white,
         cast.n_only * thinning,
@@ -339,7 +339,7 @@ def _limits(
     """
     shape = (len(task.measurements), len(scored))
     limit, feature = np.full(shape, "", object), np.full(shape, "", object)
-    kinds = {name: one.kind for name, one in task.features.items()}
+    kinds = {name: definition.kind for name, definition in task.features.items()}
     share = scores["R_f"]
     for m in range(shape[0]):
         for v, score in enumerate(scored):
@@ -352,8 +352,8 @@ def _limits(
         noise, count = np.full((2, len(scored), len(inputs)), np.nan)
         for v, score in enumerate(scored):
             for i, quantity in enumerate(inputs):
-                if isinstance(known := score.inputs[quantity], ExpectedInput):
-                    noise[v, i], count[v, i] = known.fit.noise, known.fit.count
+                if isinstance(expected := score.inputs[quantity], ExpectedInput):
+                    noise[v, i], count[v, i] = expected.fit.noise, expected.fit.count
         able = possible[m]
         if not able.any():
             limit[m] = "few points"
@@ -375,10 +375,10 @@ def _limits(
             worst = int(np.argmax(parts[v]))
             name = inputs[worst].features[0]
             feature[m, v] = name
-            what = int(np.nanargmax(np.where(np.isfinite(excess[:, v, worst]), excess[:, v, worst], -1)))
-            limit[m, v] = ("noise", "few points", "small extent" if kinds[name] == "plane" else "short arc")[what]
+            cause = int(np.nanargmax(np.where(np.isfinite(excess[:, v, worst]), excess[:, v, worst], -1)))
+            limit[m, v] = ("noise", "few points", "small extent" if kinds[name] == "plane" else "short arc")[cause]
             shaped = name in share["feature"].values
-            if what == 1 and shaped and float(share.sel(feature=name).values[v]) < OCCLUDED:
+            if cause == 1 and shaped and float(share.sel(feature=name).values[v]) < OCCLUDED:
                 limit[m, v] = "occlusion"
             if not able[v]:
                 limit[m, v] = "occlusion" if limit[m, v] == "occlusion" else "few points"

@@ -140,7 +140,7 @@ def predicted(found: RecordedCalibration, place: Transform, seed: int, draws: in
         assert true.projector is not None
         board = BOARD.corners + np.einsum("m,mni->ni", sigma * rng.standard_normal(len(sigma)), modes)
         points = place.points(board)
-        like = rng.integers(len(found.places))  # noise as in one of the poses that were calibrated with
+        like = rng.integers(len(found.poses))  # noise as in one of the poses that were calibrated with
         off = found.camera_px[like] * rng.standard_normal((len(points), 2))
         turned = homographies(eye_jacobian(true.reference, points)[0], eye_jacobian(true.projector, points)[0], place)
         column = true.projector.project(points)[:, 0] + np.einsum("nj,nj->n", turned[:, 0], off)

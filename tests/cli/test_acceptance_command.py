@@ -107,6 +107,7 @@ def test_the_table_names_figures_and_a_figure_that_cannot_be_is_told(walls, tmp_
         (([], ["ball"], []), r"--sphere: found 'ball'.*DIAMETER"),
         (([], ["ball=1,1,5,5"], []), "DIAMETER"),
         (([], ["a=30"], ["a,b,100"]), r"'a,b,100'; allowed: .*, a"),
+        (([], ["a=30", "b=30"], ["a,a,100"]), "'a,a,100'; allowed: two different spheres"),
         (([], ["a=30", "b=30"], ["a,b"]), "NAME,NAME,DISTANCE"),
         (([], ["a=30", "b=30"], ["a,b,0"]), "lengths over 0 mm"),
     ],

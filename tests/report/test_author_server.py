@@ -78,6 +78,19 @@ def test_files_that_are_refused_do_not_finish(closed):
     assert not thread.is_alive()
 
 
+@pytest.mark.parametrize("fault", [RuntimeError, KeyboardInterrupt, MemoryError])
+def test_files_are_restored_whatever_ends_their_check(tmp_path, fault):
+    def check():
+        assert (tmp_path / "task.toml").read_text() == TASK
+        raise fault
+
+    (tmp_path / "part.xml").write_text("old")
+    server = AuthorServer(tmp_path, {"scene": "part.xml", "task": "task.toml"}, lambda token: token, check)
+    with server._server, pytest.raises(fault):
+        server.save(json.dumps({"files": {"scene": "new", "task": TASK}}).encode())
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"part.xml": "old"}
+
+
 def test_a_silent_connection_does_not_hold_up_the_page(tmp_path, monkeypatch):
     monkeypatch.setattr(author_server, "_SECONDS", 0.2)
     server = AuthorServer(tmp_path, {"task": "task.toml"}, lambda token: token, list)

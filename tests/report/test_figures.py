@@ -8,9 +8,10 @@ import pytest
 
 from characterisation.plots.discs import noise_limits
 from characterisation.point_cloud import Status
+from characterisation.region_of_interest import Roi
 from mitsim.report import figures
 from mitsim.report.agreement import agreement
-from mitsim.report.cloud_figures import REASONS, camera_images, shrink, window
+from mitsim.report.cloud_figures import REASONS, camera_images, shrink
 from mitsim.report.style import as_svg
 from mitsim.report.view_figures import agreement_figure, uncertainty_figure, uncertainty_limits, view_places
 from mitsim.sensor.png import decode_png
@@ -135,9 +136,11 @@ def test_shrinking_keeps_the_mean():
     assert small.mean() == pytest.approx(image[:9, :1698].mean())
 
 
-def test_window_holds_the_part():
-    rows, columns = window(cloud("predicted", 1), margin=2)
-    assert (rows, columns) == (slice(3, 22), slice(6, 30))
+def test_a_region_around_the_part_ends_with_the_image():
+    there = cloud("predicted", 1).status != Status.NO_SURFACE
+    assert Roi.around(there, 2).slices == (slice(3, 22), slice(6, 30))
+    assert Roi.around(there, 100) == Roi.whole(there.shape[1], there.shape[0])
+    assert Roi.around(there & False, 2) is None
 
 
 def test_every_status_has_words_and_a_colour_of_its_own():

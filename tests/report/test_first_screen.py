@@ -140,6 +140,8 @@ def test_measurements_of_files_without_kinds_are_told_by_their_features():
         (0.6, 0.0, "deg", "up to 0.6°"),
         (0.3, 0.1, "mm", "up to 0.4 mm"),
         ((-0.2, 0.0), 35.0, "mm", "+0 −0.2 mm"),
+        ((-0.4, 0.4), 35.0, "mm", "±0.4 mm"),
+        ((-0.1, 0.3), 0.1, "mm", "up to 0.4 mm"),  # no value is below 0
         (None, 35.0, "mm", "–"),
     ],
 )

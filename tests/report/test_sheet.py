@@ -58,11 +58,17 @@ def with_rows(folder, count, long=False):
         write_netcdf(of_rows, path)
 
 
-@pytest.mark.parametrize(("rows", "long", "pages"), [(2, False, 1), (13, True, 1), (20, True, 2), (70, False, 3)])
-def test_no_text_overlaps_another_or_leaves_the_page(run_folder, tmp_path, rows, long, pages):
+@pytest.mark.parametrize(
+    ("rows", "long", "sizes", "pages"),
+    [(2, False, 0, 1), (13, True, 0, 1), (20, True, 0, 2), (70, False, 0, 3), (2, False, 600, 5)],
+)
+def test_no_text_overlaps_another_or_leaves_the_page(run_folder, tmp_path, rows, long, sizes, pages):
     folder = shutil.copytree(run_folder, tmp_path / "run")
     with_rows(folder, rows, long)
-    figures = figures_of(folder)
+    declaration = read_declaration(folder, read_scene_geometry(folder))
+    forms = [("with sizes of", ", ".join(f"form of the face_{k} of the housing 0.02 mm" for k in range(sizes)))]
+    declaration = replace(declaration, facts=[*declaration.facts, *forms])
+    figures = sheet_figures(declaration, read_scene_geometry(folder))
     assert len(figures) == pages
     shown = ""
     for figure in figures:
@@ -74,6 +80,7 @@ def test_no_text_overlaps_another_or_leaves_the_page(run_folder, tmp_path, rows,
         small = [(text, box.padded(-1.5)) for text, box in boxes]
         assert [(a, b) for k, (a, one) in enumerate(small) for b, other in small[:k] if one.overlaps(other)] == []
     assert all(f"distance_{k}" in shown for k in range(rows)) and "Signature" in shown
+    assert all(f"face_{k} " in shown.replace("\n", " ") for k in range(sizes))
     assert "organisation" in shown and shown.count("not traceable") == pages
 
 

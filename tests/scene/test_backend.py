@@ -35,6 +35,15 @@ def test_a_broken_library_is_told(tmp_path, monkeypatch):
     assert found.fault
 
 
+def test_a_library_that_never_loads_is_told(tmp_path, monkeypatch):
+    (tmp_path / "libLLVM.so.21").write_bytes(b"")
+    monkeypatch.setenv(backend.LLVM_VARIABLE, str(tmp_path / "libLLVM.so.21"))
+    monkeypatch.setattr(backend, "_VERSION_SCRIPT", "import time; time.sleep(70)")
+    monkeypatch.setattr(backend, "_PATIENCE_S", 0.3, raising=False)
+    (found,) = backend.find_llvm()
+    assert (found.usable, found.fault) == (False, "it does not load within 0.3 s")
+
+
 def test_none_at_all_gives_two_lines_of_help(tmp_path, monkeypatch):
     monkeypatch.setenv(backend.LLVM_VARIABLE, str(tmp_path / "nothing.so"))
     monkeypatch.setattr(backend, "cuda_devices", lambda: 0)

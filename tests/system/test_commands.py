@@ -14,6 +14,7 @@ from characterisation.cloud_files import read_cloud
 from characterisation.files.atomic_io import HOST
 from mitsim.capture.folder import read_capture
 from mitsim.capture.simulated.truth import read_truth
+from mitsim.cli import doctor
 from mitsim.running.progress import be_quiet, say, say_progress, track
 from tests.shell import ROOT, mitsim, mitsim_here
 from tests.smaller_sensors import coarse_sensor
@@ -78,6 +79,14 @@ def test_doctor_says_what_is_there():
     assert "llvm_ad_mono" in findings["renderer"]["detail"] or "cuda_ad_mono" in findings["renderer"]["detail"]
     assert findings["mitsim"]["detail"]
     assert "renderer" in mitsim_here("doctor").stdout
+
+
+def test_doctor_gives_up_a_kernel_that_never_ends(monkeypatch):
+    monkeypatch.setattr(doctor, "_TRIAL", "import time; time.sleep(310)")
+    monkeypatch.setattr(doctor, "_PATIENCE_S", 0.3, raising=False)
+    findings = {f["what"]: f for f in json.loads(mitsim_here("doctor", "--json", code=3).stdout)}
+    assert findings["renderer"]["verdict"] == "missing"
+    assert findings["renderer"]["detail"].endswith("failed: a trial kernel did not end within 0.3 s")
 
 
 def test_render_decode_and_back(tmp_path):

@@ -11,8 +11,9 @@ from PIL import Image
 
 from characterisation.files.errors import InputError
 from mitsim.capture.folder import write_capture
-from mitsim.talk.make import make, results_known
-from mitsim.talk.measured import measured_errors
+from mitsim.sensor.transforms import Transform
+from mitsim.talk.make import make, missing_results
+from mitsim.talk.measured import _nearest, measured_errors
 from mitsim.talk.page import write_talk
 from mitsim.talk.results import Results
 from mitsim.talk.talk_file import read_talk
@@ -101,6 +102,44 @@ def copied(kept: Path, folder: Path, names: tuple[str, ...]) -> Path:
     return folder
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            'measurement = "pillar1_radius", sample = "m',
+            'measurement = "pilar1_radius", sample = "m',
+            "examples.measur",
+        ),
+        (
+            'measurement = "pillar1_radius", sample = "R',
+            'measurement = "pilar1_radius", sample = "R',
+            "sphere.measurem",
+        ),
+        ('sample = "matt white"', 'sample = "mat white"', "examples.sample: .*'matt white'"),
+        ("trials = 2", 'trials = 2\nshown_feature = "pillar2_axis"', "shown_feature: .*pillar1, .*'pillar2'"),
+        ("distances_mm = [600]", "distances_mm = [450]", r"coupons\.shown_distance_mm: found 600\.0; allowed: 450"),
+    ],
+)
+def test_a_name_that_a_slide_shows_is_checked_before_work(tmp_path: Path, old: str, new: str, message: str) -> None:
+    path = small_talk(tmp_path)
+    text = path.read_text(encoding="utf-8")
+    assert text.count(old) == 1
+    path.write_text(text.replace(old, new), encoding="utf-8")
+    with pytest.raises(InputError, match=message):
+        read_talk(path)
+
+
+def test_a_capture_belongs_to_the_view_of_its_standoff(tmp_path: Path) -> None:
+    talk = read_talk(small_talk(tmp_path))
+    assert {view.standoff for view in talk.views} == {520.0, 600.0}
+    small = Transform.from_degrees([0.5, 0, 1], [2, 1, 3])
+    for view in talk.views:
+        assert _nearest(talk, view.world_from_sensor @ small, tmp_path) is view
+    away = Transform(np.eye(3), np.array([0.0, 0.0, -250.0]))
+    with pytest.raises(InputError, match=r"0\.0 deg and (170|250) mm from the nearest view"):
+        _nearest(talk, talk.views[0].world_from_sensor @ away, tmp_path)
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Make the small talk once; return its file and its output folder."""
@@ -157,7 +196,7 @@ def test_missing_results_are_named_on_the_page(made: tuple[Path, Path], tmp_path
     path, output = made
     kept = copied(output / "kept", tmp_path / "kept", ("tilts", "trials_matt_white", "scores_matt_white"))
     talk, results = read_talk(path), Results(kept, any_version=True)
-    missing = results_known(talk, results)
+    missing = missing_results(talk, results)
     assert set(missing) == {file.stem for file in (output / "kept").iterdir()} - {file.stem for file in kept.iterdir()}
     page = write_talk(talk, results, tmp_path, missing).read_text(encoding="utf-8")
     assert page.count("Not made yet") >= 6

@@ -60,7 +60,7 @@ def load_scene(
 
     See Also
     --------
-    load_sensor : the sensor
+    mitsim.sensor.preset.load_sensor : the sensor
 
     Examples
     --------

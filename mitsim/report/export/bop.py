@@ -33,6 +33,7 @@ from characterisation.files.atomic_io import atomic_folder
 from characterisation.files.checked_files import read_json_object
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
 from mitsim.decoding.cloud import capture_cloud, capture_geometry, decoder_settings
@@ -147,7 +148,7 @@ def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train
     Raises
     ------
     InputError
-        If ``output`` exists, a pattern matches nothing, or a capture cannot be used.
+        If ``output`` exists, a pattern matches nothing, or a capture cannot be used or shows other objects.
 
     See Also
     --------
@@ -160,22 +161,24 @@ def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train
     tables: dict[str, dict[str, dict[str, Any]]] = {
         finish: {"camera": {}, "gt": {}, "gt_info": {}} for finish in finishes
     }
-    scenes: dict[str, tuple[Scene, list[Scene]]] = {}
+    scenes: dict[tuple[Any, ...], tuple[Scene, list[Scene]]] = {}  # by file and parameters
     camera: dict[str, Any] = {}
     with atomic_folder(output) as partial:
         for source in track(sources, "export"):
             capture = read_capture(source.folder)
-            if source.finish not in scenes:
+            key = source.scene, *sorted(source.parameters.items())
+            if key not in scenes:
                 scene = load_scene(source.scene, _ANY_NM, dict(source.parameters))
-                scenes[source.finish] = scene, [scene.only(*names) for names in objects_of(scene.names, patterns)]
-            frame, scale = bop_frame(capture, *scenes[source.finish], source.folder)
+                scenes[key] = scene, [scene.only(*names) for names in objects_of(scene.names, patterns)]
+                _check_same_objects(scenes[key], next(iter(scenes.values())), source)
+            frame, scale = bop_frame(capture, *scenes[key], source.folder)
             folder = partial / split / f"{finishes.index(source.finish) + 1:06d}"
             _write_frame(frame, folder, len(tables[source.finish]["camera"]), scale, tables[source.finish])
             camera = camera or _camera_file(frame.grid, scale)
         for number, finish in enumerate(finishes, 1):
             for name, table in tables[finish].items():
                 _write_json(partial / split / f"{number:06d}" / f"scene_{name}.json", table)
-        first, objects = scenes[finishes[0]]
+        first, objects = next(iter(scenes.values()))
         _write_models(partial / "models", objects)
         _write_json(partial / "camera.json", camera)
         _write_json(partial / "statuses.json", {str(status.value): status.name.lower() for status in Status})
@@ -184,6 +187,16 @@ def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train
         described = _about(sources, finishes, split, [part.names for part in objects])
         (partial / "dataset_info.md").write_text(described, encoding="utf-8")
     return len(sources)
+
+
+def _check_same_objects(found: tuple[Scene, list[Scene]], first: tuple[Scene, list[Scene]], source: Source) -> None:
+    """Check that a scene has the shapes and objects of the first: a data set has one table and one model of each."""
+    pairs = zip(found[1], first[1], strict=True)
+    if found[0].names == first[0].names and all(np.array_equal(triangles(a), triangles(b)) for a, b in pairs):
+        return
+    told = f"{source.scene} with {dict(source.parameters)}, whose shapes or objects differ from the first capture's"
+    hint = "simulate other parts into other folders, and export each"
+    raise InputError(source.folder, "many.scene", told, "captures of the same objects", hint)
 
 
 def bop_frame(capture: Capture, scene: Scene, objects: Sequence[Scene], where: str | Path) -> tuple[Frame, float]:
@@ -299,10 +312,8 @@ def _info(silhouette: NDArray[np.bool_], visible: NDArray[np.bool_], valid: NDAr
 
 def _box(mask: NDArray[np.bool_]) -> list[int]:
     """Return x, y, width, height of a mask; four times -1 if it is empty."""
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    if not len(rows):
-        return [-1, -1, -1, -1]
-    return [int(columns[0]), int(rows[0]), int(columns[-1] - columns[0] + 1), int(rows[-1] - rows[0] + 1)]
+    box = Roi.around(mask)
+    return [-1, -1, -1, -1] if box is None else [box.left, box.top, box.width, box.height]
 
 
 def _camera_file(grid: ViewGrid, scale: float) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from xml.etree.ElementTree import Element, ElementTree, SubElement, indent, regi
 from characterisation.files.atomic_io import atomic_write
 from characterisation.files.errors import InputError
 from characterisation.statements.statement import ANY_PART
+from characterisation.tasks.task_file import effective_deviations
 from mitsim.report.declaration import Declaration
 from mitsim.report.export.results import ExpectedResult, RunResults
 from mitsim.running.version import __version__
@@ -204,21 +205,13 @@ def _result(to: Element, expected_result: ExpectedResult) -> None:
                 _si(expanded, "uncertainty", _number(largest))
                 _si(expanded, "coverageFactor", f"{largest / expected_result.uncertainty:.4f}")
                 _si(expanded, "coverageProbability", "0.95")
-    for name, value in zip(("lower deviation", "upper deviation"), _limits(expected_result), strict=True):
+    deviations = effective_deviations(expected_result.nominal, expected_result.tolerance) or (None, None)
+    for name, value in zip(("lower deviation", "upper deviation"), deviations, strict=True):
         if value is not None:
             _real(_quantity(table, f"tolerance, {name}"), value, unit)
     _real(_quantity(table, "number of virtual measurements"), float(expected_result.trials), r"\one")
     _real(_quantity(table, "share without a value"), expected_result.without_value, r"\one")
     _text(_quantity(table, "verdict on the measurement, not on a part"), "noQuantity", expected_result.verdict)
-
-
-def _limits(result: ExpectedResult) -> tuple[float | None, float | None]:
-    """Return the lower and upper deviation that the tolerance allows, None where it has no limit."""
-    if isinstance(result.tolerance, tuple):
-        return result.tolerance
-    if result.tolerance is None:
-        return None, None
-    return (None if result.nominal - result.tolerance <= 0 else -result.tolerance), result.tolerance
 
 
 def _quantity(to: Element, name: str, reference: str = "") -> Element:

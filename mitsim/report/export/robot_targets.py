@@ -75,14 +75,12 @@ def read_targets(folder: str | Path, views: str = "best") -> tuple[list[RobotTar
         If there are no poses, ``best`` is used for a folder without a race, or a view does not exist.
     """
     path = Path(folder) / "poses" / "poses.json"
+    document = read_json_object(path, "a folder made by mitsim run or mitsim study score")
     try:
-        document = read_json_object(path, "a folder made by mitsim run or mitsim study score")
         entries = {int(entry["view"]): entry for entry in document["views"]}
         tool = "flange" if "flange_from_sensor" in document else "sensor"
         poses = {number: Transform.from_matrix(entry[f"part_from_{tool}"]) for number, entry in entries.items()}
-    except InputError:
-        raise
-    except (ValueError, KeyError, TypeError, IndexError) as error:
+    except (OverflowError, ValueError, KeyError, TypeError, IndexError) as error:
         raise InputError(path, "", f"a file that cannot be read ({error})", "poses.json of mitsim") from None
     if views == "best":
         run = read_run(folder)
@@ -92,6 +90,10 @@ def read_targets(folder: str | Path, views: str = "best") -> tuple[list[RobotTar
             chosen.sort(key=lambda number: number != stated.view)  # stable: the others stay ascending
     else:
         chosen = numbers_of(views, list(entries))
+    missing = [number for number in chosen if number not in poses]
+    if missing or not chosen:
+        allowed = "the poses.json of this run, with every view that it names"
+        raise InputError(path, "views", f"no entry of view {missing[0]}" if chosen else "no view", allowed)
     return [RobotTarget(f"view_{number:04d}", poses[number]) for number in chosen], tool
 
 

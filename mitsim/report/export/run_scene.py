@@ -63,7 +63,7 @@ def read_run_scene(folder: str | Path, views: str = "best") -> RunScene:
     run = read_run(folder)
     shown = []
     for number in chosen_views(run, views):
-        clouds = {kind: run.cloud(kind, number) for kind in KINDS if run.has(_cloud_name(kind, number))}
+        clouds = {kind: run.cloud(kind, number) for kind in KINDS if run.has_cloud(kind, number)}
         best_of = tuple(name for name, best in run.about.leaders.items() if best == number)
         shown.append(ShownView(number, view_pose(run, number), clouds, best_of))
     grids = [cloud.grid for view in shown for cloud in view.clouds.values()]
@@ -81,7 +81,7 @@ def chosen_views(run: Run, views: str) -> list[int]:
     """Return the view numbers selected by ``best``, or as in :func:`numbers_of`, ascending."""
     numbers = [int(number) for number in run.scores["view"].values]
     if views == "best":
-        with_cloud = [number for number in numbers if any(run.has(_cloud_name(kind, number)) for kind in KINDS)]
+        with_cloud = [number for number in numbers if any(run.has_cloud(kind, number) for kind in KINDS)]
         return sorted({*with_cloud, *run.about.leaders.values()})
     return numbers_of(views, numbers)
 
@@ -96,6 +96,8 @@ def numbers_of(views: str, available: Sequence[int]) -> list[int]:
     """
     if views == "all":
         return sorted(available)
+    if not available:
+        raise InputError("--views", "", repr(views), "best or all: there are no views")
     allowed = f"best, all, or comma-separated numbers of views from {min(available)} to {max(available)}"
     try:
         chosen = sorted({int(word) for word in views.split(",")})
@@ -127,7 +129,3 @@ def quaternion(pose: Transform) -> tuple[float, float, float, float]:
 def sensor_from_grid(grid: ViewGrid) -> Transform:
     """Return the pose of a grid in the sensor frame."""
     return Transform(grid.rotation, grid.origin)
-
-
-def _cloud_name(kind: str, number: int) -> str:
-    return f"clouds/{kind}_{number:04d}.ply"

@@ -64,9 +64,9 @@ class MeasuringVolume:
         """Return the length of its body diagonal [mm]."""
         return float(2 * np.linalg.norm(self.half))
 
-    def points(self, places: Floats) -> Floats:
-        """Return points (..., 3) in the sensor frame of places within -1 to 1."""
-        return np.asarray(self.middle + places * self.half)
+    def points(self, positions: Floats) -> Floats:
+        """Return points (..., 3) in the sensor frame of positions (..., 3) from -1 to 1 along each side."""
+        return np.asarray(self.middle + positions * self.half)
 
 
 @dataclass(frozen=True)
@@ -111,11 +111,11 @@ def measuring_volume(eyes: Mapping[str, Camera], working_range_mm: tuple[float, 
     # check sides and corners: barrel distortion narrows the view at the middle of the sides
     places_on_faces = np.array([[x, y, z] for x in _SIDES for y in _SIDES for z in (-1, 1)], float)
     # transverse centre of each eye's view at the middle distance
-    places = []
+    centres = []
     for eye in eyes.values():
         ray = eye.sensor_from_camera.directions(eye.rays(np.array([eye.width - 1, eye.height - 1]) / 2))
-        places.append(eye.centre + ray * (middle - eye.centre[2]) / ray[2])
-    centre = np.array([*np.mean(places, axis=0)[:2], (first + last) / 2])
+        centres.append(eye.centre + ray * (middle - eye.centre[2]) / ray[2])
+    centre = np.array([*np.mean(centres, axis=0)[:2], (first + last) / 2])
     low, high = 0.0, middle
     for _ in range(30):
         size = (low + high) / 2
@@ -164,10 +164,10 @@ def accuracy(
         values = covariance.draw(stream)
         true = moved(sensor.rig, covariance.names, values)
         # with the nominal rig the chain returns the points up to rounding, which is subtracted
-        found = measured_points(sensor, everything, true, path_error(covariance.names, values)) - nominal + everything
-        ends = found[: bars.shape[0] * 2].reshape(-1, 2, 3)
-        flat = [flatness_error(each, 0.0) for each in found[bars.shape[0] * 2 : -1].reshape(plates.shape)]
-        deeper = np.linalg.norm(found[-1] - sensor.rig.reference.centre)
+        points = measured_points(sensor, everything, true, path_error(covariance.names, values)) - nominal + everything
+        ends = points[: bars.shape[0] * 2].reshape(-1, 2, 3)
+        flat = [flatness_error(plate, 0.0) for plate in points[bars.shape[0] * 2 : -1].reshape(plates.shape)]
+        deeper = np.linalg.norm(points[-1] - sensor.rig.reference.centre)
         deeper -= np.linalg.norm(volume.middle - sensor.rig.reference.centre)
         rows.append([*(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) - lengths), *flat, deeper])
     table = np.array(rows)
@@ -219,8 +219,8 @@ def _by_disparity(camera: Camera, pixels: Floats, other: Camera, other_rays: Flo
     right = other_rays @ pair.rotation_right.T
     left, right = left / left[:, 2:], right / right[:, 2:]
     columns = left[:, 0] * pair.matrix_left[0, 0] + pair.matrix_left[0, 2]
-    others = right[:, 0] * pair.matrix_right[0, 0] + pair.matrix_right[0, 2]
-    depth = pair.depth(columns - others)
+    other_columns = right[:, 0] * pair.matrix_right[0, 0] + pair.matrix_right[0, 2]
+    depth = pair.depth(columns - other_columns)
     return camera.sensor_from_camera.points((left * depth[:, None]) @ pair.rotation_left)
 
 

@@ -74,8 +74,8 @@ class Board:
     def corners(self) -> Floats:
         """The inner corners in the board's frame, with its centre as origin, (n, 3) [mm]."""
         x, y = np.meshgrid(np.arange(1, self.columns), np.arange(1, self.rows))
-        places = np.stack([x - self.columns / 2, y - self.rows / 2, np.zeros_like(x, float)], axis=-1)
-        return np.asarray(places.reshape(-1, 3) * self.square_mm)
+        positions = np.stack([x - self.columns / 2, y - self.rows / 2, np.zeros_like(x, float)], axis=-1)
+        return np.asarray(positions.reshape(-1, 3) * self.square_mm)
 
     @property
     def bends(self) -> Floats:
@@ -172,11 +172,11 @@ def board_poses(
     out = []
     for index in range(count):
         # R2 sequence (Roberts 2018) for the position, a coprime stride for the distance
-        place = (0.5 + index * np.array([0.7548776662466927, 0.5698402909980532])) % 1
+        position = (0.5 + index * np.array([0.7548776662466927, 0.5698402909980532])) % 1
         share = (index * 7 % count + 0.5) / count
         distance = 1 / (share / near + (1 - share) / far)
         tilt, azimuth = np.radians(TILTS_DEG[index % len(TILTS_DEG)]), index * 2.399963
-        pixel = (0.1 + 0.8 * place) * [reference.width - 1, reference.height - 1]
+        pixel = (0.1 + 0.8 * position) * [reference.width - 1, reference.height - 1]
         ray = reference.sensor_from_camera.directions(reference.rays(pixel))
         turn = Rotation.from_euler("z", 90.0 * (index // 2), degrees=True)
         facing = Rotation.align_vectors([ray], [[0.0, 0.0, 1.0]])[0]
@@ -190,8 +190,8 @@ def board_poses(
                 out.append((pose, np.flatnonzero(seen)))
                 break
     if len(out) < 6:
-        found = f"{len(out)} of {count} poses at which all eyes see half of the board"
-        raise InputError("--board", str(board), found, "6 poses or more", "use a smaller board or more poses")
+        poses = f"{len(out)} of {count} poses at which all eyes see half of the board"
+        raise InputError("--board", str(board), poses, "6 poses or more", "use a smaller board or more poses")
     return out
 
 
@@ -218,8 +218,8 @@ def _unfolded(eye: Camera, points: Floats) -> NDArray[np.bool_]:
 
 def _middle(eyes: Mapping[str, Camera], distance: float) -> Floats:
     """Return the mean of the points at a distance on the central rays of all eyes, (3,)."""
-    places = []
+    points = []
     for eye in eyes.values():
         ray = eye.rays(np.array([(eye.width - 1) / 2, (eye.height - 1) / 2]))
-        places.append(eye.centre + distance * eye.sensor_from_camera.directions(ray))
-    return np.asarray(np.mean(places, axis=0))
+        points.append(eye.centre + distance * eye.sensor_from_camera.directions(ray))
+    return np.asarray(np.mean(points, axis=0))

@@ -101,8 +101,8 @@ def eye_start(
     **options
         ``distCoeffs``, ``flags`` and others of OpenCV's function.
     """
-    seen = [each.astype(np.float32).reshape(-1, 1, 2) for each in pixels]
-    flat = [each.astype(np.float32) for each in points]
+    seen = [corners.astype(np.float32).reshape(-1, 1, 2) for corners in pixels]
+    flat = [corners.astype(np.float32) for corners in points]
     misfit, matrix, distortion, turns, shifts = cv2.calibrateCamera(flat, seen, size, guess, **options)
     poses = [
         Transform(Rotation.from_rotvec(turn.ravel()).as_matrix(), np.asarray(shift, np.float64).ravel())
@@ -114,18 +114,18 @@ def eye_start(
 def second_eye(first: Sequence[Transform], second: Sequence[Transform]) -> Transform:
     """Return the pose of an eye in the frame of a first one: their mean over poses of the board in both frames."""
     apart = [transform @ other.inverse() for transform, other in zip(first, second, strict=True)]
-    turn = Rotation.from_matrix([each.rotation for each in apart]).mean().as_matrix()
-    return Transform(turn, np.median([each.translation for each in apart], axis=0))
+    turn = Rotation.from_matrix([motion.rotation for motion in apart]).mean().as_matrix()
+    return Transform(turn, np.median([motion.translation for motion in apart], axis=0))
 
 
-def stepped(rig: Rig, places: Sequence[Transform], names: tuple[str, ...], step: Floats) -> tuple[Rig, list[Transform]]:
+def stepped(rig: Rig, poses: Sequence[Transform], names: tuple[str, ...], step: Floats) -> tuple[Rig, list[Transform]]:
     """Return rig and poses of the board after a step of an adjustment.
 
     Parameters
     ----------
     rig
         Rig before the step.
-    places
+    poses
         Poses ``sensor_from_board`` before the step.
     names
         The p parameters of the rig that are adjusted.
@@ -138,8 +138,8 @@ def stepped(rig: Rig, places: Sequence[Transform], names: tuple[str, ...], step:
     """
     turns = step[len(names) :].reshape(-1, 6)
     return moved(rig, names, step[: len(names)]), [
-        Transform(Rotation.from_rotvec(turn[:3]).as_matrix() @ place.rotation, place.translation + turn[3:])
-        for turn, place in zip(turns, places, strict=True)
+        Transform(Rotation.from_rotvec(turn[:3]).as_matrix() @ pose.rotation, pose.translation + turn[3:])
+        for turn, pose in zip(turns, poses, strict=True)
     ]
 
 
@@ -168,21 +168,21 @@ def linearise(rig: Rig, eyes: Mapping[str, Camera], board: Board, views: Sequenc
     normal, noise = np.zeros((size, size)), np.zeros((size, size))
     shared = np.zeros((size, len(modes)))
     for number, view in enumerate(views):
-        own = [*range(len(names)), *range(first := len(names) + 6 * number, first + 6)]
+        indices = [*range(len(names)), *range(first := len(names) + 6 * number, first + 6)]
         jacobian, by_point = view_jacobian(eyes, names, view.sensor_from_board, board.corners[view.corners])
         covariance = observation_covariance(eyes, by_point, view)
         to_board = board_derivatives(view.sensor_from_board, modes[:, view.corners], by_point)
-        part = jacobian.reshape(len(view.corners), -1, len(own))  # groups all coordinates of a corner
-        normal[np.ix_(own, own)] += np.einsum("nop,noq->pq", part, part)
+        part = jacobian.reshape(len(view.corners), -1, len(indices))  # groups all coordinates of a corner
+        normal[np.ix_(indices, indices)] += np.einsum("nop,noq->pq", part, part)
         weighted = np.einsum("nor,nrq->noq", covariance, part)
-        noise[np.ix_(own, own)] += np.einsum("nop,noq->pq", part, weighted)
-        shared[own] += np.einsum("nop,nom->pm", part, to_board.reshape(len(view.corners), -1, len(modes)))
+        noise[np.ix_(indices, indices)] += np.einsum("nop,noq->pq", part, weighted)
+        shared[indices] += np.einsum("nop,nom->pm", part, to_board.reshape(len(view.corners), -1, len(modes)))
     return Linearised(names, normal, noise, shared, sigma)
 
 
-def board_derivatives(place: Transform, modes: Floats, by_point: Floats) -> Floats:
+def board_derivatives(pose: Transform, modes: Floats, by_point: Floats) -> Floats:
     """Return derivatives (n, eyes, 2, m) of pixels by imperfections (m, n, 3) of the board at a pose."""
-    shifts = np.einsum("ij,mnj->mni", place.rotation, modes)
+    shifts = np.einsum("ij,mnj->mni", pose.rotation, modes)
     return np.asarray(np.einsum("neak,mnk->neam", by_point, shifts))
 
 
@@ -204,17 +204,17 @@ def eye_jacobian(eye: Camera, points: Floats) -> tuple[Floats, Floats]:
     return np.asarray(by_point), np.asarray(optics.reshape(count, 2, -1))
 
 
-def homographies(first: Floats, second: Floats, place: Transform) -> Floats:
+def homographies(first: Floats, second: Floats, pose: Transform) -> Floats:
     """Return the derivatives of a second eye's pixels by those of a first on the board's plane, (n, 2, 2).
 
     ``first`` and ``second`` (n, 2, 3) are the derivatives of the two eyes' pixels by the point.
     """
-    plane = place.rotation[:, :2]
+    plane = pose.rotation[:, :2]
     return np.asarray((second @ plane) @ np.linalg.inv(first @ plane))
 
 
 def view_jacobian(
-    eyes: Mapping[str, Camera], names: tuple[str, ...], place: Transform, corners: Floats
+    eyes: Mapping[str, Camera], names: tuple[str, ...], pose: Transform, corners: Floats
 ) -> tuple[Floats, Floats]:
     """Return the derivatives of the pixels of a board's corners in every eye.
 
@@ -227,7 +227,7 @@ def view_jacobian(
         Cameras and projector by name, the reference camera first.
     names
         The p parameters of the rig, in the order of the columns.
-    place
+    pose
         Pose ``sensor_from_board``.
     corners
         (n, 3) corners in the board's frame [mm].
@@ -236,22 +236,22 @@ def view_jacobian(
     --------
     eye_jacobian : the derivatives of the pixels of a single eye
     """
-    points = place.points(corners)
-    arms = points - place.translation
+    points = pose.points(corners)
+    arms = points - pose.translation
     jacobian = np.zeros((len(points), len(eyes), 2, len(names) + 6))
     by_point = np.empty((len(points), len(eyes), 2, 3))
     for number, (name, eye) in enumerate(eyes.items()):
         moves, optics = eye_jacobian(eye, points)
         by_point[:, number] = moves
-        own = [names.index(f"{name}.{what}") for what in (*MATRIX_NAMES, *distortion_names(eye))]
-        jacobian[:, number][:, :, own] = optics
+        columns = [names.index(f"{name}.{parameter}") for parameter in (*MATRIX_NAMES, *distortion_names(eye))]
+        jacobian[:, number][:, :, columns] = optics
         if number:
-            pose = [names.index(f"{name}.{what}") for what in POSE_NAMES]
+            pose_columns = [names.index(f"{name}.{parameter}") for parameter in POSE_NAMES]
             # in the frame of R exp(w) a point x is rotated by exp(-w): dx = x cross w
             local = moves @ eye.sensor_from_camera.rotation
             seen = eye.sensor_from_camera.inverse().points(points)
-            jacobian[:, number][:, :, pose[:3]] = np.cross(local, seen[:, None])
-            jacobian[:, number][:, :, pose[3:]] = -moves
+            jacobian[:, number][:, :, pose_columns[:3]] = np.cross(local, seen[:, None])
+            jacobian[:, number][:, :, pose_columns[3:]] = -moves
     jacobian[..., -6:-3] = np.cross(arms[:, None, None], by_point)
     jacobian[..., -3:] = by_point
     return jacobian, by_point

@@ -116,8 +116,8 @@ def _together(path: Path, seen: Seen, sizes: Sizes, images: Mapping[str, FittedC
         used[pose] = pixels
         boards.append(RecordedBoard(np.array(common, np.intp), pixels, images.get(pose)))
     if not boards:
-        found = "; ".join(left_out[:3]) or "no pose"
-        raise InputError(path, "", found, f"poses with {_LEAST_CORNERS} corners or more", "check --board")
+        reasons = "; ".join(left_out[:3]) or "no pose"
+        raise InputError(path, "", reasons, f"poses with {_LEAST_CORNERS} corners or more", "check --board")
     return RecordedCorners(boards, sizes, left_out)
 
 
@@ -129,23 +129,23 @@ def _check_inside(path: Path, pose: str, pixels: dict[str, Floats], sizes: Sizes
     InputError
         If one does not: the size belongs to other images, or x and y are exchanged.
     """
-    for eye, places in pixels.items():
+    for eye, corners in pixels.items():
         width, height = sizes[eye]
-        outside = (places < -1).any(axis=1) | (places > (width, height)).any(axis=1)
+        outside = (corners < -1).any(axis=1) | (corners > (width, height)).any(axis=1)
         if outside.any():
-            x, y = places[outside][0]
+            x, y = corners[outside][0]
             hint = "are these corners of images of another size, or are x and y exchanged?"
-            found = f"a corner at {x:.1f}, {y:.1f} px"
-            raise InputError(path, f"{eye}, pose {pose}", found, f"corners within {width} x {height} px", hint)
+            corner = f"a corner at {x:.1f}, {y:.1f} px"
+            raise InputError(path, f"{eye}, pose {pose}", corner, f"corners within {width} x {height} px", hint)
 
 
 def _are_equal(first: dict[str, Floats], second: dict[str, Floats]) -> bool:
     """Return whether two poses have the same pixels, as a copy of an image has."""
-    return all(np.array_equal(places, second[eye]) for eye, places in first.items())
+    return all(np.array_equal(corners, second[eye]) for eye, corners in first.items())
 
 
 def _of_images(path: Path, board: Board) -> tuple[Seen, Sizes, dict[str, FittedCapture]]:
-    files = sorted(one for one in path.rglob("*") if one.suffix.lower() in _IMAGES and one.is_file())
+    files = sorted(file for file in path.rglob("*") if file.suffix.lower() in _IMAGES and file.is_file())
     seen: Seen = {}
     sizes: Sizes = {}
     digests: dict[str, dict[str, bytes]] = {}
@@ -154,8 +154,8 @@ def _of_images(path: Path, board: Board) -> tuple[Seen, Sizes, dict[str, FittedC
         image = read_grey(file)
         size = (image.shape[1], image.shape[0])
         if sizes.setdefault(camera, size) != size:
-            others = "{} x {} px, as the others".format(*sizes[camera])
-            raise InputError(file, "size", f"{size[0]} x {size[1]} px", others)
+            allowed = "{} x {} px, as the others".format(*sizes[camera])
+            raise InputError(file, "size", f"{size[0]} x {size[1]} px", allowed)
         corners = found_corners(image, board)
         seen.setdefault(pose, {})
         digests.setdefault(pose, {})[camera] = stack_digest(image[None])
@@ -171,8 +171,10 @@ def _of_images(path: Path, board: Board) -> tuple[Seen, Sizes, dict[str, FittedC
     if len(sizes) > 2:
         raise InputError(path, "", f"images of {', '.join(sizes)}", "one or two cameras", "name them left and right")
     images = {
-        pose: FittedCapture(name=f"{path / pose}", images_sha256=joined_digest(own[camera] for camera in sorted(own)))
-        for pose, own in digests.items()
+        pose: FittedCapture(
+            name=f"{path / pose}", images_sha256=joined_digest(by_camera[camera] for camera in sorted(by_camera))
+        )
+        for pose, by_camera in digests.items()
     }
     return seen, dict(sorted(sizes.items())), images
 
@@ -184,10 +186,10 @@ def found_corners(image: NDArray[np.generic], board: Board) -> Floats | None:
     low, high = np.percentile(levels, [1, 99])
     grey = np.clip(255 * (levels - low) / max(high - low, 1e-9), 0, 255).astype(np.uint8)
     for flags in (cv2.CALIB_CB_ACCURACY, cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE):
-        found, corners = cv2.findChessboardCornersSB(grey, shape, flags=flags)
-        if found:
+        detected, corners = cv2.findChessboardCornersSB(grey, shape, flags=flags)
+        if detected:
             break
-    return np.asarray(corners, float).reshape(-1, 2) if found else None
+    return np.asarray(corners, float).reshape(-1, 2) if detected else None
 
 
 def turned_alike(first: Floats, second: Floats) -> Floats:
@@ -227,18 +229,18 @@ def _of_table(path: Path, board: Board) -> tuple[Seen, Sizes]:
     for number, row in enumerate(rows, 1):
         try:
             column, line_of_board = int(row["column"]), int(row["row"])
-            place = np.array([float(row["x_px"]), float(row["y_px"])])
+            pixel = np.array([float(row["x_px"]), float(row["y_px"])])
         except (TypeError, ValueError):
-            found = str(list(row.values()))[:60]
-            raise InputError(path, f"row {number}", found, "whole numbers, and two pixels") from None
+            values = str(list(row.values()))[:60]
+            raise InputError(path, f"row {number}", values, "whole numbers, and two pixels") from None
         inside = 0 <= column < board.columns - 1 and 0 <= line_of_board < board.rows - 1
-        if not inside or not np.isfinite(place).all():
+        if not inside or not np.isfinite(pixel).all():
             corners = f"corners 0 to {board.columns - 2} and 0 to {board.rows - 2} of the board, with finite pixels"
             raise InputError(path, f"row {number}", f"corner {column}, {line_of_board}", corners)
         if row["camera"] not in sizes:
             raise InputError(path, row["camera"], "no size", f"a line # size {row['camera']} WIDTH HEIGHT")
         by_eye = seen.setdefault(row["pose"], {}).setdefault(row["camera"], {})
-        by_eye[line_of_board * (board.columns - 1) + column] = place
+        by_eye[line_of_board * (board.columns - 1) + column] = pixel
     return seen, sizes
 
 
@@ -259,20 +261,20 @@ def _of_arrays(path: Path, arrays: Mapping[str, Any], board: Board) -> tuple[See
         try:
             pixels = np.asarray(values, float).reshape(-1, count, 2)
         except (TypeError, ValueError):
-            found = f"{np.asarray(values, object).shape}"
-            raise InputError(path, eye, found, f"(poses, {count}, 2), for {board}", "check --board") from None
-        for pose, places in enumerate(pixels):
-            known = np.isfinite(places).all(axis=1)
-            seen.setdefault(str(pose), {})[eye] = {int(k): places[k] for k in np.flatnonzero(known)}
+            shape = f"{np.asarray(values, object).shape}"
+            raise InputError(path, eye, shape, f"(poses, {count}, 2), for {board}", "check --board") from None
+        for pose, corners in enumerate(pixels):
+            finite = np.isfinite(corners).all(axis=1)
+            seen.setdefault(str(pose), {})[eye] = {int(k): corners[k] for k in np.flatnonzero(finite)}
     return seen, dict.fromkeys(by_eye, size)
 
 
 def _size(path: Path, arrays: Mapping[str, Any]) -> tuple[int, int]:
-    given = arrays.get("image_size", [arrays.get("image_width"), arrays.get("image_height")])
+    size = arrays.get("image_size", [arrays.get("image_width"), arrays.get("image_height")])
     try:
-        width, height = (int(value) for value in np.asarray(given).ravel())
+        width, height = (int(value) for value in np.asarray(size).ravel())
     except (TypeError, ValueError):
-        raise InputError(path, "image_size", given, "width and height of the images [px]") from None
+        raise InputError(path, "image_size", size, "width and height of the images [px]") from None
     if not (0 < width <= 65535 and 0 < height <= 65535):
         raise InputError(path, "image_size", f"{width} x {height}", "1 to 65535 px")
     return width, height

@@ -103,15 +103,15 @@ def corner_noise(
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-5)
     errors = []
     for _ in range(patches):
-        place = half + rng.uniform(-0.5, 0.5, 2)
-        bright = _crossing(size, place, rng.uniform(0, 2 * np.pi), rng.uniform(np.radians(60), np.radians(120)), disc)
+        corner = half + rng.uniform(-0.5, 0.5, 2)
+        bright = _crossing(size, corner, rng.uniform(0, 2 * np.pi), rng.uniform(np.radians(60), np.radians(120)), disc)
         image = cv2.sepFilter2D(bright, -1, blur, blur, borderType=cv2.BORDER_REFLECT)
         light = electrons * (BLACK + (WHITE - BLACK) * image) / WHITE
         pattern = fixed_pattern(imager, light.shape, rng)
         grey = expose(light, imager, pattern, noise, rng, sensor.exposure.limits_s[0]).astype(np.float32)
-        start = np.float32(place + rng.uniform(-0.7, 0.7, 2)).reshape(1, 1, 2)
-        found = cv2.cornerSubPix(grey, start, (window, window), (-1, -1), criteria)
-        errors.append(found.reshape(2) - place)
+        start = np.float32(corner + rng.uniform(-0.7, 0.7, 2)).reshape(1, 1, 2)
+        detected = cv2.cornerSubPix(grey, start, (window, window), (-1, -1), criteria)
+        errors.append(detected.reshape(2) - corner)
     wrong = np.array(errors)
     # a calibration rejects corners with large residuals, where the detector diverged
     wrong = wrong[np.abs(wrong).max(axis=1) < 1.0]
@@ -180,8 +180,8 @@ def coordinate_noise(sensor: Sensor, distance_mm: float, square_px: float, seed:
     contrast = getattr(pattern, "contrast", 0.5)
     signal = level * imager.full_well * imager.gain
     variance = grey_level_variance(np.array([signal / 2 + imager.black_level], np.float32), imager)
-    one = fringe_sigma(min(periods), steps, variance, np.array([signal * contrast], np.float32), imager)
-    return float(one[0] / np.sqrt(white))
+    sigma = fringe_sigma(min(periods), steps, variance, np.array([signal * contrast], np.float32), imager)
+    return float(sigma[0] / np.sqrt(white))
 
 
 def homography_scale(sensor: Sensor) -> float:
@@ -189,11 +189,11 @@ def homography_scale(sensor: Sensor) -> float:
     return float(sensor.projector.optics.matrix[0, 0] / sensor.rig.reference.matrix[0, 0])
 
 
-def _crossing(size: int, place: Floats, angle: float, between: float, disc_px: float) -> Floats:
+def _crossing(size: int, corner: Floats, angle: float, between: float, disc_px: float) -> Floats:
     """Return an image (size, size) of two crossing edges, 0 and 1, averaged over pixels and over a defocus disc."""
     steps = (np.arange(_SUPERSAMPLING) + 0.5) / _SUPERSAMPLING - 0.5
     grid = (np.arange(size)[:, None] + steps).reshape(-1)
-    x, y = np.meshgrid(grid - place[0], grid - place[1])
+    x, y = np.meshgrid(grid - corner[0], grid - corner[1])
     first = x * np.sin(angle) - y * np.cos(angle)
     second = x * np.sin(angle + between) - y * np.cos(angle + between)
     fine = ((first > 0) == (second > 0)).astype(np.float64)

@@ -91,7 +91,7 @@ def calibrate_checked(
     calibrate_recorded : the calibration alone
     """
     whole = calibrate_recorded(boards, board, sizes, source)
-    tilt = largest_tilt(whole.places)
+    tilt = largest_tilt(whole.poses)
     if len(boards) < 2 * LEAST_POSES:
         return CheckedCalibration(whole, math.nan, "", math.nan, tilt)
     halves = [calibrate_recorded(boards[first::2], board, sizes, source) for first in (0, 1)]
@@ -111,7 +111,7 @@ def calibrate_checked(
             name,
             f"two halves of the {len(boards)} poses that differ by {abs(standard[worst]):.1f} standard uncertainties",
             f"{limit * MOST_WIDENED:.1f} or less: the covariance of this calibration cannot be believed",
-            tilt_hint(whole.places)
+            tilt_hint(whole.poses)
             or "check the geometry of the board and the order of its corners, and cover the images of all cameras",
         )
     widened = replace(
@@ -126,7 +126,7 @@ def _difference(calibration: RecordedCalibration, other: RecordedCalibration) ->
     """Return the difference (p,) of two calibrations with one board, and its covariance (p, p)."""
     names = calibration.covariance.names
     shared = calibration.board_effect - other.board_effect
-    noise = (each.covariance.covariance - each.board_effect @ each.board_effect.T for each in (calibration, other))
+    noise = (half.covariance.covariance - half.board_effect @ half.board_effect.T for half in (calibration, other))
     return np.asarray(parameter_differences(calibration.rig, other.rig, names)), sum(noise) + shared @ shared.T
 
 

@@ -76,7 +76,7 @@ class RecordedBoard:
 
 @dataclass(frozen=True)
 class RecordedCalibration:
-    """Result of a calibration: ``rig``, ``places`` sensor_from_board of the poses, ``covariance``, observation noise.
+    """Result of a calibration: ``rig``, ``poses`` sensor_from_board, ``covariance``, observation noise.
 
     ``board_effect`` (p, m): what one standard deviation of each imperfection of the board changes; the covariance
     contains it.
@@ -86,7 +86,7 @@ class RecordedCalibration:
     """
 
     rig: Rig
-    places: list[Transform]
+    poses: list[Transform]
     covariance: RigCovariance
     camera_px: Floats
     coordinate_px: Floats
@@ -123,29 +123,31 @@ def calibrate_recorded(
     """
     if len(boards) < LEAST_POSES:
         raise InputError("boards", "", f"{len(boards)} poses", f"{LEAST_POSES} or more, tilted against one another")
-    observed, (rig, places) = _Observations(boards, board), _start(boards, board, sizes)
+    observed, (rig, poses) = _Observations(boards, board), _start(boards, board, sizes)
     noise = np.tile([0.1, 0.1 if "projector" in sizes else 0.0], (len(boards), 1))
     for _ in range(_ROUNDS):
-        rig, places, normal = observed.adjusted(rig, places, noise, rig_prior(rig, sizes))
-        noise = observed.noise(rig, places, normal)
+        rig, poses, normal = observed.adjusted(rig, poses, noise, rig_prior(rig, sizes))
+        noise = observed.noise(rig, poses, normal)
     if (typical := float(np.median(noise[:, 0]))) > _MOST_NOISE_PX:
         hint = (
             "a lens of more than about 90 deg needs another model; leave out corners far from the middle of the image"
         )
-        found = f"residuals of {typical:.1f} px of the corners"
-        raise InputError("boards", "", found, f"{_MOST_NOISE_PX:g} px or less, of a lens with k1, k2, p1, p2, k3", hint)
-    matrix, effect = observed.covariance(rig, places, noise, normal, own_units)
+        residuals = f"residuals of {typical:.1f} px of the corners"
+        raise InputError(
+            "boards", "", residuals, f"{_MOST_NOISE_PX:g} px or less, of a lens with k1, k2, p1, p2, k3", hint
+        )
+    matrix, effect = observed.covariance(rig, poses, noise, normal, own_units)
     details: dict[str, str | float] = {
         "board": str(board),
-        "poses": float(len(places)),
-        "corners": float(sum(len(each.corners) for each in boards)),
+        "poses": float(len(poses)),
+        "corners": float(sum(len(recorded.corners) for recorded in boards)),
         "corner_noise_px": float(noise[:, 0].max()),
         "coordinate_noise_px": float(noise[:, 1].max()),
     }
-    shown = tuple(each.images for each in boards if each.images is not None)
+    shown = tuple(recorded.images for recorded in boards if recorded.images is not None)
     covariance = RigCovariance(parameter_names(rig), matrix, source, details, shown)
     camera_px, coordinate_px = noise.T
-    return RecordedCalibration(rig, places, covariance, camera_px, coordinate_px, effect)
+    return RecordedCalibration(rig, poses, covariance, camera_px, coordinate_px, effect)
 
 
 @dataclass(frozen=True)
@@ -163,7 +165,7 @@ def rig_prior(rig: Rig, sizes: Mapping[str, tuple[int, int]]) -> LensPrior:
     names = parameter_names(rig)
     rows, values, sigma = [], [], []
 
-    def known(parts: Mapping[str, float], value: float, spread: float) -> None:
+    def add(parts: Mapping[str, float], value: float, spread: float) -> None:
         row = np.zeros(len(names))
         for name, weight in parts.items():
             row[names.index(name)] = weight
@@ -174,12 +176,12 @@ def rig_prior(rig: Rig, sizes: Mapping[str, tuple[int, int]]) -> LensPrior:
     optics = all_eyes(rig)
     for eye, (width, height) in sizes.items():
         middle = _PROJECTOR_MIDDLE if eye == "projector" else _CAMERA_MIDDLE
-        known({f"{eye}.principal_x_px": 1.0}, (width - 1) / 2, middle[0] * width)
-        known({f"{eye}.principal_y_px": 1.0}, (height - 1) / 2, middle[1] * height)
+        add({f"{eye}.principal_x_px": 1.0}, (width - 1) / 2, middle[0] * width)
+        add({f"{eye}.principal_y_px": 1.0}, (height - 1) / 2, middle[1] * height)
         focal = float(optics[eye].matrix[0, 0])
-        known({f"{eye}.focal_x_px": 1.0, f"{eye}.focal_y_px": -1.0}, 0.0, _ASPECT * focal)
+        add({f"{eye}.focal_x_px": 1.0, f"{eye}.focal_y_px": -1.0}, 0.0, _ASPECT * focal)
         for name, spread in _DISTORTION.items():
-            known({f"{eye}.{name}": 1.0}, 0.0, spread)
+            add({f"{eye}.{name}": 1.0}, 0.0, spread)
     return LensPrior(names, np.array(rows), np.array(values), np.array(sigma))
 
 
@@ -192,15 +194,15 @@ def _start(
     cameras, poses, reference = dict[str, Camera](), dict[str, list[Transform]](), next(iter(sizes))
     for eye, (width, height) in sizes.items():
         free = 0 if eye == "projector" else cv2.CALIB_FIX_PRINCIPAL_POINT
-        points = [board.corners[each.corners] for each in boards]
+        points = [board.corners[view.corners] for view in boards]
         tries = []
         for share in (0.6, 1.0, 1.6, 2.5):
             guess = np.array([[share * width, 0, (width - 1) / 2], [0, share * width, (height - 1) / 2], [0, 0, 1.0]])
-            pixels, options = [each.pixels[eye] for each in boards], {"distCoeffs": np.zeros(5), "flags": flags | free}
+            pixels, options = [view.pixels[eye] for view in boards], {"distCoeffs": np.zeros(5), "flags": flags | free}
             tries.append(bundle.eye_start(points, pixels, (width, height), guess, **options))
-        _, matrix, _, poses[eye] = min(tries, key=lambda one: one[0])
-        place = Transform.identity() if eye == reference else bundle.second_eye(poses[reference], poses[eye])
-        cameras[eye] = Camera(matrix, np.zeros(5), width, height, place)
+        _, matrix, _, poses[eye] = min(tries, key=lambda fit: fit[0])
+        pose = Transform.identity() if eye == reference else bundle.second_eye(poses[reference], poses[eye])
+        cameras[eye] = Camera(matrix, np.zeros(5), width, height, pose)
     projector = cameras.pop("projector", None)
     return Rig(cameras, projector), poses[reference]
 
@@ -212,20 +214,20 @@ class _Observations:
     boards: Sequence[RecordedBoard]
     board: Board
 
-    def residuals(self, rig: Rig, place: Transform, recorded: RecordedBoard) -> tuple[Floats, Floats, Floats]:
+    def residuals(self, rig: Rig, pose: Transform, recorded: RecordedBoard) -> tuple[Floats, Floats, Floats]:
         """Return derivatives of one pose's pixels, (n, eyes, 2, p + 6), (n, eyes, 2, 3), and residuals (n, 2 eyes)."""
         optics, corners = all_eyes(rig), self.board.corners[recorded.corners]
-        jacobian, by_point = bundle.view_jacobian(optics, parameter_names(rig), place, corners)
-        at = place.points(corners)
+        jacobian, by_point = bundle.view_jacobian(optics, parameter_names(rig), pose, corners)
+        at = pose.points(corners)
         left = np.concatenate([recorded.pixels[name] - eye.project(at) for name, eye in optics.items()], axis=1)
         return jacobian, by_point, left
 
-    def whitened(self, rig: Rig, places: Sequence[Transform], noise: Floats) -> Iterator[_Whitened]:
+    def whitened(self, rig: Rig, poses: Sequence[Transform], noise: Floats) -> Iterator[_Whitened]:
         """Yield what each pose contributes to an adjustment, at a noise (poses, 2) [px]."""
         count = len(parameter_names(rig))
-        for number, (place, recorded, own) in enumerate(zip(places, self.boards, noise, strict=True)):
-            jacobian, by_point, left = self.residuals(rig, place, recorded)
-            view = bundle.BoardView(place, recorded.corners, *map(float, own))
+        for number, (pose, recorded, pose_noise) in enumerate(zip(poses, self.boards, noise, strict=True)):
+            jacobian, by_point, left = self.residuals(rig, pose, recorded)
+            view = bundle.BoardView(pose, recorded.corners, *map(float, pose_noise))
             covariance = bundle.observation_covariance(all_eyes(rig), by_point, view)
             whiten = np.linalg.inv(np.linalg.cholesky(covariance))
             flat = np.einsum("nij,njk->nik", whiten, jacobian.reshape(len(left), -1, count + 6))
@@ -233,96 +235,96 @@ class _Observations:
             yield _Whitened(view, indices, flat, whiten, by_point, left)
 
     def adjusted(
-        self, rig: Rig, places: list[Transform], noise: Floats, prior: LensPrior
+        self, rig: Rig, poses: list[Transform], noise: Floats, prior: LensPrior
     ) -> tuple[Rig, list[Transform], Floats]:
         """Minimise weighted squares over rig and poses by Levenberg-Marquardt; also return the normal matrix (q, q)."""
         damping = 1e-3
-        cost, normal, gradient = self._normal(rig, places, noise, prior)
+        cost, normal, gradient = self._normal(rig, poses, noise, prior)
         for _ in range(_MOST_STEPS):
             scale = 1 / np.sqrt(np.diag(normal))
             scaled = normal * np.outer(scale, scale)
             step = scale * np.linalg.solve(scaled + damping * np.eye(len(scale)), scale * gradient)
-            tried_rig, tried = bundle.stepped(rig, places, prior.names, step)
+            tried_rig, tried = bundle.stepped(rig, poses, prior.names, step)
             new = self._normal(tried_rig, tried, noise, prior)
             if not new[0] <= cost * (1 + 1e-12):  # a lens that folds projects to NaN
                 damping *= 4
                 if damping > _STUCK:
-                    return rig, places, normal
+                    return rig, poses, normal
                 continue
             gained = cost - new[0]
-            rig, places, damping = tried_rig, tried, max(damping / 3, 1e-12)
+            rig, poses, damping = tried_rig, tried, max(damping / 3, 1e-12)
             cost, normal, gradient = new
             if gained < _SMALL_GAIN * cost and float(step @ normal @ step) < _SMALL_STEP:
-                return rig, places, normal
-        found = f"an adjustment that does not converge in {_MOST_STEPS} steps"
-        hint = tilt_hint(places) or (
+                return rig, poses, normal
+        failure = f"an adjustment that does not converge in {_MOST_STEPS} steps"
+        hint = tilt_hint(poses) or (
             "are the corners of all cameras in the order of --board, COLUMNSxROWS, and of the same pose?"
         )
-        raise InputError("boards", "", found, "poses that determine it", hint)
+        raise InputError("boards", "", failure, "poses that determine it", hint)
 
     def _normal(
-        self, rig: Rig, places: list[Transform], noise: Floats, prior: LensPrior
+        self, rig: Rig, poses: list[Transform], noise: Floats, prior: LensPrior
     ) -> tuple[float, Floats, Floats]:
         """Return weighted sum of squares, normal matrix (q, q) and gradient (q,) for the rig, then six of each pose."""
         count = len(prior.names)
-        size = count + 6 * len(places)
+        size = count + 6 * len(poses)
         normal, gradient = np.zeros((size, size)), np.zeros(size)
         weighted = prior.rows / prior.sigma[:, None]
         off = (prior.values - prior.rows @ parameter_values(rig, prior.names)) / prior.sigma
         normal[:count, :count], gradient[:count] = weighted.T @ weighted, weighted.T @ off
         cost = float(off @ off)
-        for pose in self.whitened(rig, places, noise):
-            flat = pose.jacobian.reshape(-1, count + 6)
-            white = np.einsum("nij,nj->ni", pose.whiten, pose.left).ravel()
-            normal[np.ix_(pose.indices, pose.indices)] += flat.T @ flat
-            gradient[pose.indices] += flat.T @ white
+        for block in self.whitened(rig, poses, noise):
+            flat = block.jacobian.reshape(-1, count + 6)
+            white = np.einsum("nij,nj->ni", block.whiten, block.left).ravel()
+            normal[np.ix_(block.indices, block.indices)] += flat.T @ flat
+            gradient[block.indices] += flat.T @ white
             cost += float(white @ white)
         return cost, normal, gradient
 
-    def noise(self, rig: Rig, places: list[Transform], normal: Floats) -> Floats:
+    def noise(self, rig: Rig, poses: list[Transform], normal: Floats) -> Floats:
         """Return the noise of a camera's corner and the projector's part, (poses, 2), from residuals and freedom."""
         out, optics = [], list(all_eyes(rig))
         count = sum(2 * len(optics) * len(recorded.corners) for recorded in self.boards)
         lost = count / max(count - len(normal), 1)
-        for place, recorded in zip(places, self.boards, strict=True):
-            _, by_point, left = self.residuals(rig, place, recorded)
-            camera, own = [], [np.zeros(1)]
+        for pose, recorded in zip(poses, self.boards, strict=True):
+            _, by_point, left = self.residuals(rig, pose, recorded)
+            camera, projector = [], [np.zeros(1)]
             for index, eye in enumerate(optics):
                 part = left[:, 2 * index : 2 * index + 2]
                 if eye == "projector":
-                    turned = bundle.homographies(by_point[:, 0], by_point[:, index], place)
-                    own = [part - np.einsum("nij,nj->ni", turned, left[:, :2])]
+                    turned = bundle.homographies(by_point[:, 0], by_point[:, index], pose)
+                    projector = [part - np.einsum("nij,nj->ni", turned, left[:, :2])]
                 else:
                     camera.append(part)
-            out.append([np.mean(np.concatenate(camera) ** 2), np.mean(np.concatenate(own) ** 2)])
+            out.append([np.mean(np.concatenate(camera) ** 2), np.mean(np.concatenate(projector) ** 2)])
         return np.sqrt(np.array(out) * lost)
 
     def covariance(
-        self, rig: Rig, places: list[Transform], noise: Floats, normal: Floats, own_units: bool
+        self, rig: Rig, poses: list[Transform], noise: Floats, normal: Floats, own_units: bool
     ) -> tuple[Floats, Floats]:
         """Return the covariance of the rig's parameters (p, p), and what the board's errors change of them (p, m)."""
         count, (modes, sigma) = len(parameter_names(rig)), self.board.imperfections()
         if own_units:
             sigma = np.concatenate([[0.0], sigma[1:]])  # the first is the scale
         shared = np.zeros((len(normal), len(modes)))
-        for pose in self.whitened(rig, places, noise):
-            moves = bundle.board_derivatives(pose.view.sensor_from_board, modes[:, pose.view.corners], pose.by_point)
-            moved = np.einsum("nij,njm->nim", pose.whiten, moves.reshape(len(pose.left), -1, len(modes)))
-            shared[pose.indices] += np.einsum("nip,nim->pm", pose.jacobian, moved)
+        for block in self.whitened(rig, poses, noise):
+            moves = bundle.board_derivatives(block.view.sensor_from_board, modes[:, block.view.corners], block.by_point)
+            moved = np.einsum("nij,njm->nim", block.whiten, moves.reshape(len(block.left), -1, len(modes)))
+            shared[block.indices] += np.einsum("nip,nim->pm", block.jacobian, moved)
         inverse = bundle.inverse_of(normal)
         spread = (inverse @ shared)[:count] * sigma
         return np.asarray(inverse[:count, :count] + spread @ spread.T), np.asarray(spread)
 
 
-def largest_tilt(places: Sequence[Transform]) -> float:
+def largest_tilt(poses: Sequence[Transform]) -> float:
     """Return the largest angle [deg] between normals of the board in two poses."""
-    normals = np.array([place.rotation[:, 2] for place in places])
+    normals = np.array([pose.rotation[:, 2] for pose in poses])
     return float(np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0))))
 
 
-def tilt_hint(places: Sequence[Transform]) -> str:
+def tilt_hint(poses: Sequence[Transform]) -> str:
     """Return a hint if the poses of the board are too much alike to separate focal length and distance, or ""."""
-    tilt = largest_tilt(places)
+    tilt = largest_tilt(poses)
     if tilt >= _TILTED_DEG:
         return ""
     advice = "record poses tilted by 20 to 40 deg in several directions"

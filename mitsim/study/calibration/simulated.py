@@ -71,14 +71,14 @@ def simulate_corners(
         points = view.sensor_from_board.points(true[view.corners])
         errors: list[Floats] = []
         for name, eye in eyes.items():
-            own = view.camera_px * rng.standard_normal((len(points), 2))
+            error = view.camera_px * rng.standard_normal((len(points), 2))
             if name == "projector":  # read at the position of the corner found by the camera
                 first = bundle.eye_jacobian(next(iter(eyes.values())), points)[0]
                 turned = bundle.homographies(first, bundle.eye_jacobian(eye, points)[0], view.sensor_from_board)
-                own = np.einsum("nij,nj->ni", turned, errors[0])
-                own += view.coordinate_px * rng.standard_normal(own.shape)
-            errors.append(own)
-            pixels[name].append(eye.project(points) + own)
+                error = np.einsum("nij,nj->ni", turned, errors[0])
+                error += view.coordinate_px * rng.standard_normal(error.shape)
+            errors.append(error)
+            pixels[name].append(eye.project(points) + error)
     return SimulatedCorners([board.corners[view.corners] for view in views], pixels)
 
 
@@ -109,16 +109,18 @@ def estimate(rig: Rig, eyes: Mapping[str, Camera], corners: SimulatedCorners) ->
             flags=_flags(eyes),
             criteria=_COARSE,
         )
-        place = eye.sensor_from_camera
+        sensor_from_eye = eye.sensor_from_camera
         if name != reference:
-            place = eyes[reference].sensor_from_camera @ bundle.second_eye(poses[reference], poses[name])
-        started[name] = replace(eye, matrix=matrix, distortion=distortion, sensor_from_camera=place)
-    places = [eyes[reference].sensor_from_camera @ pose for pose in poses[reference]]
+            sensor_from_eye = eyes[reference].sensor_from_camera @ bundle.second_eye(poses[reference], poses[name])
+        started[name] = replace(eye, matrix=matrix, distortion=distortion, sensor_from_camera=sensor_from_eye)
+    board_poses = [eyes[reference].sensor_from_camera @ pose for pose in poses[reference]]
     cameras = {name: started.get(name, camera) for name, camera in rig.cameras.items()}
-    return _adjusted(replace(rig, cameras=cameras, projector=started.get("projector", rig.projector)), places, corners)
+    return _adjusted(
+        replace(rig, cameras=cameras, projector=started.get("projector", rig.projector)), board_poses, corners
+    )
 
 
-def _adjusted(rig: Rig, places: list[Transform], corners: SimulatedCorners) -> tuple[Rig, list[Transform]]:
+def _adjusted(rig: Rig, poses: list[Transform], corners: SimulatedCorners) -> tuple[Rig, list[Transform]]:
     """Minimise the sum of squares of all residuals over the rig and the board's poses by Gauss-Newton."""
     names = tuple(
         n for n in parameter_names(rig, "projector" in corners.pixels) if n.rpartition(".")[0] in corners.pixels
@@ -126,22 +128,22 @@ def _adjusted(rig: Rig, places: list[Transform], corners: SimulatedCorners) -> t
     count = len(names)
     for _ in range(_MOST_STEPS):
         optics = {name: eye for name, eye in all_eyes(rig).items() if name in corners.pixels}
-        size = count + 6 * len(places)
+        size = count + 6 * len(poses)
         normal, gradient = np.zeros((size, size)), np.zeros(size)
-        for number, (place, board) in enumerate(zip(places, corners.points, strict=True)):
-            jacobian, _ = bundle.view_jacobian(optics, names, place, board)
-            at = place.points(board)
+        for number, (pose, board) in enumerate(zip(poses, corners.points, strict=True)):
+            jacobian, _ = bundle.view_jacobian(optics, names, pose, board)
+            at = pose.points(board)
             left = np.stack([corners.pixels[name][number] - eye.project(at) for name, eye in optics.items()], axis=1)
-            own = [*range(count), *range(count + 6 * number, count + 6 * number + 6)]
+            indices = [*range(count), *range(count + 6 * number, count + 6 * number + 6)]
             flat = jacobian.reshape(-1, count + 6)
-            normal[np.ix_(own, own)] += flat.T @ flat
-            gradient[own] += flat.T @ left.reshape(-1)
+            normal[np.ix_(indices, indices)] += flat.T @ flat
+            gradient[indices] += flat.T @ left.reshape(-1)
         scale = 1 / np.sqrt(np.diag(normal))
         step = scale * np.linalg.solve(normal * np.outer(scale, scale), scale * gradient)
-        rig, places = bundle.stepped(rig, places, names, step)
+        rig, poses = bundle.stepped(rig, poses, names, step)
         # change of all observations in the step: root of the sum of squares [px]
         if float(step @ normal @ step) < _SMALL_STEP_PX**2:
-            return rig, places
+            return rig, poses
     raise InputError(
         "--check", "", f"an adjustment that does not converge in {_MOST_STEPS} steps", "poses that determine it"
     )
@@ -190,6 +192,6 @@ def coverage(
     """
     names, sigma, rows = list(stated), np.array(list(stated.values())), []
     for stream in rng.spawn(count):
-        found, _ = estimate(rig, eyes, simulate_corners(eyes, board, views, stream))
-        rows.append(parameter_differences(rig, found, names) / sigma)
+        estimated_rig, _ = estimate(rig, eyes, simulate_corners(eyes, board, views, stream))
+        rows.append(parameter_differences(rig, estimated_rig, names) / sigma)
     return np.array(rows)

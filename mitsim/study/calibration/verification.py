@@ -47,7 +47,7 @@ _NEAR_PX = 6.0
 
 @dataclass(frozen=True)
 class KnownPoints:
-    """Measured points of known spacing: ``points`` (n, 3) [mm], and ``scale`` of their lengths over the known ones.
+    """Measured points of known spacing: ``points`` (n, 3) [mm], and ``scale`` of their lengths over the true ones.
 
     - ``scatter``: standard uncertainty of the scale by the scatter of the points.
     - ``board``: standard uncertainty of the known lengths, relative.
@@ -73,7 +73,7 @@ class Verification:
     - ``maker`` one sigma of a length by the maker, relative; NaN without a curve at ``distance_mm``.
     """
 
-    known: KnownPoints
+    artefact: KnownPoints
     distance_mm: float
     length_error: float
     length_uncertainty: float
@@ -108,22 +108,22 @@ class Verification:
             else ""
         )
         return (
-            f"Calibrate again: {' and '.join(words[one] for one in self.too_large)} exceeds the 95 % limits of the "
+            f"Calibrate again: {' and '.join(words[name] for name in self.too_large)} exceeds the 95 % limits of the "
             f"stated calibration.{spacing}"
         )
 
     def rows(self) -> list[str]:
         """Return the table, line by line."""
-        length, own = 1e3 * self.length_error, 1e3 * _INSIDE * self.length_uncertainty
+        length, limit = 1e3 * self.length_error, 1e3 * _INSIDE * self.length_uncertainty
         out = [
-            f"points of known spacing\t{len(self.known.points)}, up to {self.known.extent_mm:.0f} mm apart, at "
+            f"points of known spacing\t{len(self.artefact.points)}, up to {self.artefact.extent_mm:.0f} mm apart, at "
             f"{self.distance_mm:.0f} mm",
-            f"error of lengths\t{length:+.2f} per mille, 95 % limit {own:.2f} (calibration and drift "
-            f"{1e3 * _INSIDE * self.rig_uncertainty:.2f}, board {1e3 * _INSIDE * self.known.board:.2f}, scatter "
-            f"{1e3 * _INSIDE * self.known.scatter:.2f})",
+            f"error of lengths\t{length:+.2f} per mille, 95 % limit {limit:.2f} (calibration and drift "
+            f"{1e3 * _INSIDE * self.rig_uncertainty:.2f}, board {1e3 * _INSIDE * self.artefact.board:.2f}, scatter "
+            f"{1e3 * _INSIDE * self.artefact.scatter:.2f})",
         ]
         if math.isfinite(self.row_error_px):
-            scatter = float(np.std(self.known.rows_px))
+            scatter = float(np.std(self.artefact.rows_px))
             out.append(
                 f"difference of rows\t{self.row_error_px:+.3f} px, 95 % limit {_INSIDE * self.row_uncertainty_px:.3f}; "
                 f"scatter {scatter:.3f} px"
@@ -144,17 +144,17 @@ def corners_of_board(capture: Capture, board: Board, cloud: PointCloud | None) -
     pixels = {}
     for name, stack in capture.images.items():
         image = stack.astype(float).mean(axis=0)
-        found = found_corners(image, board)
-        if found is None:
+        corners = found_corners(image, board)
+        if corners is None:
             raise InputError(
                 "--board", name, "no such board in its image", f"all {len(board.corners)} corners of {board}"
             )
-        pixels[name] = found
+        pixels[name] = corners
     names = list(capture.rig.cameras)
     if len(names) > 1 and all(name in pixels for name in names[:2]):
         first, second = (capture.rig.cameras[name] for name in names[:2])
-        others = turned_alike(pixels[names[0]], pixels[names[1]])
-        points, rows = triangulated(first, pixels[names[0]], second, others)
+        second_pixels = turned_alike(pixels[names[0]], pixels[names[1]])
+        points, rows = triangulated(first, pixels[names[0]], second, second_pixels)
     elif cloud is not None and names[0] in pixels:
         points, rows = _on_plane(capture, pixels[names[0]], cloud), np.empty(0)
     else:
@@ -193,13 +193,17 @@ def dots_of_plate(capture: Capture, plate: Plate, cloud: PointCloud, printed: fl
 
 
 def verify(
-    known: KnownPoints, sensor: Sensor, rig: Rig, covariance: RigCovariance, published: PublishedLengths | None = None
+    artefact: KnownPoints,
+    sensor: Sensor,
+    rig: Rig,
+    covariance: RigCovariance,
+    published: PublishedLengths | None = None,
 ) -> Verification:
     """Compare the errors of measured points with those that the covariance of a calibration allows.
 
     Parameters
     ----------
-    known
+    artefact
         Points of known spacing in the capture.
     sensor
         Sensor of the capture: its decoder.
@@ -217,27 +221,27 @@ def verify(
     measuring = replace(sensor, rig=rig)
     covariance = parameters_of(covariance, rig)
     rng = np.random.default_rng(_SEED)
-    nominal = measured_points(measuring, known.points, rig)
+    nominal = measured_points(measuring, artefact.points, rig)
     cameras, scales, shifts = list(rig.cameras.values()), [], []
     for stream in rng.spawn(_DRAWS):
         values = covariance.draw(stream)
         true = moved(rig, covariance.names, values)
-        found = measured_points(measuring, known.points, true, path_error(covariance.names, values))
-        scales.append(_spread(found) / _spread(nominal))
-        if len(known.rows_px):
-            pixels, others = (eye.project(known.points) for eye in list(true.cameras.values())[:2])
-            shifts.append(float(np.mean(triangulated(cameras[0], pixels, cameras[1], others)[1])))
+        points = measured_points(measuring, artefact.points, true, path_error(covariance.names, values))
+        scales.append(_spread(points) / _spread(nominal))
+        if len(artefact.rows_px):
+            pixels, second_pixels = (eye.project(artefact.points) for eye in list(true.cameras.values())[:2])
+            shifts.append(float(np.mean(triangulated(cameras[0], pixels, cameras[1], second_pixels)[1])))
     rigs = float(np.sqrt(np.mean((np.array(scales) - 1) ** 2)))
-    distance = float(np.linalg.norm(known.points - rig.reference.centre, axis=1).mean())
-    rows = known.rows_px
+    distance = float(np.linalg.norm(artefact.points - rig.reference.centre, axis=1).mean())
+    rows = artefact.rows_px
     by_rows = math.nan
     if shifts:
         by_rows = math.hypot(float(np.sqrt(np.mean(np.square(shifts)))), float(np.std(rows)) / math.sqrt(len(rows)))
     return Verification(
-        known,
+        artefact,
         distance,
-        known.scale - 1,
-        math.sqrt(rigs**2 + known.board**2 + known.scatter**2),
+        artefact.scale - 1,
+        math.sqrt(rigs**2 + artefact.board**2 + artefact.scatter**2),
         rigs,
         float(np.mean(rows)) if len(rows) else math.nan,
         by_rows,
@@ -247,24 +251,24 @@ def verify(
 
 def parameters_of(covariance: RigCovariance, rig: Rig) -> RigCovariance:
     """Return the part of a covariance of which a rig has the parameters: a unit's lens may have fewer coefficients."""
-    known = parameter_names(rig, rig.projector is not None)
-    chosen = [index for index, name in enumerate(covariance.names) if name in known or name.startswith("path.")]
+    rig_names = parameter_names(rig, rig.projector is not None)
+    chosen = [index for index, name in enumerate(covariance.names) if name in rig_names or name.startswith("path.")]
     names = tuple(covariance.names[index] for index in chosen)
     return replace(covariance, names=names, covariance=covariance.covariance[np.ix_(chosen, chosen)])
 
 
-def triangulated(first: Camera, pixels: Floats, second: Camera, others: Floats) -> tuple[Floats, Floats]:
+def triangulated(first: Camera, pixels: Floats, second: Camera, second_pixels: Floats) -> tuple[Floats, Floats]:
     """Return points (n, 3) [mm] that two cameras see, on rectified rows of the first, and row errors (n,) [px].
 
     Parameters
     ----------
     first, second
         Cameras, in the sensor frame.
-    pixels, others
+    pixels, second_pixels
         (n, 2) [px] of the points in the first and in the second camera.
     """
     pair = stereo_rectification(first, second)
-    left, right = _rectified(first, pixels, pair.rotation_left), _rectified(second, others, pair.rotation_right)
+    left, right = _rectified(first, pixels, pair.rotation_left), _rectified(second, second_pixels, pair.rotation_right)
     f, columns = pair.matrix_left[0, 0], left[:, 0] * pair.matrix_left[0, 0] + pair.matrix_left[0, 2]
     depth = pair.depth(columns - right[:, 0] * f - pair.matrix_right[0, 2])
     points = first.sensor_from_camera.points((left * depth[:, None]) @ pair.rotation_left)
@@ -284,9 +288,9 @@ def _on_plane(capture: Capture, pixels: Floats, cloud: PointCloud) -> Floats:
     at = cloud.grid.project(camera.centre + 1e3 * rays)
     low = np.maximum(np.floor(np.nanmin(at, axis=0) - _NEAR_PX).astype(int), 0)
     high = np.ceil(np.nanmax(at, axis=0) + _NEAR_PX).astype(int)
-    some = cloud.points[low[1] : high[1], low[0] : high[0]].reshape(-1, 3)
+    points = cloud.points[low[1] : high[1], low[0] : high[0]].reshape(-1, 3)
     try:
-        plane = fit_plane(some, cloud.grid.origin)
+        plane = fit_plane(points, cloud.grid.origin)
     except FitError as error:
         raise InputError("--board", "", f"the cloud of the board: {error}", "points on the board") from None
     along = (plane.point - camera.centre) @ plane.normal / (rays @ plane.normal)

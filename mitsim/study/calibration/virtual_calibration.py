@@ -135,17 +135,17 @@ def board_views(sensor: Sensor, eyes: Mapping[str, Camera], board: Board, poses:
     --------
     mitsim.study.calibration.board.board_poses : the poses alone
     """
-    places = board_poses(board, eyes, sensor.working_range_mm, poses)
+    placements = board_poses(board, eyes, sensor.working_range_mm, poses)
     focal = sensor.rig.reference.matrix[0, 0]
-    distances = np.array([np.linalg.norm(place.translation - sensor.rig.reference.centre) for place, _ in places])
-    known = np.geomspace(distances.min(), distances.max(), 5)
-    camera = [corner_noise(sensor, d, board.square_mm * focal / d, seed).sigma for d in known]
+    distances = np.array([np.linalg.norm(pose.translation - sensor.rig.reference.centre) for pose, _ in placements])
+    nodes = np.geomspace(distances.min(), distances.max(), 5)
+    camera = [corner_noise(sensor, d, board.square_mm * focal / d, seed).sigma for d in nodes]
     coordinate = [
-        coordinate_noise(sensor, d, board.square_mm * focal / d, seed) if "projector" in eyes else 0.0 for d in known
+        coordinate_noise(sensor, d, board.square_mm * focal / d, seed) if "projector" in eyes else 0.0 for d in nodes
     ]
     return [
-        BoardView(place, corners, float(np.interp(d, known, camera)), float(np.interp(d, known, coordinate)))
-        for (place, corners), d in zip(places, distances, strict=True)
+        BoardView(pose, corners, float(np.interp(d, nodes, camera)), float(np.interp(d, nodes, coordinate)))
+        for (pose, corners), d in zip(placements, distances, strict=True)
     ]
 
 
@@ -161,16 +161,16 @@ def _with_path(linear: Linearised, board: Board, views: list[BoardView]) -> Floa
     modes, _ = board.imperfections()
     by_pose, by_board, distances = [], [], []
     for number, view in enumerate(views):
-        place = view.sensor_from_board
-        points = place.points(board.corners[view.corners])
+        pose = view.sensor_from_board
+        points = pose.points(board.corners[view.corners])
         rays = points / np.linalg.norm(points, axis=1, keepdims=True)
         row = np.zeros(len(inverse))
         first = count + 6 * number
-        row[first : first + 3] = np.cross(points - place.translation, rays).mean(axis=0)
+        row[first : first + 3] = np.cross(points - pose.translation, rays).mean(axis=0)
         row[first + 3 : first + 6] = rays.mean(axis=0)
         by_pose.append(row)
         # the calibration uses the nominal board at its estimated pose; the true one is also bent and scaled
-        by_board.append(-np.einsum("ni,ij,mnj->m", rays, place.rotation, modes[:, view.corners]) / len(points))
+        by_board.append(-np.einsum("ni,ij,mnj->m", rays, pose.rotation, modes[:, view.corners]) / len(points))
         distances.append(np.linalg.norm(points, axis=1).mean())
     fit = np.linalg.pinv(np.stack([np.ones(len(views)), np.array(distances)], axis=1))
     # errors of the rig are true minus nominal, those of the path reported minus true: opposite signs
@@ -201,23 +201,23 @@ def _details(board: Board, views: list[BoardView]) -> dict[str, str | float]:
     return out
 
 
-def calibration_table(found: VirtualCalibration) -> str:
+def calibration_table(calibration: VirtualCalibration) -> str:
     """Return board, noise, standard deviations and accuracy, one per line."""
-    views = found.views
+    views = calibration.views
     camera = [view.camera_px for view in views]
     lines = [
-        f"{found.sensor.name}: board of {found.board}; "
-        f"{len(views)} poses, {sum(len(each.corners) for each in views)} corners",
+        f"{calibration.sensor.name}: board of {calibration.board}; "
+        f"{len(views)} poses, {sum(len(view.corners) for view in views)} corners",
         f"noise of a corner: {min(camera):.3f} to {max(camera):.3f} px in a camera",
     ]
-    if "projector" in found.eyes:
+    if "projector" in calibration.eyes:
         lines[-1] += f", {max(view.coordinate_px for view in views):.2g} px of the projector's own"
     lines += ["", f"{'parameter':<28} {'one sigma':>10}"]
     lines += [
         f"{name:<28} {sigma:>10.3g}"
-        for name, sigma in zip(found.covariance.names, found.covariance.one_sigma, strict=True)
+        for name, sigma in zip(calibration.covariance.names, calibration.covariance.one_sigma, strict=True)
     ]
-    alone, drifted = found.accuracy.numbers(), found.accuracy_drifted.numbers()
+    alone, drifted = calibration.accuracy.numbers(), calibration.accuracy_drifted.numbers()
     rows = {
         "ball bar, SD, one sigma [mm]": "sphere_spacing_sigma_mm",
         "  relative to its length": "sphere_spacing_relative",
@@ -231,7 +231,7 @@ def calibration_table(found: VirtualCalibration) -> str:
         f"at {alone['middle_mm']:.0f} mm, over a diagonal of {alone['diagonal_mm']:.0f} mm: true points, no noise",
     ]
     lines += [f"{'':<40} {'calibration':>12} {'and drift':>12}"]
-    lines += [f"{what:<40} {alone[key]:>12.3g} {drifted[key]:>12.3g}" for what, key in rows.items()]
+    lines += [f"{label:<40} {alone[key]:>12.3g} {drifted[key]:>12.3g}" for label, key in rows.items()]
     return "\n".join(lines) + "\n"
 
 

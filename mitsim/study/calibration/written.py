@@ -25,11 +25,11 @@ def write_calibration(checked: CheckedCalibration, output: Path) -> Path:
 
 def opencv_text(rig: Rig) -> str:
     """Return a rig as OpenCV's YAML, by the names of its stereo sample; a projector by ``proj_``."""
-    (_, first), *others = rig.cameras.items()
+    (_, first), *other_cameras = rig.cameras.items()
     lines = ["%YAML:1.0", "---"]
-    if others:
+    if other_cameras:
         lines += _eye(first, "cameraMatrix1", "distCoeffs1", "image_size")
-        lines += _eye(others[0][1], "cameraMatrix2", "distCoeffs2", "image_size_2") + _pose(others[0][1])
+        lines += _eye(other_cameras[0][1], "cameraMatrix2", "distCoeffs2", "image_size_2") + _pose(other_cameras[0][1])
     else:
         lines += _eye(first, "cam_K", "cam_kc", "image_size")
     if rig.projector is not None:
@@ -40,16 +40,16 @@ def opencv_text(rig: Rig) -> str:
 
 def calibration_table(checked: CheckedCalibration) -> str:
     """Return noise, halves and the values of all parameters with their standard uncertainties, one per line."""
-    found = checked.calibration
-    names, sigma = found.covariance.names, found.covariance.one_sigma
+    calibration = checked.calibration
+    names, sigma = calibration.covariance.names, calibration.covariance.one_sigma
     lines = [
-        f"{len(found.places)} poses, tilted by up to {checked.tilt_deg:.0f} deg against one another; noise of a corner "
-        f"{found.camera_px.min():.3f} to {found.camera_px.max():.3f} px",
+        f"{len(calibration.poses)} poses, tilted by up to {checked.tilt_deg:.0f} deg against one another; noise "
+        f"of a corner {calibration.camera_px.min():.3f} to {calibration.camera_px.max():.3f} px",
         in_words(checked),
         "",
         f"{'parameter':<28} {'value':>12} {'one sigma':>10}",
     ]
-    values = parameter_values(found.rig, names)
+    values = parameter_values(calibration.rig, names)
     lines += [f"{name:<28} {value:>12.6g} {u:>10.3g}" for name, value, u in zip(names, values, sigma, strict=True)]
     return "\n".join(lines) + "\n"
 

@@ -65,8 +65,8 @@ def read_candidates(
     path = Path(path)
     file = read_toml(path, StudyFile)
     candidates, excluded = list[CandidateSensor](), list[Excluded]()
-    for given in _each(sensors):
-        opened = open_candidate(path, file, given, ask)
+    for text in _sensor_texts(sensors):
+        opened = open_candidate(path, file, text, ask)
         if isinstance(opened, Excluded):
             excluded.append(opened)
             continue
@@ -75,44 +75,44 @@ def read_candidates(
         candidates.append(opened)
     if not candidates:
         raise InputError(
-            "--sensors", "", "; ".join(one.reason for one in excluded), "at least one sensor that can measure the study"
+            "--sensors", "", "; ".join(row.reason for row in excluded), "at least one sensor that can measure the study"
         )
     return candidates, excluded
 
 
-def _each(sensors: Sequence[str]) -> list[str]:
+def _sensor_texts(sensors: Sequence[str]) -> list[str]:
     out = list[str]()
-    for given in (part.strip() for sensor in sensors for part in sensor.split(",")):
-        out += presets() if given == ALL_PRESETS else [given] if given else []
+    for text in (part.strip() for sensor in sensors for part in sensor.split(",")):
+        out += presets() if text == ALL_PRESETS else [text] if text else []
     if not out:
         raise InputError("--sensors", "", "nothing", f"{ALL_PRESETS}, or a list of {', '.join(presets())} and files")
-    if twice := next((one for one in out if out.count(one) > 1), None):
+    if twice := next((sensor for sensor in out if out.count(sensor) > 1), None):
         raise InputError("--sensors", "", f"{twice} twice", "each sensor once")
     return out
 
 
-def open_candidate(path: Path, file: StudyFile, given: str, ask: Ask | None) -> CandidateSensor | Excluded:
+def open_candidate(path: Path, file: StudyFile, text: str, ask: Ask | None) -> CandidateSensor | Excluded:
     """Open a study for one sensor; say why if that is impossible.
 
     Parameters
     ----------
     path, file
         Path of the study file, and its content.
-    given
+    text
         The sensor, as in :func:`read_candidates`.
     ask
         Answers whether finishes that its map lacks may be characterised now; None if nobody can answer.
     """
-    sensor, _, map_name = given.partition("=")
-    own = sensor.endswith(".toml")
-    if not own and sensor not in presets():
+    sensor, _, map_name = text.partition("=")
+    is_file = sensor.endswith(".toml")
+    if not is_file and sensor not in presets():
         raise InputError("--sensors", "", sensor, f"{', '.join(presets())}, or a sensor TOML")
-    mapped = own or map_name or sensor in shipped_maps()
+    mapped = is_file or map_name or sensor in shipped_maps()
     if not mapped and (sensor != file.sensor or file.characterisation == CharacterisationTable()):
-        return Excluded(sensor, given, f"no performance map of it comes with mitsim: make one, and give {sensor}=MAP")
+        return Excluded(sensor, text, f"no performance map of it comes with mitsim: make one, and give {sensor}=MAP")
     tables = [file]
     if sensor != file.sensor or map_name:
-        name = str(Path(sensor).resolve()) if own else sensor
+        name = str(Path(sensor).resolve()) if is_file else sensor
         changed = file.model_copy(update={"sensor": name, "characterisation": CharacterisationTable()})
         free = file.views.model_copy(update={"standoff_mm": None, "standoffs_mm": None})
         tables = [changed] if free == file.views else [changed, changed.model_copy(update={"views": free})]
@@ -126,8 +126,8 @@ def open_candidate(path: Path, file: StudyFile, given: str, ask: Ask | None) -> 
                 raise  # an error in the task concerns every sensor
             errors.append(error)
     if study is None:
-        return Excluded(Path(sensor).stem, given, str(errors[0]))
+        return Excluded(Path(sensor).stem, text, str(errors[0]))
     if study.performance_map is None:
         reason = "its study has a campaign instead of a map: run it, and give its map as SENSOR=MAP"
-        return Excluded(study.sensor.name, given, reason)
-    return CandidateSensor(study.sensor.name, given, replace(study, path=path))
+        return Excluded(study.sensor.name, text, reason)
+    return CandidateSensor(study.sensor.name, text, replace(study, path=path))

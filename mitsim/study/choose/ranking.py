@@ -44,11 +44,11 @@ def rank_key(demands: Iterable[float], impossible: int | None = None) -> RankKey
         Number of impossible measurements, if others than those compared count too; by default that of ``demands``.
     """
     every = list(demands)
-    possible = sorted((one for one in every if math.isfinite(one)), reverse=True)
+    possible = sorted((demand for demand in every if math.isfinite(demand)), reverse=True)
     return len(every) - len(possible) if impossible is None else impossible, tuple(possible)
 
 
-def rank_keys(demands: ArrayLike, has_tolerance: ArrayLike, known: ArrayLike) -> list[RankKey]:
+def rank_keys(demands: ArrayLike, has_tolerance: ArrayLike, references: ArrayLike) -> list[RankKey]:
     """Return the key of every sensor.
 
     Parameters
@@ -59,22 +59,22 @@ def rank_keys(demands: ArrayLike, has_tolerance: ArrayLike, known: ArrayLike) ->
     has_tolerance
         Whether a measurement (measurement,) has a tolerance. If one has, only those with a tolerance are compared: the
         others have no limit. Impossible ones count with and without tolerance.
-    known
+    references
         Sensors (sensor,) whose least demand is 1 if there are no tolerances.
     """
     table, compared = np.asarray(demands, float), np.asarray(has_tolerance, bool)
     impossible = (~np.isfinite(table)).sum(axis=1)
-    table = table[:, compared] if compared.any() else relative_to_least(table, known)
+    table = table[:, compared] if compared.any() else relative_to_least(table, references)
     return [rank_key(row, int(count)) for row, count in zip(table.tolist(), impossible, strict=True)]
 
 
-def relative_to_least(demands: ArrayLike, known: ArrayLike) -> Floats:
-    """Return demands (sensor, measurement) as multiples of the least of the ``known`` sensors (sensor,).
+def relative_to_least(demands: ArrayLike, references: ArrayLike) -> Floats:
+    """Return demands (sensor, measurement) as multiples of the least of the ``references``, a mask (sensor,).
 
-    If no known sensor can make a measurement, the least of all sensors counts. Impossible ones stay infinite.
+    If no reference can make a measurement, the least of all sensors counts. Impossible ones stay infinite.
     """
     table = np.where(np.isfinite(np.asarray(demands, float)), demands, np.inf)
-    chosen = np.asarray(known, bool)
+    chosen = np.asarray(references, bool)
     least = np.min(table, axis=0, initial=np.inf, where=chosen[:, None])
     least = np.where(np.isfinite(least), least, np.min(table, axis=0, initial=np.inf))
     return np.where(np.isfinite(table), table / np.where(np.isfinite(least), least, 1.0), np.inf)

@@ -93,16 +93,16 @@ def race_and_state(result: SensorResult, count: int, limit: TimeLimit) -> None:
     if view is None:  # no view can measure
         return
     _state(result, view, count, limit)
-    known = [number for number in dict.fromkeys((before, view)) if number in result.stated]
-    if not known:  # time was over
+    stated_views = [number for number in dict.fromkeys((before, view)) if number in result.stated]
+    if not stated_views:  # time was over
         return
-    view = _better(result, known)
-    own = _own_views(result, view)
-    for number in own:
+    view = _better(result, stated_views)
+    extra_views = _own_views(result, view)
+    for number in extra_views:
         if limit.over():
             break
         _state(result, number, count, limit)
-    result.stated = {number: result.stated[number] for number in (view, *own) if number in result.stated}
+    result.stated = {number: result.stated[number] for number in (view, *extra_views) if number in result.stated}
     _finish(result, view)
 
 
@@ -123,10 +123,10 @@ def refine_leader(leader: SensorResult, limit: TimeLimit) -> None:
     _finish(leader, next(iter(leader.stated)))
 
 
-def able_to_win(found: Sequence[SensorResult], rivals: Sequence[SensorResult]) -> list[SensorResult]:
+def able_to_win(results: Sequence[SensorResult], rivals: Sequence[SensorResult]) -> list[SensorResult]:
     """Return the rivals that more trials or a race may show to be the best.
 
-    At least one of the sensors found is measured. A raced sensor that lacks more measurements than the best cannot win.
+    At least one of ``results`` is measured. A raced sensor that lacks more measurements than the best cannot win.
     Another one can if its worst demand may be as small as that of the best may be large: of n trials the demand has a
     relative standard error of about sqrt((k - 1) / (4 n)), as a standard deviation has, with the usual kurtosis k of
     errors. Raced sensors that have all of their trials get no more.
@@ -134,7 +134,7 @@ def able_to_win(found: Sequence[SensorResult], rivals: Sequence[SensorResult]) -
     A sensor that was not raced may have a better view. It can win if it lacks a measurement, or with a demand that is
     larger by the factor that a race is expected to gain.
     """
-    stated = [result for result in ordered(found) if result.stated]
+    stated = [result for result in ordered(results) if result.stated]
     keys = rank_keys([result.demands() for result in stated], stated[0].has_tolerance, [True] * len(stated))
     first = keys[0]
     highest = max(first[1], default=math.inf) * math.exp(_STANDARD_ERRORS * _relative_error(stated[0]))
@@ -187,7 +187,7 @@ def _finish(result: SensorResult, view: int) -> None:
 
 def _better(result: SensorResult, views: Sequence[int]) -> int:
     """Return the stated view that makes more measurements, or else has the less demanding ones."""
-    demands = [[stated_demand(each) for each in result.stated[view].statements] for view in views]
+    demands = [[stated_demand(statement) for statement in result.stated[view].statements] for view in views]
     keys = rank_keys(demands, result.has_tolerance, [True] * len(views))
     return views[min(range(len(views)), key=keys.__getitem__)]
 
@@ -196,11 +196,11 @@ def _own_views(result: SensorResult, view: int) -> list[int]:
     """Return best views of measurements that do not fit, or have no value, from the common view and may elsewhere."""
     assert result.raced is not None
     out = list[int]()
-    place = int(np.flatnonzero(result.raced.views == view)[0])
-    for name, known in zip(result.session.study.task.measurements, result.stated[view].statements, strict=True):
+    index = int(np.flatnonzero(result.raced.views == view)[0])
+    for name, statement in zip(result.session.study.task.measurements, result.stated[view].statements, strict=True):
         standing = result.raced.standings[name]
-        better = standing.risk[standing.leader] < _WORTH_STATING * standing.risk[place]
-        lost = not math.isfinite(stated_demand(known)) and standing.leader != place
-        if lost or (known.verdict not in ("fits", "no tolerance") and better):
+        better = standing.risk[standing.leader] < _WORTH_STATING * standing.risk[index]
+        lost = not math.isfinite(stated_demand(statement)) and standing.leader != index
+        if lost or (statement.verdict not in ("fits", "no tolerance") and better):
             out.append(result.raced.leader(name))
     return [number for number in dict.fromkeys(out) if number != view]

@@ -75,46 +75,48 @@ def choose_sensor(
     workers
         Processes or cluster that make the trials; by default this process makes them.
     """
-    found = list[SensorResult]()
+    results = list[SensorResult]()
     screening = limit.part(_SCREENING_SHARE)
     equal = screening.left / len(candidates)
     for number, candidate in enumerate(candidates, 1):
         share = screening.part(1 / (len(candidates) - number + 1))
-        found.append(screen_sensor(candidate, Session(candidate.study, folder / candidate.name, workers), share, equal))
-        _say(found, f"{number} of {len(candidates)} screened", limit)
-    report_results(ordered(found), False)
-    _measure_in_rounds(found, limit, report_results)
-    leader = ordered(found)[0]
+        results.append(
+            screen_sensor(candidate, Session(candidate.study, folder / candidate.name, workers), share, equal)
+        )
+        _say(results, f"{number} of {len(candidates)} screened", limit)
+    report_results(ordered(results), False)
+    _measure_in_rounds(results, limit, report_results)
+    leader = ordered(results)[0]
     if leader.stated and not limit.over():
         refine_leader(leader, limit.part(1.0, _reserve(limit)))
-    _complete(ordered(found)[0])
-    report_results(ordered(found), True)
-    return ordered(found)
+    _complete(ordered(results)[0])
+    report_results(ordered(results), True)
+    return ordered(results)
 
 
 def _measure_in_rounds(
-    found: list[SensorResult], limit: TimeLimit, report_results: Callable[[list[SensorResult], bool], None]
+    results: list[SensorResult], limit: TimeLimit, report_results: Callable[[list[SensorResult], bool], None]
 ) -> None:
     """Measure the promising sensors in rounds, until one is left or time is over."""
-    rivals, count = _promising(found), FEW_TRIALS
+    rivals, count = _promising(results), FEW_TRIALS
     raced = len(rivals) == 1
     for turn in range(_ROUNDS):
         work = limit.part(_ROUND_SHARE if len(rivals) > 1 else 1.0, _reserve(limit))
-        for place, rival in enumerate(rivals):
-            if limit.over() and (place or turn):
-                unmeasured = sum(not each.stated for each in rivals)
+        for index, rival in enumerate(rivals):
+            if limit.over() and (index or turn):
+                unmeasured = sum(not result.stated for result in rivals)
                 if unmeasured:
                     say(f"choose: time is over; {unmeasured} sensors are judged by screening alone")
                 break
-            share = work.part(1 / (len(rivals) - place))
+            share = work.part(1 / (len(rivals) - index))
             if raced:
                 race_and_state(rival, count, share)
             else:
                 state_by_screening(rival, count, share, limit)
-            _say(found, f"round {turn + 1}: {place + 1} of {len(rivals)} sensors measured", limit)
-            report_results(ordered(found), False)
-        if any(result.stated for result in found):
-            rivals, count, raced = able_to_win(found, rivals), GROWTH * count, True
+            _say(results, f"round {turn + 1}: {index + 1} of {len(rivals)} sensors measured", limit)
+            report_results(ordered(results), False)
+        if any(result.stated for result in results):
+            rivals, count, raced = able_to_win(results, rivals), GROWTH * count, True
         else:  # every share was too short for a statement: the first rival, best by screening, gets what is left
             rivals = rivals[:1]
         if limit.over() or not rivals or (len(rivals) == 1 and rivals[0].raced is not None):
@@ -131,24 +133,24 @@ def _complete(winner: SensorResult) -> None:
     if not winner.stated:
         return
     session = winner.session
-    own = zip(session.study.task.measurements, winner.best(), strict=True)
-    leaders = {ALL: next(iter(winner.stated))} | {name: row[0] for name, row in own if row is not None}
+    best_rows = zip(session.study.task.measurements, winner.best(), strict=True)
+    leaders = {ALL: next(iter(winner.stated))} | {name: row[0] for name, row in best_rows if row is not None}
     complete_winner(session, winner.scores, race_as_stated(winner), leaders)
     session.release()
 
 
-def _promising(found: list[SensorResult]) -> list[SensorResult]:
+def _promising(results: list[SensorResult]) -> list[SensorResult]:
     """Return the sensors worth a virtual measurement, best first: at least one if any sensor can measure at all."""
-    keys = rank_keys([result.screened for result in found], found[0].has_tolerance, [True] * len(found))
-    for result, reason in zip(found, unpromising(keys, any(found[0].has_tolerance)), strict=True):
+    keys = rank_keys([result.screened for result in results], results[0].has_tolerance, [True] * len(results))
+    for result, reason in zip(results, unpromising(keys, any(results[0].has_tolerance)), strict=True):
         result.unpromising = reason
-    order = sorted(range(len(found)), key=keys.__getitem__)
-    return [found[i] for i in order if not found[i].unpromising]
+    order = sorted(range(len(results)), key=keys.__getitem__)
+    return [results[i] for i in order if not results[i].unpromising]
 
 
-def _say(found: list[SensorResult], done: str, limit: TimeLimit) -> None:
+def _say(results: list[SensorResult], done: str, limit: TimeLimit) -> None:
     """Print the progress and the leading sensor."""
-    first = ordered(found)[0]
+    first = ordered(results)[0]
     names = list(first.candidate.study.task.measurements)
     rows = first.demands()
     by = "measured" if first.stated else "by the screening"

@@ -44,7 +44,7 @@ class SensorResult:
         """Return the largest demand of the possible measurements that have a limit; NaN if there is none."""
         limited = self.has_tolerance
         compared = limited if any(limited) else [True] * len(limited)
-        demands = [one for one, kept in zip(self.demands(), compared, strict=True) if kept and math.isfinite(one)]
+        demands = [value for value, kept in zip(self.demands(), compared, strict=True) if kept and math.isfinite(value)]
         return max(demands, default=math.nan)
 
     @property
@@ -80,10 +80,10 @@ def stated_demand(statement: Statement) -> float:
     return value if math.isfinite(value) else math.inf
 
 
-def ordered(found: Sequence[SensorResult]) -> list[SensorResult]:
+def ordered(results: Sequence[SensorResult]) -> list[SensorResult]:
     """Return measured sensors before screened ones, each by their impossible and then their worst measurements."""
-    stated = [bool(result.stated) for result in found]
-    known = stated if any(stated) else [True] * len(found)
-    keys = rank_keys([result.demands() for result in found], found[0].has_tolerance, known)
-    order = sorted(range(len(found)), key=lambda i: (not stated[i], keys[i]))
-    return [found[i] for i in order]
+    stated = [bool(result.stated) for result in results]
+    references = stated if any(stated) else [True] * len(results)
+    keys = rank_keys([result.demands() for result in results], results[0].has_tolerance, references)
+    order = sorted(range(len(results)), key=lambda i: (not stated[i], keys[i]))
+    return [results[i] for i in order]

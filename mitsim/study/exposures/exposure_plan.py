@@ -77,7 +77,7 @@ class ExposurePlan:
 
     - ``exposure``: the planned exposures and power.
     - ``added``: exposure [s], and the result of it with all before it, the most useful first; with new noise.
-    - ``own``: result of the sensor's own exposure rule, with the same noise.
+    - ``default``: result of the sensor's own exposure rule, with the same noise.
     - ``limits``: most points and smallest u of every feature that can be measured.
     - ``reached``: whether the plan reached all limits when it was chosen.
     - ``unseen``: features with too few points at every exposure.
@@ -88,7 +88,7 @@ class ExposurePlan:
     view: int
     exposure: PlannedExposure
     added: tuple[tuple[float, ExposureResult], ...]
-    own: ExposureResult
+    default: ExposureResult
     limits: dict[str, FeatureResult]
     reached: bool
     unseen: tuple[str, ...]
@@ -97,7 +97,7 @@ class ExposurePlan:
 
 
 class _Results:
-    """Results with one noise, each computed once: call it with a set of exposures. ``known`` has all of them.
+    """Results with one noise, each computed once: call it with a set of exposures. ``results`` has all of them.
 
     The first is computed even if time is over; after it, a call for a new one raises
     :class:`~mitsim.running.time_limit.OutOfTimeError`.
@@ -110,19 +110,19 @@ class _Results:
         over: Callable[[], bool],
     ) -> None:
         self.evaluate, self.noise, self.over = evaluate, noise, over
-        self.known = dict[PlannedExposure, ExposureResult]()
+        self.results = dict[PlannedExposure, ExposureResult]()
 
     def __call__(self, exposure: PlannedExposure) -> ExposureResult:
-        if exposure not in self.known:
-            if self.known and self.over():
+        if exposure not in self.results:
+            if self.results and self.over():
                 raise OutOfTimeError
-            self.known[exposure] = self.evaluate(exposure, self.noise, DRAWS[self.noise])
-        return self.known[exposure]
+            self.results[exposure] = self.evaluate(exposure, self.noise, DRAWS[self.noise])
+        return self.results[exposure]
 
 
 def plan_exposures(
     evaluate: Callable[[PlannedExposure, int, int], ExposureResult],
-    own: PlannedExposure,
+    default: PlannedExposure,
     limits_s: tuple[float, float],
     rules: PlanRules,
     dimmable: bool = True,
@@ -135,7 +135,7 @@ def plan_exposures(
     ----------
     evaluate
         Function of a set of exposures, the number of the noise and the number of its samples, which returns the result.
-    own
+    default
         The sensor's own exposures, from which the search starts.
     limits_s
         Shortest and longest exposure of the device [s].
@@ -150,37 +150,37 @@ def plan_exposures(
     """
     search, decision, report = (_Results(evaluate, noise, over) for noise in (SEARCH, DECISION, REPORT))
     try:
-        singles = _sweep(search, own, limits_s, dimmable)
+        singles = _sweep(search, default, limits_s, dimmable)
         names = list(singles[0].features)
         full_power = [single for single in singles if single.exposure.power == 1.0]
         # with half of the exposures, the greedy search finds other sets
-        sets = [_greedy_sets(search, start, names, rules.most) for start in (full_power, full_power[::2])]
-        first_limits = _measurable(_limits(list(search.known.values()), names))
-        for exposure in {own, *(result.exposure for result in _nearest(singles, first_limits)), *sets[0], *sets[1]}:
+        sets = [_greedy_sets(search, subset, names, rules.most) for subset in (full_power, full_power[::2])]
+        first_limits = _measurable(_limits(list(search.results.values()), names))
+        for exposure in {default, *(result.exposure for result in _nearest(singles, first_limits)), *sets[0], *sets[1]}:
             decision(exposure)
-        limits = _measurable(_limits(list(decision.known.values()), names))
+        limits = _measurable(_limits(list(decision.results.values()), names))
         chosen, reached = (
-            _fewest_exposures(search, decision, full_power, limits, rules) if limits else (decision(own), False)
+            _fewest_exposures(search, decision, full_power, limits, rules) if limits else (decision(default), False)
         )
         added = []
         for prefix in _by_usefulness(decision, chosen.exposure, limits or _limits([chosen], names)):
             added.append((prefix[-1], report(PlannedExposure(tuple(sorted(prefix)), chosen.exposure.power))))
         unseen = tuple(name for name in names if name not in limits)
-        tried = len(search.known | decision.known)
-        return ExposurePlan(view, chosen.exposure, tuple(added), report(own), limits, reached, unseen, tried)
+        tried = len(search.results | decision.results)
+        return ExposurePlan(view, chosen.exposure, tuple(added), report(default), limits, reached, unseen, tried)
     except OutOfTimeError:
-        return _best_single(search, search.known.get(own) or evaluate(own, SEARCH, DRAWS[SEARCH]), view)
+        return _best_single(search, search.results.get(default) or evaluate(default, SEARCH, DRAWS[SEARCH]), view)
 
 
-def _best_single(search: _Results, own: ExposureResult, view: int) -> ExposurePlan:
+def _best_single(search: _Results, default: ExposureResult, view: int) -> ExposurePlan:
     """Return the single exposure that comes closest to the limits of those tried, as a plan that is not finished."""
-    singles = [result for exposure, result in search.known.items() if len(exposure.exposures_s) == 1]
-    names = list(own.features)
+    singles = [result for exposure, result in search.results.items() if len(exposure.exposures_s) == 1]
+    names = list(default.features)
     limits = _measurable(_limits(singles, names))
     best = min(singles, key=lambda result: (shortfall(result, limits), result.exposure.seconds))
     added = ((best.exposure.exposures_s[0], best),)
     unseen = tuple(name for name in names if name not in limits)
-    return ExposurePlan(view, best.exposure, added, own, limits, False, unseen, len(search.known), False)
+    return ExposurePlan(view, best.exposure, added, default, limits, False, unseen, len(search.results), False)
 
 
 def shortfall(result: ExposureResult, limits: dict[str, FeatureResult]) -> float:
@@ -191,29 +191,29 @@ def shortfall(result: ExposureResult, limits: dict[str, FeatureResult]) -> float
     """
     worst = 0.0
     for name, limit in limits.items():
-        known = result.features[name]
-        missing_points = limit.points / known.points - 1 if known.points > 0 else math.inf
-        allowance = 2 * math.hypot(known.error, limit.error)
-        worst = max(worst, missing_points, known.u / limit.u / (1 + allowance) - 1)
+        feature = result.features[name]
+        missing_points = limit.points / feature.points - 1 if feature.points > 0 else math.inf
+        allowance = 2 * math.hypot(feature.error, limit.error)
+        worst = max(worst, missing_points, feature.u / limit.u / (1 + allowance) - 1)
     return worst
 
 
 def _sweep(
-    search: _Results, own: PlannedExposure, limits_s: tuple[float, float], dimmable: bool
+    search: _Results, default: PlannedExposure, limits_s: tuple[float, float], dimmable: bool
 ) -> list[ExposureResult]:
     """Return the results of single exposures around the sensor's own, shortest first."""
-    several = len(own.exposures_s) > 1
-    middle = math.exp(np.mean(np.log(own.exposures_s))) if several else own.exposures_s[0]
+    several = len(default.exposures_s) > 1
+    middle = math.exp(np.mean(np.log(default.exposures_s))) if several else default.exposures_s[0]
     shortest, longest = limits_s
     best: dict[str, float] = {}
-    found = [search(PlannedExposure((middle,)))]
+    results = [search(PlannedExposure((middle,)))]
 
     def is_useful(result: ExposureResult) -> bool:
-        for name, known in result.features.items():
-            best[name] = max(best.get(name, 0.0), known.points if math.isfinite(known.u) else 0.0)
-        return any(known.points > STOP_SHARE * best[name] > 0 for name, known in result.features.items())
+        for name, feature in result.features.items():
+            best[name] = max(best.get(name, 0.0), feature.points if math.isfinite(feature.u) else 0.0)
+        return any(feature.points > STOP_SHARE * best[name] > 0 for name, feature in result.features.items())
 
-    is_useful(found[0])
+    is_useful(results[0])
     steps = math.floor(math.log(LARGEST_RATIO) / math.log(STEP))
     for direction in (1, -1):
         useless_steps = 0
@@ -221,15 +221,15 @@ def _sweep(
             exposure = _feasible_exposure(middle * STEP ** (direction * k), shortest, longest, dimmable)
             if exposure is None:
                 break
-            one = search(exposure)
-            found.append(one)
-            useless_steps = 0 if is_useful(one) else useless_steps + 1
+            result = search(exposure)
+            results.append(result)
+            useless_steps = 0 if is_useful(result) else useless_steps + 1
             if useless_steps >= STOP_STEPS and all(best.values()):
                 break
             if exposure.exposures_s[0] >= longest:
                 break
-    unique = {result.exposure: result for result in found}
-    return sorted(unique.values(), key=lambda one: one.exposure.seconds * one.exposure.power)
+    unique = {result.exposure: result for result in results}
+    return sorted(unique.values(), key=lambda result: result.exposure.seconds * result.exposure.power)
 
 
 def _feasible_exposure(seconds: float, shortest: float, longest: float, dimmable: bool) -> PlannedExposure | None:
@@ -308,14 +308,14 @@ def _fewest_exposures(
                 decision(result.exposure)
         sufficient = [
             result
-            for result in decision.known.values()
+            for result in decision.results.values()
             if len(result.exposure.exposures_s) == size and shortfall(result, limits) <= rules.within
         ]
         if sufficient:
-            return min(sufficient, key=lambda one: one.exposure.seconds), True
-    least = min(shortfall(result, limits) for result in decision.known.values())
-    near = [result for result in decision.known.values() if shortfall(result, limits) <= least + rules.within]
-    return min(near, key=lambda one: (len(one.exposure.exposures_s), one.exposure.seconds)), False
+            return min(sufficient, key=lambda result: result.exposure.seconds), True
+    least = min(shortfall(result, limits) for result in decision.results.values())
+    near = [result for result in decision.results.values() if shortfall(result, limits) <= least + rules.within]
+    return min(near, key=lambda result: (len(result.exposure.exposures_s), result.exposure.seconds)), False
 
 
 def _candidate_sets(
@@ -326,10 +326,10 @@ def _candidate_sets(
     for results in combinations(full_power, size):
         share = min(float(_union(results, name).sum()) / limit.points for name, limit in limits.items())
         sets.append((share, sum(result.exposure.seconds for result in results), _merged_set(results)))
-    sufficient = sorted((one for one in sets if one[0] >= 1 / (1 + within)), key=lambda one: one[1])
+    sufficient = sorted((row for row in sets if row[0] >= 1 / (1 + within)), key=lambda row: row[1])
     if len(sufficient) < TRIED:  # too few sets are predicted to: add those that come closest
-        sufficient += sorted((one for one in sets if one[0] < 1 / (1 + within)), key=lambda one: -one[0])
-    return [one[2] for one in sufficient[:TRIED]]
+        sufficient += sorted((row for row in sets if row[0] < 1 / (1 + within)), key=lambda row: -row[0])
+    return [row[2] for row in sufficient[:TRIED]]
 
 
 def _by_usefulness(

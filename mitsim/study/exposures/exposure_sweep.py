@@ -115,8 +115,8 @@ class ExposureSweep:
             capture = self.renderer.exposed(self.lit, exposure, seed, keep=True)
             cloud = self.renderer.unlabelled_cloud(capture)
             for name, possible in self.possible.items():
-                one, mask = feature_result(cloud, possible.pixel, possible.derivatives, possible.surface)
-                results[name].append(one)
+                result, mask = feature_result(cloud, possible.pixel, possible.derivatives, possible.surface)
+                results[name].append(result)
                 recovered[name] = mask
         return ExposureResult(exposure, {name: _mean_result(samples) for name, samples in results.items()}, recovered)
 

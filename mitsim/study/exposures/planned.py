@@ -102,12 +102,12 @@ def plan_view(
     policy = sensor.exposure
     if policy.limits_s == _NO_LIMITS:
         say(f"{sensor.name} states no exposure limits: any exposure is allowed")
-    own = PlannedExposure(policy.exposures(None, float(sensor.imager.full_well)))
+    default = PlannedExposure(policy.exposures(None, float(sensor.imager.full_well)))
     sweep, limit = ExposureSweep(renderer, view), limit or TimeLimit()
     if not sensor.merges_exposures:
         say(f"{sensor.name} cannot merge exposures: the plan has one exposure")
         rules = PlanRules(1, rules.within)
-    return plan_exposures(sweep.evaluate, own, policy.limits_s, rules, sweep.dimmable, view.number, limit.over)
+    return plan_exposures(sweep.evaluate, default, policy.limits_s, rules, sweep.dimmable, view.number, limit.over)
 
 
 def rendered(measurements: RenderedMeasurements | MappedMeasurements) -> RenderedMeasurements:
@@ -137,16 +137,16 @@ def stated_exposures(study: Study, exposures_s: Sequence[float], power: float) -
     InputError
         If the sensor cannot take or merge them.
     """
-    given = PlannedExposure(tuple(sorted(exposures_s)), power)
+    planned = PlannedExposure(tuple(sorted(exposures_s)), power)
     (shortest, longest), sensor = study.sensor.exposure.limits_s, study.sensor.name
-    for seconds in given.exposures_s:
+    for seconds in planned.exposures_s:
         if not shortest <= seconds <= longest:
             allowed, hint = f"{shortest:g} to {longest:g} s", f"these are the limits of {sensor}"
             raise InputError(study.path, "exposure.exposures_s", f"{seconds:g} s", allowed, hint)
-    if len(given.exposures_s) > 1 and not study.sensor.merges_exposures:
-        several, hint = f"{len(given.exposures_s)} exposures", f"{sensor} cannot merge exposures"
+    if len(planned.exposures_s) > 1 and not study.sensor.merges_exposures:
+        several, hint = f"{len(planned.exposures_s)} exposures", f"{sensor} cannot merge exposures"
         raise InputError(study.path, "exposure.exposures_s", several, "one", hint)
-    return given
+    return planned
 
 
 def with_exposure(digest: str, planned: PlannedExposure | None, more: Any = None) -> str:
@@ -173,7 +173,7 @@ def plan_document(study: Study, plan: ExposurePlan) -> dict[str, Any]:
             name: {"points": limit.points, "fraction": limit.fraction, "u_mm": _number(limit.u)}
             for name, limit in plan.limits.items()
         },
-        "own": _result_values(plan.own),
+        "own": _result_values(plan.default),
         "added": [{"exposure_s": seconds} | _result_values(result) for seconds, result in plan.added],
     }
 
@@ -198,9 +198,9 @@ def _number(value: float) -> float | None:
 
 def plan_table(plan: ExposurePlan) -> str:
     """Return a plan as a table of text: the exposures to set, and the result that each adds."""
-    names = list(plan.own.features)
-    own = ", ".join(f"{1e3 * seconds:.3g}" for seconds in plan.own.exposure.exposures_s)
-    steps = [("sensor's own", own, plan.own.exposure.power, plan.own.features)]
+    names = list(plan.default.features)
+    times = ", ".join(f"{1e3 * seconds:.3g}" for seconds in plan.default.exposure.exposures_s)
+    steps = [("sensor's own", times, plan.default.exposure.power, plan.default.features)]
     for k, (seconds, result) in enumerate(plan.added, 1):
         step_name = "1" if k == 1 else f"and {k}, merged"
         steps.append((step_name, f"{1e3 * seconds:.3g}", plan.exposure.power, result.features))
@@ -217,7 +217,7 @@ def write_plan_csv(path: Path, plan: ExposurePlan) -> None:
     """Write a plan as a CSV file, with one row for each feature of each step."""
     lines, power = ["step,exposure_ms,power,feature,points,fraction,u_mm"], plan.exposure.power
     steps = [
-        ("own", ";".join(f"{1e3 * exposure_s:.4g}" for exposure_s in plan.own.exposure.exposures_s), plan.own, 1.0)
+        ("own", ";".join(f"{1e3 * seconds:.4g}" for seconds in plan.default.exposure.exposures_s), plan.default, 1.0)
     ]
     steps += [(str(k), f"{1e3 * seconds:.4g}", result, power) for k, (seconds, result) in enumerate(plan.added, 1)]
     for step, exposure, result, power in steps:

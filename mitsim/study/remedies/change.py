@@ -163,7 +163,9 @@ def same_direction(study: Study, view: View) -> View:
     InputError
         If the study has none.
     """
-    for one in study.views:
-        if float(one.direction @ view.direction) > 1 - 1e-9 and math.isclose(one.roll_deg, view.roll_deg, abs_tol=1e-6):
-            return one
+    for candidate in study.views:
+        if float(candidate.direction @ view.direction) > 1 - 1e-9 and math.isclose(
+            candidate.roll_deg, view.roll_deg, abs_tol=1e-6
+        ):
+            return candidate
     raise InputError(study.path, "views", f"no view in the direction of view {view.number}", "a view there")

@@ -89,7 +89,10 @@ def _of_study(
     """Return a change of the unknowns or of the exposure, with the same part and views."""
     study, number = now.study, now.stated.view.number
     changed = ChangedStudy(
-        now, name or kind, lambda: replace(study, file=changed_file(study.file, keys)), lambda one: one.view(number)
+        now,
+        name or kind,
+        lambda: replace(study, file=changed_file(study.file, keys)),
+        lambda opened: opened.view(number),
     )
     return Change(kind, words, keys, (number,), expected, changed.state, release=changed.release)
 
@@ -130,7 +133,7 @@ def _bias(now: Shortfall) -> Iterator[Change]:
 
 def _views(now: Shortfall) -> Iterator[Change]:
     """Yield best other views of single measurements, by the race or by the map, those of most measurements first."""
-    stated, found = now.stated.view.number, dict[int, dict[str, float]]()
+    stated, by_view = now.stated.view.number, dict[int, dict[str, float]]()
     risk = screening_risk(now.scores)
     numbers = now.scores["view"].values.tolist()
     names = [str(name) for name in now.scores["measurement"].values]
@@ -149,8 +152,8 @@ def _views(now: Shortfall) -> Iterator[Change]:
         for number, ratio in ratios.items():
             u = ratio * statement.standard_uncertainty / SCREENING_FACTOR
             if number != stated and ratio < 1 and can_fit(statement, u, unbiased=True):
-                found.setdefault(number, {})[name] = u
-    for number, expected in sorted(found.items(), key=lambda row: -len(row[1]))[:_MOST_OTHER_VIEWS]:
+                by_view.setdefault(number, {})[name] = u
+    for number, expected in sorted(by_view.items(), key=lambda row: -len(row[1]))[:_MOST_OTHER_VIEWS]:
 
         def state(count: int, limit: TimeLimit, view: int = number) -> list[Statement]:
             return now.session.state(now.study.view(view), StatementTable(trials=count), limit).statements
@@ -224,17 +227,17 @@ def _fresh_calibration(now: Shortfall) -> Iterator[Change]:
 
 
 def _better_calibration(now: Shortfall) -> Iterator[Change]:
-    own = now.study.unknowns.calibration.scale
+    scale = now.study.unknowns.calibration.scale
     for share, expected in _by_share(now, "calibration").items():
-        keys = {"unknowns": {"calibration": {"scale": own * share}}}
+        keys = {"unknowns": {"calibration": {"scale": scale * share}}}
         words = f"with a calibration {1 / share:.0f} times as accurate"
         yield _of_study(now, "calibration", words, keys, expected, f"calibration_{1 / share:.0f}")
 
 
 def _temperature(now: Shortfall) -> Iterator[Change]:
-    own = now.study.unknowns.temperature
+    temperature = now.study.unknowns.temperature
     for share, expected in _by_share(now, "temperature").items():
-        part, sensor = own.part_kelvin * share, own.sensor_kelvin * share
+        part, sensor = temperature.part_kelvin * share, temperature.sensor_kelvin * share
         keys = {"unknowns": {"temperature": {"part_kelvin": part, "sensor_kelvin": sensor}}}
         words = f"with the part steady within {part:g} K and the sensor within {sensor:g} K"
         yield _of_study(now, "temperature", words, keys, expected, f"temperature_{1 / share:.0f}")
@@ -284,9 +287,9 @@ def _several_views(now: Shortfall) -> Iterator[Change]:
 
     def state(count: int, limit: TimeLimit) -> list[Statement]:
         joined = changed_file(study.file, {"set": table.model_copy(update={"trials": count}).model_dump()})
-        own = now.session
-        session = Session(replace(own.study, file=joined), own.folder, own.workers, own.separate_light)
-        session.measurements = own.measurements
+        base = now.session
+        session = Session(replace(base.study, file=joined), base.folder, base.workers, base.separate_light)
+        session.measurements = base.measurements
         return state_set(session, chosen, limit.over)
 
     expected = {name: limits[name] for name in able}

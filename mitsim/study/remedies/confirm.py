@@ -104,28 +104,31 @@ def find_remedies(
         Expected time of a virtual measurement [s]: a change whose share of the time is too short for the fewest is not
         tried.
     """
-    known = Remedies(missed) if before is None else before
-    found, limit = Remedies(missed, list(known.tried), list(known.failed)), limit or TimeLimit()
+    earlier = Remedies(missed) if before is None else before
+    remedies, limit = Remedies(missed, list(earlier.tried), list(earlier.failed)), limit or TimeLimit()
     done = {
         change.words
-        for change in (*(tried_change.change for tried_change in known.tried), *(one for one, _ in known.failed))
+        for change in (
+            *(tried_change.change for tried_change in earlier.tried),
+            *(impossible for impossible, _ in earlier.failed),
+        )
     }
     kinds = set[str]()
     for change in proposed:
         kinds.add(change.kind)
-        wanted = [name for name in change.expected if name in found.open]
+        wanted = [name for name in change.expected if name in remedies.open]
         if not wanted or change.words in done:
             continue
         untried = UntriedChange(change=change.kind, words=change.words, measurements=wanted)
-        own = limit.part(_CHANGE_SHARE)
-        if own.left <= (_FEWEST * trial_s if change.needs_trials else 0.0):
-            found.untried.append(untried)
+        change_limit = limit.part(_CHANGE_SHARE)
+        if change_limit.left <= (_FEWEST * trial_s if change.needs_trials else 0.0):
+            remedies.untried.append(untried)
             continue
         began = time.monotonic()
         try:
-            stated = _stated(change, wanted, trials, own)
+            stated = _stated(change, wanted, trials, change_limit)
         except InputError as error:
-            found.failed.append((change, str(error)))
+            remedies.failed.append((change, str(error)))
             continue
         finally:
             change.release()
@@ -133,17 +136,17 @@ def find_remedies(
         seconds = time.monotonic() - began
         tried = TriedChange(change, stated, seconds)
         if tried.trials < _FEWEST:
-            found.untried.append(untried)
+            remedies.untried.append(untried)
             continue
-        found.tried.append(tried)
+        remedies.tried.append(tried)
         fits = ", ".join(name for name in wanted if name in tried.fits) or "no measurement"
         say(f"remedies: {change.words}: {fits} of {len(wanted)} fits, by {tried.trials} trials in {seconds:.0f} s")
-        if not found.open:
+        if not remedies.open:
             break
-    return _without_sensors(found) if limit.over() and "sensor" not in kinds else found
+    return _without_sensors(remedies) if limit.over() and "sensor" not in kinds else remedies
 
 
-def of_missed(found: Remedies | None, missed: dict[str, Statement], proposed_all: bool = True) -> Remedies | None:
+def of_missed(remedies: Remedies | None, missed: dict[str, Statement], proposed_all: bool = True) -> Remedies | None:
     """Return remedies for the measurements that a longer statement misses; None if it misses none.
 
     Changes were chosen for the measurements that were missed before; they may help others too. Unless all kinds were
@@ -151,20 +154,20 @@ def of_missed(found: Remedies | None, missed: dict[str, Statement], proposed_all
     """
     if not missed:
         return None
-    now = Remedies(missed) if found is None else replace(found, missed=missed)
-    known = () if found is None else found.missed
-    if new := [name for name in now.open if name not in known]:
+    now = Remedies(missed) if remedies is None else replace(remedies, missed=missed)
+    missed_before = () if remedies is None else remedies.missed
+    if new := [name for name in now.open if name not in missed_before]:
         any_change = UntriedChange(change=ANY, words="any change", measurements=new)
         now = replace(now, untried=[*now.untried, any_change])
     return now if proposed_all else _without_sensors(now)
 
 
-def _without_sensors(found: Remedies) -> Remedies:
+def _without_sensors(remedies: Remedies) -> Remedies:
     """Return remedies that name other sensors among what was not tried, if a measurement is open."""
-    if not found.open:
-        return found
-    sensors = UntriedChange(change="sensor", words="with another sensor", measurements=found.open)
-    return replace(found, untried=[*(one for one in found.untried if one.change != "sensor"), sensors])
+    if not remedies.open:
+        return remedies
+    sensors = UntriedChange(change="sensor", words="with another sensor", measurements=remedies.open)
+    return replace(remedies, untried=[*(entry for entry in remedies.untried if entry.change != "sensor"), sensors])
 
 
 def all_changes(now: Shortfall, limit: TimeLimit) -> Iterator[Change]:
@@ -197,7 +200,7 @@ def _deserves_more(statement: Statement, first: bool) -> bool:
     return demand <= 1 or (first and demand**2 <= high / demand)
 
 
-def remedies_document(found: Remedies) -> dict[str, Any]:
+def remedies_document(remedies: Remedies) -> dict[str, Any]:
     """Return the changes that were tried as JSON values; see docs/reference/formats/run-folder.md."""
     return {
         "measurements": {
@@ -206,13 +209,13 @@ def remedies_document(found: Remedies) -> dict[str, Any]:
                 "standard_uncertainty": json_values(statement.standard_uncertainty),
                 "needed": None if statement.decided is None else json_values(statement.decided.needed),
                 "demand": None if statement.decided is None else json_values(statement.decided.demand),
-                "fits_by": next((i for i, tried in enumerate(found.tried) if name in tried.fits), None),
+                "fits_by": next((i for i, tried in enumerate(remedies.tried) if name in tried.fits), None),
             }
-            for name, statement in found.missed.items()
+            for name, statement in remedies.missed.items()
         },
-        "tried": [_entry(change, found.missed) for change in found.tried],
-        "impossible": [{"words": change.words, "reason": why} for change, why in found.failed],
-        "untried": [one.model_dump() for one in found.untried],
+        "tried": [_entry(change, remedies.missed) for change in remedies.tried],
+        "impossible": [{"words": change.words, "reason": why} for change, why in remedies.failed],
+        "untried": [entry.model_dump() for entry in remedies.untried],
     }
 
 

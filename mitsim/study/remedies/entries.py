@@ -67,45 +67,45 @@ class RemediesEntry(PartialDocument):
 
     @model_validator(mode="before")
     @classmethod
-    def _of_older_runs(cls, found: Any) -> Any:
+    def _of_older_runs(cls, document: Any) -> Any:
         """Take the words alone, as older versions wrote them, as changes for every measurement."""
-        if not isinstance(found, dict) or not isinstance(found.get("untried"), list):
-            return found
-        names = list(found["measurements"]) if isinstance(found.get("measurements"), dict) else []
+        if not isinstance(document, dict) or not isinstance(document.get("untried"), list):
+            return document
+        names = list(document["measurements"]) if isinstance(document.get("measurements"), dict) else []
         untried = [
-            {"change": "", "words": one, "measurements": names} if isinstance(one, str) else one
-            for one in found["untried"]
+            {"change": "", "words": entry, "measurements": names} if isinstance(entry, str) else entry
+            for entry in document["untried"]
         ]
-        return {**found, "untried": untried}
+        return {**document, "untried": untried}
 
 
-def remedies_in_words(found: RemediesEntry | None) -> list[str]:
+def remedies_in_words(remedies: RemediesEntry | None) -> list[str]:
     """Return lines such as ``sprayed matt white: pillar1_radius fits, u 0.58 to 0.03 mm (40 virtual measurements)``."""
-    if found is None or not found.measurements:
+    if remedies is None or not remedies.measurements:
         return []
     lines = list[str]()
-    for index, tried in enumerate(found.tried):
-        names = [name for name, measurement in found.measurements.items() if measurement.fits_by == index]
+    for index, tried in enumerate(remedies.tried):
+        names = [name for name, measurement in remedies.measurements.items() if measurement.fits_by == index]
         if names:
-            changed = [_changed(name, found.measurements[name], tried.measurements[name]) for name in names]
+            changed = [_changed(name, remedies.measurements[name], tried.measurements[name]) for name in names]
             verb = "fits" if len(names) == 1 else "fit"
             if len(names) > NAMED + 1:
                 changed = [*changed[:NAMED], f"{len(names) - NAMED} more"]
             lines.append(f"{tried.words}: {listed(changed)} {verb} ({tried.trials} virtual measurements)")
-    still = [name for name, measurement in found.measurements.items() if measurement.fits_by is None]
-    waiting = {name for one in found.untried for name in one.measurements}
+    still = [name for name, measurement in remedies.measurements.items() if measurement.fits_by is None]
+    waiting = {name for change in remedies.untried for name in change.measurements}
     unsolved: dict[str, list[str]] = {}
     for name in still:
-        told, why = _unsolved(found, name)
+        told, why = _unsolved(remedies, name)
         if why or name not in waiting:
             unsolved.setdefault(why or "by its budget, no single change that mitsim knows suffices", []).append(told)
     lines += [f"{named(entries)}: {why}" for why, entries in unsolved.items()]
-    of_any = {name for one in found.untried if one.change == ANY for name in one.measurements}
+    of_any = {name for change in remedies.untried if change.change == ANY for name in change.measurements}
     untried = list[str]()
-    for one in found.untried:
-        names = [name for name in one.measurements if name in still and (one.change == ANY or name not in of_any)]
+    for change in remedies.untried:
+        names = [name for name in change.measurements if name in still and (change.change == ANY or name not in of_any)]
         if names:
-            untried.append(one.words if set(names) == set(still) else f"{one.words} for {named(names)}")
+            untried.append(change.words if set(names) == set(still) else f"{change.words} for {named(names)}")
     return lines + [f"not tried for lack of time: {'; '.join(untried)}"] * bool(untried)
 
 
@@ -121,20 +121,20 @@ def _changed(name: str, before: MissedEntry, after: ChangedMeasurement) -> str:
     return f"{name} (u {u}, before {_plain(before.standard_uncertainty, before.unit)})"
 
 
-def _unsolved(found: RemediesEntry, name: str) -> tuple[str, str]:
+def _unsolved(remedies: RemediesEntry, name: str) -> tuple[str, str]:
     """Return a measurement with the nearest uncertainty that was reached, and why no change tried makes it fit.
 
     The reason is empty if none was tried.
     """
-    one = found.measurements[name]
-    rows = [(or_nan(tried.measurements[name].demand), tried) for tried in found.tried if name in tried.measurements]
+    measurement = remedies.measurements[name]
+    rows = [(or_nan(tried.measurements[name].demand), tried) for tried in remedies.tried if name in tried.measurements]
     if not rows:
         return name, ""
     demand, best = min(rows, key=lambda row: math.inf if math.isnan(row[0]) else row[0])
-    helps = math.isfinite(demand) and (one.demand is None or demand < one.demand)
-    nearest = best.measurements[name].standard_uncertainty if helps else one.standard_uncertainty
-    needed = "" if one.needed is None else f", {_plain(one.needed, one.unit)} needed"
-    told = name if nearest is None else f"{name} (u {_plain(nearest, one.unit)}{needed})"
+    helps = math.isfinite(demand) and (measurement.demand is None or demand < measurement.demand)
+    nearest = best.measurements[name].standard_uncertainty if helps else measurement.standard_uncertainty
+    needed = "" if measurement.needed is None else f", {_plain(measurement.needed, measurement.unit)} needed"
+    told = name if nearest is None else f"{name} (u {_plain(nearest, measurement.unit)}{needed})"
     if best.measurements[name].verdict == "not decided" and demand <= 1:
         return told, f"perhaps {best.words}, not decided by {best.trials} virtual measurements"
     if len(rows) == 1:

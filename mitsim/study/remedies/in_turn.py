@@ -40,7 +40,7 @@ def seeks_remedies(study: Study) -> bool:
 
 
 def state_and_mend(
-    session: Session, now: Shortfall, rest: TimeLimit, clock: StepTimes
+    session: Session, now: Shortfall, limit: TimeLimit, clock: StepTimes
 ) -> tuple[StatedView, Remedies | None]:
     """Try changes for what a statement misses, and go on with the statement in turn with them, within a limit.
 
@@ -50,7 +50,7 @@ def state_and_mend(
         The study, being measured.
     now
         The statement of its best view so far.
-    rest
+    limit
         Time of all of it; without a limit the statement is finished, and changes have a time of their own.
     clock
         Times of the steps of the run.
@@ -69,18 +69,18 @@ def state_and_mend(
         proposed = all_changes(shortfall, within) if sensors else changes(shortfall)
         made = max((statement.trials for statement in stated.statements), default=0)
         trial_s = clock.steps.get("state", 0.0) / made if made else 0.0
-        found = find_remedies(shortfall.missed, proposed, table.trials, within, before, trial_s)
+        tried = find_remedies(shortfall.missed, proposed, table.trials, within, before, trial_s)
         clock.lap("remedies")
-        return found
+        return tried
 
     table = session.study.file.remedies
-    if rest.end is None:
+    if limit.end is None:
         return now.stated, mend(now.stated, None, TimeLimit(60 * table.minutes), True)
-    stated, remedies = in_turn(now.stated, state, mend, rest)
+    stated, remedies = in_turn(now.stated, state, mend, limit)
     return stated, remedies if seeks_remedies(session.study) else None
 
 
-def in_turn(stated: StatedView, state: Stating, mend: Mending, rest: TimeLimit) -> tuple[StatedView, Remedies | None]:
+def in_turn(stated: StatedView, state: Stating, mend: Mending, limit: TimeLimit) -> tuple[StatedView, Remedies | None]:
     """Go on with the statement of a view and try changes, in turn, until time is over.
 
     Parameters
@@ -89,17 +89,17 @@ def in_turn(stated: StatedView, state: Stating, mend: Mending, rest: TimeLimit) 
         The statement so far.
     state, mend
         Make more virtual measurements of the view, and of changes.
-    rest
+    limit
         Time of all of it.
     """
     remedies, all_tried = None, False
     if not _decided(stated):
-        remedies = mend(stated, None, rest.part(_SHARE_WHILE_OPEN), False)
-        stated = state(rest, _decided)
-    if missed_by(stated) and not rest.over():
-        remedies, all_tried = mend(stated, remedies, rest, True), True
-    if not rest.over():
-        stated = state(rest, lambda _: False)
+        remedies = mend(stated, None, limit.part(_SHARE_WHILE_OPEN), False)
+        stated = state(limit, _decided)
+    if missed_by(stated) and not limit.over():
+        remedies, all_tried = mend(stated, remedies, limit, True), True
+    if not limit.over():
+        stated = state(limit, lambda _: False)
     return stated, of_missed(remedies, missed_by(stated), all_tried)
 
 

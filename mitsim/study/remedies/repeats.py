@@ -45,8 +45,8 @@ def state_mean(session: Session, view: View, captures: int, count: int, limit: T
         complete(trials, source.runner, jobs, f"capture day {day - days[0] + 1} of {len(days)}", limit.over)
         if limit.over():
             break
-    known = trials.known(view.number)
-    whole = [day for day in days if all(Trial(day, capture) in known for capture in range(captures))]
+    outcomes = trials.known(view.number)
+    whole = [day for day in days if all(Trial(day, capture) in outcomes for capture in range(captures))]
     rows = [trials.errors_of_parts(view.number, [Trial(day, k) for day in whole]) for k in range(captures)]
     common = related([Trial(day) for day in whole])
     return [
@@ -66,7 +66,7 @@ def _mean(captures: list[np.ndarray | OneSidedErrors]) -> np.ndarray | OneSidedE
 
 def _known_mean(values: np.ndarray) -> np.ndarray:
     """Return the mean over the first axis without NaN; NaN where there is no number."""
-    known = np.isfinite(values)
-    count = known.sum(axis=0)
-    total = np.where(known, values, 0.0).sum(axis=0)
+    finite = np.isfinite(values)
+    count = finite.sum(axis=0)
+    total = np.where(finite, values, 0.0).sum(axis=0)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)

@@ -42,8 +42,8 @@ def other_sensors(now: Shortfall, limit: TimeLimit) -> Iterator[Change]:
     if now.session.source == "map":
         return
     names, stated = list(now.missed), now.stated.view.number
-    own = _risks(now.scores, names)[:, now.scores["view"].values.tolist().index(stated)]
-    found = list[tuple[int, float, Change]]()
+    stated_risks = _risks(now.scores, names)[:, now.scores["view"].values.tolist().index(stated)]
+    proposals = list[tuple[int, float, Change]]()
     # fringes first: time may not suffice for all
     for name in sorted(presets(), key=lambda preset: named_sensor(preset)[1] != "structured_light"):
         if name == now.study.sensor.name or name not in shipped_maps():
@@ -51,14 +51,14 @@ def other_sensors(now: Shortfall, limit: TimeLimit) -> Iterator[Change]:
         if limit.over():
             break
         study = _opened(now, name)
-        if study is None or not (some := _in_best_directions(now, study)).views:
+        if study is None or not (screened_study := _in_best_directions(now, study)).views:
             continue
-        say(f"remedies: screening {name}, {len(some.views)} views")
-        scores, _ = Session(some).screen(limit=limit.part(_SCREENING_SHARE))
+        say(f"remedies: screening {name}, {len(screened_study.views)} views")
+        scores, _ = Session(screened_study).screen(limit=limit.part(_SCREENING_SHARE))
         risks = _risks(scores, names)
         least = risks.min(axis=1)
         expected = {}
-        for statement, risk, before in zip(now.missed.values(), least, own, strict=True):
+        for statement, risk, before in zip(now.missed.values(), least, stated_risks, strict=True):
             ratio = float(risk / before)  # 0 where the map sees no way for the first sensor
             u = ratio * statement.standard_uncertainty / SCREENING_FACTOR
             if math.isfinite(risk) and can_fit(statement, u, unbiased=True):
@@ -67,8 +67,8 @@ def other_sensors(now: Shortfall, limit: TimeLimit) -> Iterator[Change]:
             able = np.isfinite(least)
             best = int(np.argmin((risks[able] / least[able, None]).max(axis=0)))
             view = study.view(int(scores["view"].values[best]))
-            found.append((-len(expected), float(least[able].sum()), _with_sensor(now, name, study, view, expected)))
-    for _, _, change in sorted(found, key=lambda one: one[:2])[:_MOST]:
+            proposals.append((-len(expected), float(least[able].sum()), _with_sensor(now, name, study, view, expected)))
+    for _, _, change in sorted(proposals, key=lambda proposal: proposal[:2])[:_MOST]:
         yield change
 
 
@@ -82,7 +82,7 @@ def _opened(now: Shortfall, name: str) -> Study | None:
 
 
 def _with_sensor(now: Shortfall, name: str, study: Study, view: View, expected: dict[str, float]) -> Change:
-    changed = ChangedStudy(now, f"sensor_{name}", lambda: study, lambda one: one.view(view.number))
+    changed = ChangedStudy(now, f"sensor_{name}", lambda: study, lambda opened: opened.view(view.number))
     words = f"with {name}, from its view {view.number}"
     return Change("sensor", words, {"sensor": name}, (view.number,), expected, changed.state, release=changed.release)
 
@@ -96,13 +96,13 @@ def _in_best_directions(now: Shortfall, study: Study) -> Study:
     directions = list[Floats]()
     for number in (now.stated.view.number, *order):
         direction = now.study.view(int(number)).direction
-        if len(directions) < _DIRECTIONS and all(one @ direction < 1 - 1e-9 for one in directions):
+        if len(directions) < _DIRECTIONS and all(other @ direction < 1 - 1e-9 for other in directions):
             directions.append(direction)
-    views = [view for view in study.views if any(one @ view.direction > 1 - 1e-9 for one in directions)]
+    views = [view for view in study.views if any(other @ view.direction > 1 - 1e-9 for other in directions)]
     return replace(study, candidates=replace(study.candidates, views=views))
 
 
 def _risks(scores: xr.Dataset, names: list[str]) -> Floats:
     """Return the screened risk (measurement, view) of measurements, in their units; infinite if the map excludes it."""
-    known = [str(name) for name in scores["measurement"].values]
-    return np.asarray(np.exp(screening_risk(scores)[[known.index(name) for name in names]]))
+    all_names = [str(name) for name in scores["measurement"].values]
+    return np.asarray(np.exp(screening_risk(scores)[[all_names.index(name) for name in names]]))

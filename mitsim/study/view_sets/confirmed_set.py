@@ -76,9 +76,9 @@ class TriedSet:
 
         It is at most 1 if all reachable limits are kept.
         """
-        found = {one.measurement: one for one in self.stated}
+        statements = {entry.measurement: entry for entry in self.stated}
         reachable = [name for name, able in zip(limits, self.chosen.feasible, strict=True) if able]
-        return max((_excess(found[name], limits[name]) for name in reachable), default=0.0)
+        return max((_excess(statements[name], limits[name]) for name in reachable), default=0.0)
 
 
 def confirmed_set(
@@ -115,16 +115,16 @@ def confirmed_set(
         if len(tried) == MOST_SETS:
             say(f"no further set is tried: {MOST_SETS} sets were measured, the most that a run measures")
             break
-        found = _next_set(search, stricter(tried[-1], table.limits), first, tried)
-        if found is None:
+        next_set = _next_set(search, stricter(tried[-1], table.limits), first, tried)
+        if next_set is None:
             say(
                 f"no further set is tried: by the map, no set of other views is more accurate "
                 f"({MOST_SEARCHES} searches with stricter limits)"
             )
             break
-        chosen, searched = found
+        chosen, searched = next_set
         say(f"the next set: views {', '.join(map(str, chosen.views))}")
-    return sorted(tried, key=lambda one: -one.excess(table.limits))
+    return sorted(tried, key=lambda tried_set: -tried_set.excess(table.limits))
 
 
 def _next_set(
@@ -154,8 +154,8 @@ def _next_set(
 
 def _missed(tried: TriedSet, limits: dict[str, float]) -> str:
     """Return text such as ``radius missed, 1.3 times its limit``."""
-    stated = {one.measurement: one for one in tried.stated}
-    ratios = {name: _excess(one, limits[name]) for name, one in stated.items() if name in limits}
+    stated = {entry.measurement: entry for entry in tried.stated}
+    ratios = {name: _excess(entry, limits[name]) for name, entry in stated.items() if name in limits}
     missed = {name: two_digits(ratio) for name, ratio in ratios.items() if 1 < ratio < math.inf}
     words = [f"{name} missed, {ratio} times its limit" for name, ratio in missed.items()]
     return "; ".join(words + [f"{name} without a value" for name, ratio in ratios.items() if ratio == math.inf])
@@ -163,7 +163,7 @@ def _missed(tried: TriedSet, limits: dict[str, float]) -> str:
 
 def stricter(tried: TriedSet, limits: dict[str, float]) -> dict[str, float]:
     """Return the limits for the next search: missed limits times the ratio of expected to measured uncertainty."""
-    out, stated = dict(tried.searched), {one.measurement: one for one in tried.stated}
+    out, stated = dict(tried.searched), {entry.measurement: entry for entry in tried.stated}
     for name, expected, able in zip(limits, tried.chosen.uncertainty.tolist(), tried.chosen.feasible, strict=True):
         error = stated[name].root_mean_square
         if able and _excess(stated[name], limits[name]) > 1:
@@ -172,8 +172,8 @@ def stricter(tried: TriedSet, limits: dict[str, float]) -> dict[str, float]:
     return out
 
 
-def _excess(one: Statement, limit: float) -> float:
-    return one.root_mean_square / limit if math.isfinite(one.root_mean_square) else math.inf
+def _excess(stated: Statement, limit: float) -> float:
+    return stated.root_mean_square / limit if math.isfinite(stated.root_mean_square) else math.inf
 
 
 def state_set(session: Session, chosen: ViewSet, over: Callable[[], bool] = lambda: False) -> list[Statement]:
@@ -183,8 +183,8 @@ def state_set(session: Session, chosen: ViewSet, over: Callable[[], bool] = lamb
     """
     study, renderer, table = session.study, session.renderer, session.study.file.set
     assert table is not None and renderer is not None  # clouds drawn from a map cannot be joined
-    what = ["set", list(chosen.views), table.joining, list(table.pose_known), _JOINING_VERSION]
-    decided_by = with_exposure(session.digest, None, what)
+    content = ["set", list(chosen.views), table.joining, list(table.pose_known), _JOINING_VERSION]
+    decided_by = with_exposure(session.digest, None, content)
     trials = TrialFolder.of(session.folder / "set_trials" / decided_by, decided_by, study.task)
     runner = JoinedMeasurements(renderer, [study.view(number) for number in chosen.views], table)
     days = [SET_DAYS + k for k in range(table.trials)]
@@ -194,10 +194,10 @@ def state_set(session: Session, chosen: ViewSet, over: Callable[[], bool] = lamb
         if over():
             break
     wanted = [trial for trial in map(Trial, days) if trial in trials.known(0)]
-    found = trials.errors_of_parts(0, wanted)
+    errors = trials.errors_of_parts(0, wanted)
     return [
         replace(
-            statement(name, asked.unit, found[m], tolerance_of(study.task, name)),
+            statement(name, asked.unit, errors[m], tolerance_of(study.task, name)),
             losses=losses(trials.reasons(0, wanted, name)),
         )
         for m, (name, asked) in enumerate(study.task.measurements.items())
@@ -213,7 +213,7 @@ def tried_entries(tried: Sequence[TriedSet], limits: dict[str, float]) -> list[d
             "searched": tried_set.searched,
             "expected": dict(zip(limits, tried_set.chosen.uncertainty.tolist(), strict=True)),
             "found": json_values(
-                {each.measurement: each.root_mean_square for each in tried_set.stated if each.measurement in limits}
+                {entry.measurement: entry.root_mean_square for entry in tried_set.stated if entry.measurement in limits}
             ),
         }
         for tried_set in tried
@@ -234,9 +234,9 @@ def confirmed_entry(stated: Sequence[Statement]) -> dict[str, Any]:
     """Return the results of virtual measurements of the set, by measurement, as JSON values."""
     keys = ("unit", "trials", "without_value", "bias", "standard_uncertainty", "interval", "verdict")
     out = {}
-    for one in stated:
-        decision = None if one.decided is None else asdict(one.decided)
-        out[one.measurement] = json_values({key: getattr(one, key) for key in keys} | {"decision": decision})
+    for entry in stated:
+        decision = None if entry.decided is None else asdict(entry.decided)
+        out[entry.measurement] = json_values({key: getattr(entry, key) for key in keys} | {"decision": decision})
     return out
 
 
@@ -248,11 +248,11 @@ def write_set_csv(path: Path, table: SetTable, tried: TriedSet) -> None:
 
     expected = dict(zip(table.limits, tried.chosen.uncertainty.tolist(), strict=True))
     lines = ["measurement,unit,limit,expected_uncertainty,trials,without_value,bias,uncertainty,low,high,verdict"]
-    for one in tried.stated:
-        limit = f"{table.limits[one.measurement]:g}" if one.measurement in table.limits else ""
-        counts = [text(expected.get(one.measurement)), str(one.trials), text(one.without_value)]
-        numbers = map(text, (one.bias, one.standard_uncertainty, *one.interval))
-        lines.append(",".join([one.measurement, one.unit, limit, *counts, *numbers, one.verdict]))
+    for entry in tried.stated:
+        limit = f"{table.limits[entry.measurement]:g}" if entry.measurement in table.limits else ""
+        counts = [text(expected.get(entry.measurement)), str(entry.trials), text(entry.without_value)]
+        numbers = map(text, (entry.bias, entry.standard_uncertainty, *entry.interval))
+        lines.append(",".join([entry.measurement, entry.unit, limit, *counts, *numbers, entry.verdict]))
     write_text(path, "\n".join(lines) + "\n")
 
 
@@ -260,11 +260,11 @@ def set_table(table: SetTable, tried: TriedSet) -> str:
     """Return the set as a text table: limit, expected u, and bias and u from virtual measurements."""
     expected = dict(zip(table.limits, tried.chosen.uncertainty.tolist(), strict=True))
     rows = [("measurement", "unit", "limit", "expected u", "bias", "u", "no value", "limit kept")]
-    for one in tried.stated:
-        limit = table.limits.get(one.measurement)
-        kept = "-" if limit is None else "yes" if one.root_mean_square <= limit else "no"
-        wanted = ("-", "-") if limit is None else (f"{limit:g}", digits(expected[one.measurement]))
-        u = one.standard_uncertainty
-        numbers = plain(beside(one.bias, u)), digits(u), plain(percent(one.without_value))
-        rows.append((one.measurement, one.unit, *wanted, *numbers, kept))
+    for entry in tried.stated:
+        limit = table.limits.get(entry.measurement)
+        kept = "-" if limit is None else "yes" if entry.root_mean_square <= limit else "no"
+        wanted = ("-", "-") if limit is None else (f"{limit:g}", digits(expected[entry.measurement]))
+        u = entry.standard_uncertainty
+        numbers = plain(beside(entry.bias, u)), digits(u), plain(percent(entry.without_value))
+        rows.append((entry.measurement, entry.unit, *wanted, *numbers, kept))
     return "\n".join(aligned(rows))

@@ -49,26 +49,27 @@ class JoinedMeasurements:
     def __init__(self, renderer: RenderedMeasurements, views: Sequence[View], table: SetTable) -> None:
         self.renderer, self.views, self.table = renderer, list(views), table
         self.centre = np.asarray(renderer.study.scene.centre, float)
-        self.known = pose_covariance(*table.pose_known)
+        self.covariance = pose_covariance(*table.pose_known)
 
     def run(self, days: Iterable[int]) -> Iterable[tuple[int, Outcome]]:
         """Yield the outcome of every virtual measurement, day by day."""
         for day in days:
             yield day, self._measured([self._measure_view(view, k, day) for k, view in enumerate(self.views)], day)
 
-    def _measure_view(self, view: View, place: int, day: int) -> _MeasuredView:
-        """Return the points of one view on one day; its ``place`` in the set is the number of its capture."""
+    def _measure_view(self, view: View, number: int, day: int) -> _MeasuredView:
+        """Return the points of one view on one day; its ``number`` in the set is that of its capture."""
         renderer, first = self.renderer, self.renderer.unknowns.draw(Trial(day))
-        drawn = replace(renderer.unknowns.draw(Trial(day, place)), placed=first.placed, assumed=first.assumed)
+        drawn = replace(renderer.unknowns.draw(Trial(day, number)), placed=first.placed, assumed=first.assumed)
         cloud, assumed = renderer.cloud_of(view, drawn)
-        rng = np.random.default_rng(np.random.SeedSequence([renderer.unknowns.seed, _POSE_STREAM, day, place]))
-        error = np.sqrt(np.diag(self.known)) * rng.standard_normal(6)  # of the assumed pose, a motion [w (rad), t (mm)]
+        rng = np.random.default_rng(np.random.SeedSequence([renderer.unknowns.seed, _POSE_STREAM, day, number]))
+        # error of the assumed pose, a motion [w (rad), t (mm)]
+        error = np.sqrt(np.diag(self.covariance)) * rng.standard_normal(6)
         motion = motion_matrix(error, self.centre) @ assumed.matrix()
         points = {}
         for name in renderer.study.task.shapes:
-            found = cloud.of_feature(name)
+            face_points = cloud.of_feature(name)
             nominal = renderer.study.task.features[name].nominal(assumed.inverse().matrix())
-            kept = found[belonging(found, nominal, cloud.grid.origin)] if len(found) else found
+            kept = face_points[belonging(face_points, nominal, cloud.grid.origin)] if len(face_points) else face_points
             points[name] = kept @ motion[:3, :3].T + motion[:3, 3]
         return _MeasuredView(points, assumed.matrix(), cloud)
 
@@ -76,15 +77,15 @@ class JoinedMeasurements:
         task = self.renderer.study.task
         if len(measured) == 1:
             motion = np.linalg.inv(measured[0].assumed)
-            found = measure(measured[0].cloud, task, motion, MINIMUM_POINTS, False)
+            results = measure(measured[0].cloud, task, motion, MINIMUM_POINTS, False)
         else:
             try:
                 points = self._join(measured, day)
             except FitError as error:
                 names = task.measurements
                 return Outcome(dict.fromkeys(names, math.nan), dict.fromkeys(names, f"the views do not join: {error}"))
-            found = measure_points(points, task, MINIMUM_POINTS, False)
-        return Outcome.of(found)
+            results = measure_points(points, task, MINIMUM_POINTS, False)
+        return Outcome.of(results)
 
     def _join(self, measured: Sequence[_MeasuredView], day: int) -> dict[str, Floats]:
         """Return the points of every feature from all views together."""
@@ -92,7 +93,7 @@ class JoinedMeasurements:
         if self.table.joining == "best_fit":
             task = self.renderer.study.task
             shapes = {name: task.features[name].nominal() for name in task.shapes}
-            motions = best_fit([view.points for view in measured], shapes, self.centre, self.known, day)
+            motions = best_fit([view.points for view in measured], shapes, self.centre, self.covariance, day)
         return {
             name: np.concatenate(
                 [

@@ -74,8 +74,8 @@ def drawn_sizes(rng: np.random.Generator, count: int, levels: Sequence[float], s
         Quantiles (levels,) of the size of an error; the unit of the errors is that of the quantiles.
     """
     quantiles = np.concatenate([[0.0], np.asarray(size, float)])
-    found = np.interp(rng.uniform(0, 1, count), [0.0, *levels], quantiles)
-    return np.asarray(found * rng.choice([-1.0, 1.0], count))
+    magnitudes = np.interp(rng.uniform(0, 1, count), [0.0, *levels], quantiles)
+    return np.asarray(magnitudes * rng.choice([-1.0, 1.0], count))
 
 
 class BeyondMap(Document):
@@ -89,8 +89,8 @@ class BeyondMap(Document):
 
     def of(self, sensor: Sensor) -> Sizes:
         """Return the sizes for a sensor's kind."""
-        found: Sizes = getattr(self, kind_of(sensor))
-        return found
+        sizes: Sizes = getattr(self, kind_of(sensor))
+        return sizes
 
 
 def kind_of(sensor: Sensor) -> str:

@@ -42,13 +42,13 @@ class Coat:
     spread: float
     amplitudes: Floats
 
-    def thickness(self, places: NDArray[np.floating], extent: float) -> Floats:
-        """Return the thickness (n,) [mm] at places (n, 3) [mm] on a part of an extent [mm]; nowhere below 0."""
+    def thickness(self, positions: NDArray[np.floating], extent: float) -> Floats:
+        """Return the thickness (n,) [mm] at positions (n, 3) [mm] on a part of an extent [mm]; nowhere below 0."""
         rng = np.random.default_rng(_WAVES_SEED)
         directions = rng.standard_normal((_WAVES, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         waves = directions * (2 * np.pi / (extent * rng.uniform(0.5, 2.0, (_WAVES, 1))))
-        phases = places @ waves.T
+        phases = positions @ waves.T
         cosines, sines = np.split(self.amplitudes, 2)
         deviation = (np.cos(phases) @ cosines + np.sin(phases) @ sines) / np.sqrt(_WAVES)
         return np.asarray(self.mean * np.maximum(1 + self.spread * deviation, 0.0))
@@ -106,6 +106,6 @@ def coated(
     here = np.isin(surfaces.shape, coated_shapes(scene, table)) & np.isfinite(points[..., 2])
     if not here.any():
         return points
-    places = world_from_sensor.points(points[here].astype(float))
+    positions = world_from_sensor.points(points[here].astype(float))
     extent = float(np.linalg.norm(scene.bounds[1] - scene.bounds[0]))
-    return along_rays(points, here, drawn_coat(table, seed).thickness(places, extent), surfaces, grid)
+    return along_rays(points, here, drawn_coat(table, seed).thickness(positions, extent), surfaces, grid)

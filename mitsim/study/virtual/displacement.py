@@ -31,8 +31,8 @@ def displaced(
     centre
         Middle (3,) of the part [mm], part frame.
     """
-    known = cloud.valid
-    points = cloud.points[known].astype(float)
+    valid = cloud.valid
+    points = cloud.points[valid].astype(float)
     offset, scale = drawn.path
     if offset or scale:
         away = points - cloud.grid.origin
@@ -42,5 +42,5 @@ def displaced(
         middle = world_from_sensor.inverse().points(np.asarray(centre, float))
         points = middle + (1 + drawn.expansion) * (points - middle)
     out = cloud.points.copy()
-    out[known] = points
+    out[valid] = points
     return out

@@ -62,8 +62,8 @@ class _Draw:
 
     def one_of(self, choices: Sequence[Choice], otherwise: Choice) -> Choice:
         """Return one of the choices; ``otherwise`` if there are none."""
-        place = float(self._rng.random())
-        return choices[int(place * len(choices))] if choices else otherwise
+        number = float(self._rng.random())
+        return choices[int(number * len(choices))] if choices else otherwise
 
     def between(self, ends: tuple[float, float]) -> float:
         """Return a number from a range, uniform."""
@@ -79,7 +79,7 @@ def _matcher(
 ) -> dict[str, Any]:
     """Return the drawn settings of a matcher, without its least contrast."""
     pair = sensor.technology == "active_stereo"
-    able = [one for one in unknowns.methods if pair and (one != "sgbm" or sensor.frames == 1)]
+    able = [name for name in unknowns.methods if pair and (name != "sgbm" or sensor.frames == 1)]
     method = draw.one_of(able, settings.method)
     # the sensor's own block suits the density of its pattern, if its method is correlation; 5 px suits the others
     own_block = settings.block_size if settings.method == "correlation" else 5
@@ -92,8 +92,8 @@ def _matcher(
     p1, ratio = draw.log_between(unknowns.p1), draw.log_between(unknowns.p2_over_p1)
     uniqueness = round(draw.between(unknowns.uniqueness_percent))
     if method == "correlation":  # it compares other numbers than costs
-        own = settings.uniqueness_percent if settings.method == "correlation" else 15
-        uniqueness = min(round(own * factor), 100)
+        default = settings.uniqueness_percent if settings.method == "correlation" else 15
+        uniqueness = min(round(default * factor), 100)
     foreign = {"sgbm": ("parabola", "equiangular"), "census": ("method", "opencv"), "correlation": ("opencv",)}[method]
     sub_pixel = draw.one_of([fit for fit in unknowns.sub_pixel if fit not in foreign], "method")
     return {

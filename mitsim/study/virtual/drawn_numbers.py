@@ -54,9 +54,10 @@ def statement_trials(count: int) -> list[Trial]:
 
     After every four days, the first of them is captured again. This tells what differs between captures of a day.
     """
-    places = (divmod(k, _DAYS + 1) for k in range(count))
+    positions = (divmod(k, _DAYS + 1) for k in range(count))
     return [
-        Trial(STATEMENT_DAYS + _DAYS * row + (place if place < _DAYS else 0), place // _DAYS) for row, place in places
+        Trial(STATEMENT_DAYS + _DAYS * row + (column if column < _DAYS else 0), column // _DAYS)
+        for row, column in positions
     ]
 
 
@@ -96,12 +97,12 @@ def drawn_numbers(
     for group in groups:
         if group in KEEPS_SEED or group == "noise":
             continue
-        known: dict[Trial, Floats] = {}
+        numbers: dict[Trial, Floats] = {}
         for trial in trials:
-            one = trial if group in FRESH else Trial(trial.day)
-            if one not in known:
-                known[one] = _numbers(study, unknowns, source, group, one)
-        rows = np.array([known[trial if group in FRESH else Trial(trial.day)] for trial in trials])
+            drawn_trial = trial if group in FRESH else Trial(trial.day)
+            if drawn_trial not in numbers:
+                numbers[drawn_trial] = _numbers(study, unknowns, source, group, drawn_trial)
+        rows = np.array([numbers[trial if group in FRESH else Trial(trial.day)] for trial in trials])
         out[group] = np.hstack([rows, (rows**2 - 1) / np.sqrt(2)]) if group in _CURVED else rows
     return out
 
@@ -145,7 +146,7 @@ def named_numbers(
 def _finish_ids(study: Study) -> list[str]:
     """Return the ids of the BSDFs whose finish can be drawn."""
     scene = study.scene
-    return sorted({shape.bsdf().id() for shape, known in zip(scene.shapes, scene.finishes, strict=True) if known})
+    return sorted({shape.bsdf().id() for shape, finish in zip(scene.shapes, scene.finishes, strict=True) if finish})
 
 
 def _numbers(study: Study, unknowns: Unknowns, source: str, group: str, trial: Trial) -> Floats:
@@ -174,7 +175,7 @@ def _numbers(study: Study, unknowns: Unknowns, source: str, group: str, trial: T
     if source == "map":
         return drawn_spread(study, unknowns, drawn.finish)
     return np.array(
-        [value for one in _finish_ids(study) for value in _finish(finish_numbers(unknowns, drawn.finish, one))]
+        [value for finish in _finish_ids(study) for value in _finish(finish_numbers(unknowns, drawn.finish, finish))]
     )
 
 

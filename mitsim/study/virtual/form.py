@@ -39,15 +39,15 @@ _GRAZING = 0.1
 _ZONE_SIGMAS = 4.0
 
 
-def drawn_form(task: Task, given: Mapping[str, float]) -> dict[str, float]:
-    """Return the form deviation [mm], one sigma, by face: as given, else a quarter of the tolerance of its form."""
+def drawn_form(task: Task, stated_sizes: Mapping[str, float]) -> dict[str, float]:
+    """Return the form deviation [mm], one sigma, by face: as stated, else a quarter of the tolerance of its form."""
     sizes = dict[str, float]()
     for name in form_measurements(task):
         asked = task.measurements[name]
         if asked.tolerance_size is not None:
             face = asked.features[0]
             sizes[face] = min(asked.tolerance_size / _ZONE_SIGMAS, sizes.get(face, np.inf))
-    return sizes | dict(given)
+    return sizes | dict(stated_sizes)
 
 
 def form_measurements(task: Task) -> list[str]:
@@ -76,9 +76,9 @@ def measured_with_form(
     def part(wanted: Collection[str]) -> Task:
         return task.model_copy(update={"measurements": {name: task.measurements[name] for name in wanted}})
 
-    others = [name for name in task.measurements if name not in names]
-    found = evaluate(part(names), False) | (evaluate(part(others), True) if others else {})
-    return {name: found[name] for name in task.measurements}
+    other_names = [name for name in task.measurements if name not in names]
+    results = evaluate(part(names), False) | (evaluate(part(other_names), True) if other_names else {})
+    return {name: results[name] for name in task.measurements}
 
 
 def form_deviation(
@@ -115,9 +115,9 @@ def form_deviation(
         here = (surfaces.shape == index) & np.isfinite(points[..., 2])
         if not here.any():
             continue
-        place = world_from_sensor.points(points[here].astype(float))
+        positions = world_from_sensor.points(points[here].astype(float))
         extent = float(np.linalg.norm(np.ptp(bounds_of(scene.shapes[index]), axis=0)))
-        height = size * random_field(place, extent, np.random.default_rng([seed, zlib.crc32(name.encode())]))
+        height = size * random_field(positions, extent, np.random.default_rng([seed, zlib.crc32(name.encode())]))
         out = along_rays(out, here, height, surfaces, grid)
     return out
 
@@ -150,10 +150,10 @@ def along_rays(
     return out
 
 
-def random_field(places: NDArray[np.floating], extent: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Return a smooth field of variance 1 at places (n, 3) [mm]; wavelengths are 0.5 to 2 times ``extent`` [mm]."""
+def random_field(positions: NDArray[np.floating], extent: float, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Return a smooth field of variance 1 at positions (n, 3) [mm]; wavelengths are 0.5 to 2 times ``extent`` [mm]."""
     directions = rng.standard_normal((_WAVES, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     waves = directions * (2 * np.pi / (extent * rng.uniform(0.5, 2.0, (_WAVES, 1))))
     phases = rng.uniform(0, 2 * np.pi, _WAVES)
-    return np.asarray(np.sqrt(2 / _WAVES) * np.cos(places @ waves.T + phases).sum(axis=1))
+    return np.asarray(np.sqrt(2 / _WAVES) * np.cos(positions @ waves.T + phases).sum(axis=1))

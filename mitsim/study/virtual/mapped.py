@@ -88,10 +88,10 @@ class MappedMeasurements:
 
         A cloud is fitted while the next is drawn.
         """
-        known = list(jobs)
+        jobs = list(jobs)
         if self._beyond_sizes is not None:
-            self._predict({job.view.number: job.view for job in known})
-        return one_ahead(known, self._take, self._finish)
+            self._predict({job.view.number: job.view for job in jobs})
+        return one_ahead(jobs, self._take, self._finish)
 
     def _take(self, job: Job) -> tuple[PointCloud, DrawnValues, NDArray[np.int16], Surfaces | None]:
         drawn = self.unknowns.draw(job.trial)
@@ -120,8 +120,8 @@ class MappedMeasurements:
             labelled = replace(cloud, points=moved, feature=labels, feature_names=scene.names)
             return measure(labelled, task, assumed.inverse().matrix(), MINIMUM_POINTS, False)
 
-        found = measured_with_form(self.study.task, evaluate, bool(self._has_form and drawn.form))
-        return self._with_beyond(Outcome.of(found), job.view, drawn)
+        results = measured_with_form(self.study.task, evaluate, bool(self._has_form and drawn.form))
+        return self._with_beyond(Outcome.of(results), job.view, drawn)
 
     def _predict(self, views: dict[int, View]) -> None:
         """Compute and keep the predicted uncertainties of views."""
@@ -134,25 +134,25 @@ class MappedMeasurements:
         for view, row in zip(new, predicted.tolist(), strict=True):
             self._predicted[view.number] = dict(zip(scores["measurement"].values.tolist(), row, strict=True))
 
-    def _with_beyond(self, found: Outcome, view: View, drawn: DrawnValues) -> Outcome:
+    def _with_beyond(self, outcome: Outcome, view: View, drawn: DrawnValues) -> Outcome:
         """Add effects outside the map; NaN if screening rates a measurement as impossible.
 
         An effect on a value that folds is a deviation in a random direction.
         """
         if self._beyond_sizes is None:
-            return found
-        sizes = self._beyond_sizes.draw(np.random.default_rng(drawn.beyond), len(found.errors))
+            return outcome
+        sizes = self._beyond_sizes.draw(np.random.default_rng(drawn.beyond), len(outcome.errors))
         predicted = self._predicted[view.number]
-        added = {name: predicted[name] * float(size) for name, size in zip(found.errors, sizes, strict=True)}
-        errors = {name: error + added[name] for name, error in found.errors.items()}
+        added = {name: predicted[name] * float(size) for name, size in zip(outcome.errors, sizes, strict=True)}
+        errors = {name: error + added[name] for name, error in outcome.errors.items()}
         deviations = {}
-        for name, rows in found.deviations.items():
+        for name, rows in outcome.deviations.items():
             folded = self._folded[name]
             moved = folded.moved(np.reshape(rows, folded.shape), added[name], drawn.beyond)
             errors[name] = folded.error(moved)
             deviations[name] = moved.ravel().tolist()
         impossible = {name: _NOT_PREDICTED for name in errors if not np.isfinite(predicted[name])}
-        return Outcome(errors, impossible | dict(found.reasons), deviations)
+        return Outcome(errors, impossible | dict(outcome.reasons), deviations)
 
     def _scene(self, finish: int) -> CharacterisedScene:
         if finish not in self._characterised:
@@ -190,12 +190,12 @@ def drawn_spread(study: Study, unknowns: Unknowns, finish: int) -> Floats:
     performance_map = study.performance_map
     assert performance_map is not None
     used = set[int]()
-    for one in study.scene.finishes:
-        if one is not None:
+    for material in study.scene.finishes:
+        if material is not None:
             with suppress(InputError):  # a surface that no view shows
-                members, rough = performance_map.known.representing(one.name, one.roughness, one.light)
-                place = int(np.searchsorted(performance_map.known.roughness[members], rough))
-                used |= set(members if math.isnan(rough) else members[max(place - 1, 0) : place + 1])
+                members, rough = performance_map.known.representing(material.name, material.roughness, material.light)
+                index = int(np.searchsorted(performance_map.known.roughness[members], rough))
+                used |= set(members if math.isnan(rough) else members[max(index - 1, 0) : index + 1])
     draws = [common for _, common, _ in _map_draws(performance_map, unknowns, finish)] if finish >= 0 else []
     return np.array([draw[sorted(used)] for draw in draws] or np.zeros((2, len(used)))).ravel()
 
@@ -215,16 +215,16 @@ def moved_by_calibration(cloud: PointCloud, sensor: Sensor, drawn: DrawnValues) 
 
     Parameters of a time-of-flight path are excluded; :func:`mitsim.study.virtual.displacement.displaced` applies them.
     """
-    known = cloud.valid
-    points = cloud.points[known].astype(float)
+    valid = cloud.valid
+    points = cloud.points[valid].astype(float)
     if len(points) < 4:
         return cloud.points
-    some = points[:: max(1, len(points) // _POINTS)]
-    moves = measured_points(sensor, some, drawn.rig) - measured_points(sensor, some, sensor.rig)
+    sample = points[:: max(1, len(points) // _POINTS)]
+    moves = measured_points(sensor, sample, drawn.rig) - measured_points(sensor, sample, sensor.rig)
     fine = np.isfinite(moves).all(axis=1)
     if fine.sum() < 40:
         return cloud.points
-    solution, *_ = np.linalg.lstsq(terms(some[fine]), moves[fine], rcond=None)
+    solution, *_ = np.linalg.lstsq(terms(sample[fine]), moves[fine], rcond=None)
     out = cloud.points.copy()
-    out[known] = points + terms(points) @ solution
+    out[valid] = points + terms(points) @ solution
     return out

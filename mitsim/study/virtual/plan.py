@@ -105,14 +105,18 @@ def measured_by(study: Study) -> str:
     InputError
         If clouds shall be drawn from a map, and the study has no map yet.
     """
-    given, known = study.file.measure.by, study.performance_map
-    if given == "map" and known is None:
+    choice, performance_map = study.file.measure.by, study.performance_map
+    if choice == "map" and performance_map is None:
         raise InputError(
             study.path, "measure.by", "'map' with a campaign", "a map that was made before", "set characterisation.map"
         )
-    if given is not None:
-        return given
-    return "map" if known is not None and known.data.attrs.get("source") not in (None, "", "simulated") else "render"
+    if choice is not None:
+        return choice
+    return (
+        "map"
+        if performance_map is not None and performance_map.data.attrs.get("source") not in (None, "", "simulated")
+        else "render"
+    )
 
 
 def measurements_of(

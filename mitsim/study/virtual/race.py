@@ -186,9 +186,9 @@ def prior_risk(u: Floats) -> Floats:
 
     A view without u gets three times the largest u, which counts as 1 if no view has a u.
     """
-    known = np.where(np.isfinite(u) & (u > 0), u, np.nan)
-    worst = np.nanmax(known) if np.isfinite(known).any() else 1.0
-    return np.where(np.isfinite(known), known, 3 * worst)
+    usable = np.where(np.isfinite(u) & (u > 0), u, np.nan)
+    worst = np.nanmax(usable) if np.isfinite(usable).any() else 1.0
+    return np.where(np.isfinite(usable), usable, 3 * worst)
 
 
 def run_race(
@@ -297,25 +297,25 @@ def standings(
     most = max(max(counts.values(), default=0), 1)
     errors = np.full((len(names), len(numbers), most), np.inf)
     for v, number in enumerate(numbers):
-        known = trials.known(number)
+        outcomes = trials.known(number)
         for k, trial in enumerate(_first_trials(most)):
-            if trial in known and k < counts[number]:
-                errors[:, v, k] = [known[trial].errors[name] for name in names]
+            if trial in outcomes and k < counts[number]:
+                errors[:, v, k] = [outcomes[trial].errors[name] for name in names]
     u = scores["predicted_uncertainty"].sel(measurement=names).transpose("measurement", "view").values
     chance = scores["chance"].sel(measurement=names).transpose("measurement", "view").values
     tolerances = scores["tolerance"].sel(measurement=names).values
     prior = np.array([prior_risk(row) for row in u])
     samples = joint_samples(errors, prior, np.nan_to_num(chance))
-    found = {name: judge(samples[m], rules.margin) for m, name in enumerate(names)}
+    by_name = {name: judge(samples[m], rules.margin) for m, name in enumerate(names)}
     possible = possible_measurements(u, errors)
-    found[ALL] = judge(combined_risk(samples[possible], tolerances[possible]), rules.margin)
-    decided = all(found[name].loss <= rules.loss for name in asked(found, rules))
-    return Raced(np.array(numbers), found, errors, decided, rules.margin)
+    by_name[ALL] = judge(combined_risk(samples[possible], tolerances[possible]), rules.margin)
+    decided = all(by_name[name].loss <= rules.loss for name in asked(by_name, rules))
+    return Raced(np.array(numbers), by_name, errors, decided, rules.margin)
 
 
-def asked(found: Iterable[str], rules: RaceRules) -> list[str]:
+def asked(names: Iterable[str], rules: RaceRules) -> list[str]:
     """Return the names of the choices that the race has to make."""
-    return list(found) if rules.each else [ALL]
+    return list(names) if rules.each else [ALL]
 
 
 def possible_measurements(u: Floats, errors: Floats) -> NDArray[np.bool_]:
@@ -348,12 +348,12 @@ def _next_round(raced: Raced, counts: dict[int, int], rules: RaceRules) -> dict[
     """Return the number of trials after the next round, for the views that get more."""
     wanted = {}
     for name in asked(raced.standings, rules):
-        one = raced.standings[name]
-        if one.loss <= rules.loss:
+        standing = raced.standings[name]
+        if standing.loss <= rules.loss:
             continue
-        rivals = [int(v) for v in np.argsort(-one.gain, kind="stable") if one.gain[v] > _LEAST_GAIN]
-        for place in [one.leader, *rivals[:_CHALLENGERS]]:
-            number = int(raced.views[place])
+        rivals = [int(v) for v in np.argsort(-standing.gain, kind="stable") if standing.gain[v] > _LEAST_GAIN]
+        for index in [standing.leader, *rivals[:_CHALLENGERS]]:
+            number = int(raced.views[index])
             if counts[number] < rules.most:
                 wanted[number] = min(counts[number] + BATCH, rules.most)
     return wanted

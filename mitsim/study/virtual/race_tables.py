@@ -18,10 +18,10 @@ def with_race(scores: xr.Dataset, raced: Raced) -> xr.Dataset:
     Measured views come first, by their risk; the others follow in the order of screening.
     """
     names = [str(name) for name in scores["measurement"].values]
-    places = {int(view): place for place, view in enumerate(scores["view"].values)}
+    indices = {int(view): index for index, view in enumerate(scores["view"].values)}
     shape = (len(names), scores.sizes["view"])
     risk, count = np.full(shape, np.nan), np.zeros(shape, int)
-    columns = [places[int(view)] for view in raced.views]
+    columns = [indices[int(view)] for view in raced.views]
     if columns:
         risk[:, columns] = [raced.standings[name].risk for name in names]
         count[:, columns] = (~np.isinf(raced.errors)).sum(axis=2)

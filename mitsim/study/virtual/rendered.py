@@ -190,9 +190,9 @@ class RenderedMeasurements:
         }
         images = self._indirect(sensor, scene, pose, view, drawn, shared)
         images = {name: moved_images(stack, motions.get(name)) for name, stack in images.items()}
-        how = self.rendering.indirect_settings
-        assert how is not None  # rendering_of a study
-        indirect = IndirectImages(images, shared.rois, how, self.rendering.depth)
+        settings = self.rendering.indirect_settings
+        assert settings is not None  # rendering_of a study
+        indirect = IndirectImages(images, shared.rois, settings, self.rendering.depth)
         room = {}
         for name, surfaces in shared.seen.items():
             image = moved_images(surfaces.room_radiance(albedos)[None], motions.get(name))[0]
@@ -227,13 +227,13 @@ class RenderedMeasurements:
         --------
         lit : the light
         """
-        drawn, known = lit.drawn, self.study.sensor.room is not None
+        drawn, has_room = lit.drawn, self.study.sensor.room is not None
         power = drawn.power * (1.0 if planned is None else planned.power)
         exposures = lit.light.exposures if planned is None else planned.exposures_s
         radiance = {name: images.copy() for name, images in lit.light.radiance.items()} if keep else lit.light.radiance
         for name, images in radiance.items():
             images *= np.float32(power)
-            if not known:  # a known room is part of the traced light
+            if not has_room:  # a known room is part of the traced light
                 images += lit.room[name] * np.float32(drawn.room)
         light = replace(
             lit.light, radiance=radiance, exposures=tuple(seconds * drawn.exposure for seconds in exposures)
@@ -294,8 +294,8 @@ class RenderedMeasurements:
         shared: ViewLight,
     ) -> dict[str, NDArray[np.float32]]:
         """Return the interreflections (P, h, w) of a draw by camera: on the kept paths, or rendered from a pose."""
-        how = self.rendering.indirect_settings
-        assert how is not None  # rendering_of a study
+        settings = self.rendering.indirect_settings
+        assert settings is not None  # rendering_of a study
         images = {}
         for index, (name, roi) in enumerate(shared.rois.items()):
             if self.rendering.depth == 1:
@@ -306,7 +306,7 @@ class RenderedMeasurements:
                 seed = drawn.seed if self.separate_light else self.unknowns.seed
                 seed = _seed_of(seed, view.number, drawn.finish + 1, index)
                 images[name] = simulated.indirect_radiance(
-                    scene, pose, name, how, seed=seed, depth=self.rendering.depth, roi=roi
+                    scene, pose, name, settings, seed=seed, depth=self.rendering.depth, roi=roi
                 )
         return images
 

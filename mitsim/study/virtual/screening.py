@@ -72,7 +72,7 @@ def effects_of(study: Study, unknowns: Unknowns, limit: TimeLimit | None = None)
     effects: list[Effect] = [shared_errors(study, unknowns)]
     depth = study.file.score.light_path_depth
     if depth > 1 and sees_itself(study.scene):
-        poses = [study.views[place].world_from_sensor for place in scoring_order(study.views, limit)]
+        poses = [study.views[index].world_from_sensor for index in scoring_order(study.views, limit)]
         effects.append(InterreflectionEffect(study.sensor, depth, poses=poses))
     return effects
 

@@ -86,7 +86,7 @@ class SpreadMeasurements:
 
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, Outcome]]:
         """Yield the outcome of every virtual measurement, job by job as they arrive."""
-        orders = [replace(self._order, jobs=some) for some in self._rows(jobs)]
+        orders = [replace(self._order, jobs=row) for row in self._rows(jobs)]
         made = self.workers.distribute(orders, lambda trial_order: trial_order, timed_trials, _light_of)
         for order, (outcomes, seconds) in made:
             self._seconds.append(seconds)
@@ -97,8 +97,8 @@ class SpreadMeasurements:
         longest = _IN_A_ROW
         if self._seconds:
             longest = max(1, min(longest, int(_ORDER_S / max(statistics.median(self._seconds), 1e-3))))
-        for _, some in groupby(jobs, key=lambda job: job.view.number):
-            row = tuple(some)
+        for _, group in groupby(jobs, key=lambda job: job.view.number):
+            row = tuple(group)
             for first in range(0, len(row), longest):
                 yield row[first : first + longest]
 

@@ -135,7 +135,7 @@ def state_view(
         so_far = StatedView(view, _statements(study, trials, view, made), planned)
         if limit.over():
             break
-        decided = all(one.verdict != "not decided" for one in so_far.statements)
+        decided = all(entry.verdict != "not decided" for entry in so_far.statements)
         if table is None and count > BATCH and decided and _settled(so_far.statements):
             break
         if by_known and count >= least and decided and _known_to(so_far.statements, rules.known_to):
@@ -169,9 +169,9 @@ def compared(study: Study, trials: TrialFolder, view: int, other: int) -> float 
         if len(made) < LEAST_COMPARED:
             return None
         stated = _statements(study, trials, study.view(number), made)
-        figures.append(np.array([one.root_mean_square for one in stated]))
+        figures.append(np.array([entry.root_mean_square for entry in stated]))
     sizes = np.array([measurement.tolerance_size or math.nan for measurement in task.measurements.values()])
-    first, second = (each / sizes if np.isfinite(sizes).all() else each for each in figures)
+    first, second = (errors / sizes if np.isfinite(sizes).all() else errors for errors in figures)
     if not (np.isfinite(first) & np.isfinite(second) & (first > 0) & (second > 0)).all():
         return None
     if np.isfinite(sizes).all():
@@ -211,7 +211,7 @@ def _statements(
 
 def _settled(stated: Sequence[Statement]) -> bool:
     """Return whether all statements are settled but those without values."""
-    return all(one.settled or not math.isfinite(one.standard_uncertainty) for one in stated)
+    return all(entry.settled or not math.isfinite(entry.standard_uncertainty) for entry in stated)
 
 
 def least_trials(study: Study, share: float) -> int:
@@ -227,7 +227,9 @@ def least_trials(study: Study, share: float) -> int:
 def _known_to(stated: Sequence[Statement], share: float) -> bool:
     """Return whether the standard error of every standard uncertainty is at most this share of it."""
     return all(
-        one.moved[1] <= share * one.standard_uncertainty for one in stated if math.isfinite(one.standard_uncertainty)
+        entry.moved[1] <= share * entry.standard_uncertainty
+        for entry in stated
+        if math.isfinite(entry.standard_uncertainty)
     )
 
 
@@ -248,26 +250,26 @@ def statement_table(stated: Sequence[Statement]) -> str:
     """Return the statements as a text table."""
     about_error = ("bias", "u", "95 % interval of the error", "after correction", "no value", "most of it from")
     rows = [("measurement", "unit", *about_error, "accepted readings", "verdict")]
-    for one in stated:
+    for entry in stated:
         rows.append(
             (
-                one.measurement,
-                one.unit,
-                plain(beside(one.bias, one.standard_uncertainty)),
-                digits(one.standard_uncertainty),
-                _interval(one.interval),
-                _interval(one.interval_corrected),
-                plain(percent(one.without_value)),
-                _largest(one),
-                _accepted(one),
-                one.verdict,
+                entry.measurement,
+                entry.unit,
+                plain(beside(entry.bias, entry.standard_uncertainty)),
+                digits(entry.standard_uncertainty),
+                _interval(entry.interval),
+                _interval(entry.interval_corrected),
+                plain(percent(entry.without_value)),
+                _largest(entry),
+                _accepted(entry),
+                entry.verdict,
             )
         )
-    lost = lost_features((one.measurement, one.trials, one.losses) for one in stated)
+    lost = lost_features((entry.measurement, entry.trials, entry.losses) for entry in stated)
     lines = [f"no value in {feature.in_words()}" for feature in lost]
     lines += dependences_in_words(
-        (one.measurement, one.unit, one.size_depends_on, None if one.decided is None else one.decided.needed)
-        for one in stated
+        (entry.measurement, entry.unit, entry.size_depends_on, None if entry.decided is None else entry.decided.needed)
+        for entry in stated
     )
     return "\n".join([*aligned(rows), *lines])
 
@@ -276,33 +278,33 @@ def judged(stated: Sequence[Statement]) -> list[Judged]:
     """Return the verdicts, for their description in words."""
     return [
         Judged(
-            one.measurement,
-            one.unit,
-            one.verdict,
-            one.standard_uncertainty,
-            math.nan if one.decided is None else one.decided.needed,
-            one.decided is not None and one.decided.fits_corrected,
-            one.without_value,
-            bias=one.bias,
+            entry.measurement,
+            entry.unit,
+            entry.verdict,
+            entry.standard_uncertainty,
+            math.nan if entry.decided is None else entry.decided.needed,
+            entry.decided is not None and entry.decided.fits_corrected,
+            entry.without_value,
+            bias=entry.bias,
         )
-        for one in stated
+        for entry in stated
     ]
 
 
-def _accepted(one: Statement) -> str:
-    if one.decided is None:
+def _accepted(stated: Statement) -> str:
+    if stated.decided is None:
         return "-"
-    if one.decided.accepted is None:
+    if stated.decided.accepted is None:
         return "none"
-    text = plain(accepted_text(*one.decided.accepted, one.tolerance or 1.0))
-    return text + ", bias subtracted" * one.decided.rule.endswith(BIAS_SUBTRACTED)
+    text = plain(accepted_text(*stated.decided.accepted, stated.tolerance or 1.0))
+    return text + ", bias subtracted" * stated.decided.rule.endswith(BIAS_SUBTRACTED)
 
 
-def _largest(one: Statement) -> str:
+def _largest(stated: Statement) -> str:
     """Return the largest line of the budget; none where the trials are too few to tell which."""
-    if not one.budget:
+    if not stated.budget:
         return ""
-    largest = largest_line(one.budget)
+    largest = largest_line(stated.budget)
     return "too few trials" if largest is None else f"{largest.group} ({100 * largest.share:.0f} %)"
 
 

@@ -81,10 +81,14 @@ def study_unknowns(study: Study, varied: tuple[str, ...] = GROUPS) -> Unknowns:
 
 def calibration_covariance(sensor: Sensor, table: CalibrationUnknowns, folder: Path) -> RigCovariance:
     """Return the covariance of a sensor's calibration, with the drift since then, both scaled as the table says."""
-    known = _unscaled_covariance(sensor, table, folder)
+    covariance = _unscaled_covariance(sensor, table, folder)
     if table.scale == 1:
-        return known
-    return replace(known, covariance=table.scale**2 * known.covariance, source=f"{known.source}; times {table.scale:g}")
+        return covariance
+    return replace(
+        covariance,
+        covariance=table.scale**2 * covariance.covariance,
+        source=f"{covariance.source}; times {table.scale:g}",
+    )
 
 
 def _unscaled_covariance(sensor: Sensor, table: CalibrationUnknowns, folder: Path) -> RigCovariance:
@@ -101,10 +105,10 @@ def _unscaled_covariance(sensor: Sensor, table: CalibrationUnknowns, folder: Pat
 
 def _expansion(study: Study) -> float:
     """Return the linear expansion of the part [1/K], the median over the finishes of its features."""
-    given = study.unknowns.temperature.expansion_per_kelvin
-    if given is not None:
-        return given
+    expansion = study.unknowns.temperature.expansion_per_kelvin
+    if expansion is not None:
+        return expansion
     finishes = [study.scene.finishes[study.scene.names.index(name)] for name in study.task.shapes]
     metals = [finish.name.partition("/")[0] for finish in finishes if finish is not None]
-    known = [EXPANSION_PER_KELVIN.get(metal, _USUAL_EXPANSION) for metal in metals] or [_USUAL_EXPANSION]
-    return float(np.median(known))
+    expansions = [EXPANSION_PER_KELVIN.get(metal, _USUAL_EXPANSION) for metal in metals] or [_USUAL_EXPANSION]
+    return float(np.median(expansions))

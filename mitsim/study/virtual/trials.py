@@ -88,7 +88,7 @@ class TrialFolder:
     ) -> None:
         self.folder, self.digest, self.measurements = Path(folder), digest, tuple(measurements)
         self.folded, self.folded_values = dict(folded or {}), dict(folded_values or {})
-        self._known: dict[int, dict[Trial, Outcome]] = {}
+        self._outcomes: dict[int, dict[Trial, Outcome]] = {}
 
     @classmethod
     def of(cls, folder: str | Path, digest: str, task: Task) -> TrialFolder:
@@ -99,13 +99,13 @@ class TrialFolder:
 
     def known(self, view: int) -> dict[Trial, Outcome]:
         """Return the finished trials of a view; the file is read once."""
-        if view not in self._known:
-            self._known[view] = self._read(view)
-        return self._known[view]
+        if view not in self._outcomes:
+            self._outcomes[view] = self._read(view)
+        return self._outcomes[view]
 
     def add(self, view: int, trial: Trial, outcome: Outcome) -> None:
         """Keep a finished trial; it is on the disk when this function returns."""
-        known, path = self.known(view), self._path(view)
+        outcomes, path = self.known(view), self._path(view)
         values = {name: float(outcome.errors[name]) for name in self.measurements}
         deviations = {name: list(outcome.deviations[name]) for name in self.folded if name in outcome.deviations}
         line: dict[str, Any] = {
@@ -129,17 +129,17 @@ class TrialFolder:
                 os.fsync(stream.fileno())
         except OSError as error:
             raise OSError(error.errno, error.strerror, str(path)) from None
-        known[trial] = Outcome(values, dict(outcome.reasons), deviations)
+        outcomes[trial] = Outcome(values, dict(outcome.reasons), deviations)
 
     def errors(self, view: int, trials: Sequence[Trial]) -> Floats:
         """Return the errors (measurements, trials) of finished trials of a view."""
-        known = self.known(view)
-        return np.array([[known[trial].errors[name] for trial in trials] for name in self.measurements], float)
+        outcomes = self.known(view)
+        return np.array([[outcomes[trial].errors[name] for trial in trials] for name in self.measurements], float)
 
     def deviations(self, view: int, trials: Sequence[Trial], measurement: str) -> Floats:
         """Return the deviations (trials, k m) behind a value that folds; NaN in trials without a value."""
-        known, none = self.known(view), [math.nan] * self.folded[measurement]
-        return np.array([known[trial].deviations.get(measurement, none) for trial in trials], float)
+        outcomes, none = self.known(view), [math.nan] * self.folded[measurement]
+        return np.array([outcomes[trial].deviations.get(measurement, none) for trial in trials], float)
 
     def errors_of_parts(self, view: int, trials: Sequence[Trial]) -> list[Floats | OneSidedErrors]:
         """Return the errors (n,) of finished trials of a view, for every measurement of the task in its order."""
@@ -164,8 +164,8 @@ class TrialFolder:
 
     def reasons(self, view: int, trials: Sequence[Trial], measurement: str) -> list[str]:
         """Return the known reasons why a measurement has no value in finished trials of a view."""
-        known = self.known(view)
-        reasons = [known[trial].reasons for trial in trials if trial in known]
+        outcomes = self.known(view)
+        reasons = [outcomes[trial].reasons for trial in trials if trial in outcomes]
         return [reason[measurement] for reason in reasons if measurement in reason]
 
     def _head(self) -> dict[str, Any]:
@@ -187,19 +187,19 @@ class TrialFolder:
         if not lines or _parsed(lines[0]) != self._head():
             path.replace(path.with_suffix(f".{path.stat().st_mtime_ns}.other"))
             return {}
-        found = {}
+        outcomes = {}
         kept = [lines[0]]
         for line in lines[1:]:
             entry = self._entry(line)
             if entry is None:
                 break  # lines after an invalid line are not trusted either
-            found[entry[0]] = entry[1]
+            outcomes[entry[0]] = entry[1]
             kept.append(line)
         if "\n".join([*kept, ""]) != text:
             partial = path.with_suffix(f".{os.getpid()}.partial")
             partial.write_text("\n".join([*kept, ""]), encoding="utf-8")
             partial.replace(path)
-        return found
+        return outcomes
 
     def _entry(self, line: str) -> tuple[Trial, Outcome] | None:
         try:

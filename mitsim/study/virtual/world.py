@@ -141,10 +141,10 @@ class Unknowns:
     def stream(self, group: str, trial: Trial) -> np.random.Generator:
         """Return the stream of random numbers from which a group is drawn in a trial."""
         day = seed_day(group, trial.day)
-        place = [day, trial.capture] if group in FRESH else [day]
+        key = [day, trial.capture] if group in FRESH else [day]
         if group not in self.varied:
-            place = [0]
-        return np.random.default_rng(np.random.SeedSequence([self.seed, GROUPS.index(group), *place]))
+            key = [0]
+        return np.random.default_rng(np.random.SeedSequence([self.seed, GROUPS.index(group), *key]))
 
     def _geometry(self, rng: np.random.Generator, sensor_kelvin: float) -> tuple[tuple[str, ...], NDArray[np.float64]]:
         """Return names and errors of the rig's parameters, due to calibration and temperature."""

@@ -235,13 +235,13 @@ def contrast_window(capture: Capture, specimen: Specimen) -> int:
 
 def patch_corners(mask: NDArray[np.bool_], side: int, least: float) -> list[tuple[int, int]]:
     """Return the upper left pixels (row, column) of adjacent square patches, at least a share ``least`` in a mask."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    if not len(rows):
+    box = Roi.around(mask)
+    if box is None:
         return []
     return [
         (row, column)
-        for row in range(int(rows[0]), int(rows[-1]) - side + 2, side)
-        for column in range(int(columns[0]), int(columns[-1]) - side + 2, side)
+        for row in range(box.top, box.bottom - side + 1, side)
+        for column in range(box.left, box.right - side + 1, side)
         if mask[row : row + side, column : column + side].mean() >= least
     ]
 

@@ -181,6 +181,7 @@ def test_the_uncertainty_of_a_slots_position_is_the_scatter_of_drawn_fits():
         (('"top", "first", "second"', '"top", "left", "second"'), "plane, axis, axis"),
         (("[-1, 0, 0]", "[0, 1, 0]"), "nearly parallel"),
         ((", outline_mm = [[0, -20, 0], [0, 20, 0], [0, 20, -10]]", ""), "corners of the face"),
+        (('of = ["left", "right"]', 'of = ["left", "left"]'), "found ['left', 'left']; allowed: different features"),
         (("[40, 0, -7]", "[-40, 0.5, -7]"), "1 mm apart"),
         (("[0, 0, -1], radius", "[1, 0, 0], radius"), "perpendicular"),
     ],

@@ -126,6 +126,9 @@ def test_pairs_that_cannot_be_measured_are_refused():
         WindowPlan(features, [("angle", "a", "ball")]).check()
     with pytest.raises(InputError, match="did you mean 'ball'"):
         WindowPlan(features, [("distance", "a", "bal")]).check()
+    for kind, name in (("angle", "a"), ("distance", "a"), ("distance", "ball")):
+        with pytest.raises(InputError, match=f"--{kind}: found {name},{name}; allowed: two different features"):
+            WindowPlan(features, [(kind, name, name)]).check()
 
 
 BALL = sphere([0, 0, 450], 20), plane([0, 0, 470], [0, 0.3, -1])

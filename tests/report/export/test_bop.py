@@ -4,6 +4,7 @@ The page is docs/bop_datasets_format.md of bop_toolkit, which is not on PyPI.
 """
 
 import json
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from typer.testing import CliRunner
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.cli.program import app
-from mitsim.report.export.bop import depth_scale, find_sources, on_pinhole
+from mitsim.report.export.bop import depth_scale, find_sources, on_pinhole, write_bop
 from tests.report.export.test_export_command import export
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -160,6 +161,20 @@ def test_objects_are_groups_of_shapes_that_hide_one_another(data_set, tmp_path):
         assert np.array_equal(shown > 0, images["feature"] == plane)
         assert plate["px_count_all"] == (under > 0).sum() > plate["px_count_visib"] == (shown > 0).sum()
         assert plate["visib_fract"] == plate["px_count_visib"] / plate["px_count_all"]
+
+
+def test_a_folder_of_two_scenes_has_the_images_of_each_or_is_refused(data_set, tmp_path):
+    first, other = find_sources(data_set / "captures")
+    (tmp_path / "moved.xml").write_text(SCENE.read_text().replace('x="35"', 'x="45"'))
+    sources = [first, replace(other, finish=first.finish, scene=tmp_path / "moved.xml")]
+    write_bop(sources, tmp_path / "data", patterns=["pillar1*"])
+    features, names = [], json.loads((tmp_path / "data/features.json").read_text())
+    for _, _, _, images, _ in BopReader(tmp_path / "data", "train").frames():
+        features.append([int(name) for name in names if names[name] == "pillar2_top"] == images["feature"])
+    assert features[0].sum() > 500 and (features[0] != features[1]).sum() > 500
+    with pytest.raises(InputError, match=r"moved\.xml .*differ from the first capture.*the same objects"):
+        write_bop(sources, tmp_path / "whole")  # one model for two parts
+    assert not (tmp_path / "whole").exists()
 
 
 def test_what_cannot_be_exported_is_told(data_set, tmp_path):

@@ -1,6 +1,7 @@
 """The digital calibration certificate: elements in PTB's order, numbers in D-SI's form and those of the statement."""
 
 import re
+from dataclasses import replace
 
 import pytest
 
@@ -150,6 +151,26 @@ def test_numbers_are_those_of_the_statement(document, every_kind):  # noqa: F811
                 1.25e9,
                 0.95,
             ]  # from the bias, -0.25, to the farther end
+
+
+@pytest.mark.parametrize(
+    ("nominal", "tolerance", "deviations"),
+    [
+        (12.5, (-0.2, 0.1), {"lower deviation": -0.2, "upper deviation": 0.1}),
+        (0.1, (-0.1, 0.3), {"upper deviation": 0.3}),  # no value is below 0
+        (0.1, 0.1, {"upper deviation": 0.1}),
+        (0.0, 0.1, {"upper deviation": 0.1}),
+    ],
+)
+def test_a_lower_limit_without_an_effect_is_none(every_kind, tmp_path, nominal, tolerance, deviations):  # noqa: F811
+    result = replace(every_kind.results[0], nominal=nominal, tolerance=tolerance)
+    write_dcc(replace(every_kind, results=[result]), declared(), ISSUER, tmp_path / "dcc.xml")
+    found = {
+        quantity.find("{*}name/{*}content").text: float(quantity.find("{*}real/{*}value").text)
+        for quantity in etree.parse(tmp_path / "dcc.xml").iter(f"{{{DCC}}}quantity")
+        if quantity.find("{*}name/{*}content").text.startswith("tolerance")
+    }
+    assert found == {f"tolerance, {name}": value for name, value in deviations.items()}
 
 
 def test_the_country_is_the_laboratorys_alone(document):

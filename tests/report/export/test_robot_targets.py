@@ -134,5 +134,15 @@ def test_targets_of_a_run_are_its_set_of_views(tmp_path):
     ):
         with pytest.raises(InputError, match=message):
             export("targets", folder, *options)
+    for entries, views, message in (
+        (document["views"][:5], "best", r"poses\.json: views: found no entry of view (9|11)"),
+        ([], "best", r"poses\.json: views: found no entry of view"),
+        ([], "all", r"poses\.json: views: found no view; "),
+        ([], "3", "--views: found '3'; allowed: best or all: there are no views"),
+        ([{"view": float("inf")}], "all", r"poses\.json: found a file that cannot be read"),
+    ):
+        (folder / "poses/poses.json").write_text(json.dumps({"views": entries}))
+        with pytest.raises(InputError, match=message):
+            read_targets(folder, views)
     with pytest.raises(InputError, match=r"poses\.json: found no such file"):
         export("targets", tmp_path, "--robot", "abb", "-o", tmp_path / "w.mod")
