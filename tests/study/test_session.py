@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 
 from characterisation.files.errors import InputError
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.maps.shipped import shipped_maps
 from mitsim.cli.options import keep_finished
 from mitsim.maps.prediction.interreflections import TOGETHER, InterreflectionEffect, InterreflectionImage
 from mitsim.running.time_limit import TimeLimit
 from mitsim.study import RaceTable, StatementTable, StudyFile, open_study, session
+from mitsim.study.remedies.change import reopened
 from mitsim.study.run import run_study, run_within
 from mitsim.study.run_folder import read_run
 from mitsim.study.session import Session
@@ -195,3 +198,16 @@ def test_a_run_within_a_limit_says_what_it_lacks_and_goes_on_without_one(study, 
     assert whole[0].trials == 2 and about.finished and not about.lacks
     with pytest.raises(InputError, match="finished run"):
         keep_finished(tmp_path / "other", False, "run.json")
+
+
+def test_a_map_of_ones_own_is_still_there_when_workers_and_changes_open_the_study_again(tmp_path):
+    sensor = coarse_sensor("ensenso-n10", 2, tmp_path)
+    sensor.write_text(sensor.read_text().replace('"ensenso-n10"', '"mine"'))
+    shipped = PerformanceMap.load(shipped_maps()["ensenso-n10"])
+    shipped.data.attrs["sensor"] = "mine"
+    shipped.save(tmp_path / "map.nc")
+    table = {"scene": "matt_white.xml", "task": "task.toml", "sensor": str(sensor), "views": {"subdivisions": 0}}
+    opened = open_study(SCENES / "study.toml", StudyFile.model_validate(table), performance_map=tmp_path / "map.nc")
+    again = reopened(opened, {"measure": {"by": "render"}})
+    assert again.performance_map.data.identical(opened.performance_map.data)
+    assert open_study(opened.path, opened.file, mapped=False).performance_map.data.attrs["sensor"] == "mine"

@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from characterisation.files.documents import validate
+from characterisation.files.errors import InputError
 from mitsim.views import ViewsTable, candidate_views, write_views
 
 STAGE = {
@@ -138,3 +139,11 @@ def test_views_that_stand_farther_out_are_counted(n10, tmp_path, capsys):
     write_views(tmp_path / "poses", found, table, n10.name)
     assert found.moved_out > 0
     assert f"{found.moved_out} of {len(found.views)} views are moved farther out" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("axes", [2, 3])
+def test_a_stage_without_a_direction_above_the_horizon_says_so(n10, axes):
+    tilt = {"name": "tilt", "direction": [0, 1, 0], "limits_deg": [-30, 30]}
+    stage = {**STAGE, "axes": [*STAGE["axes"], tilt][:axes]}
+    with pytest.raises(InputError, match="no direction above it"):
+        views(n10, subdivisions=0, lowest_elevation_deg=89, up=[1, 2, 3], stage=stage)

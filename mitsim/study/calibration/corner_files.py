@@ -6,8 +6,8 @@ Signal chain: folder of images, table of corners, OpenCV's file or arrays -> pix
 Four forms are read:
 
 - **A folder of images.** Camera and pose follow from the names: ``left-0001.png`` and ``right-0001.png``, as ROS's
-  calibrator saves them, or folders ``left`` and ``right`` with images of equal names. Names without a camera belong to
-  one camera. The corners are found by ``cv2.findChessboardCornersSB``.
+  calibrator saves them, or two folders, such as ``left`` and ``right``, with images of equal names. Names without a
+  camera belong to one camera. The corners are found by ``cv2.findChessboardCornersSB``.
 - **A table**, ``.csv``: columns ``pose, camera, column, row, x_px, y_px``. ``column`` and ``row`` count the inner
   corners from 0. A camera named ``projector`` is a projector. Lines ``# size CAMERA WIDTH HEIGHT`` give the sizes.
 - **OpenCV's file**, ``.yml``, ``.yaml``, ``.xml`` or ``.json`` of its calibration sample: ``image_points`` (poses,
@@ -20,7 +20,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -149,8 +149,9 @@ def _of_images(path: Path, board: Board) -> tuple[Seen, Sizes, dict[str, FittedC
     seen: Seen = {}
     sizes: Sizes = {}
     digests: dict[str, dict[str, bytes]] = {}
+    folders = {file.parent for file in files}
     for file in files:
-        camera, pose = _named(file.relative_to(path))
+        camera, pose = _named(file.relative_to(path), len(folders) > 1)
         image = read_grey(file)
         size = (image.shape[1], image.shape[0])
         if sizes.setdefault(camera, size) != size:
@@ -169,7 +170,7 @@ def _of_images(path: Path, board: Board) -> tuple[Seen, Sizes, dict[str, FittedC
     if not files:
         raise InputError(path, "", "no image", f"images {', '.join(sorted(_IMAGES))} of the board")
     if len(sizes) > 2:
-        raise InputError(path, "", f"images of {', '.join(sizes)}", "one or two cameras", "name them left and right")
+        raise _too_many(path, sizes)
     images = {
         pose: FittedCapture(
             name=f"{path / pose}", images_sha256=joined_digest(by_camera[camera] for camera in sorted(by_camera))
@@ -192,6 +193,11 @@ def found_corners(image: NDArray[np.generic], board: Board) -> Floats | None:
     return np.asarray(corners, float).reshape(-1, 2) if detected else None
 
 
+def _too_many(path: Path, cameras: Iterable[str]) -> InputError:
+    hint = "name them left and right; calibrate pairs of more cameras one by one"
+    return InputError(path, "", f"corners of {', '.join(cameras)}", "one or two cameras", hint)
+
+
 def turned_alike(first: Floats, second: Floats) -> Floats:
     """Return the corners (n, 2) [px] of a second camera in the order of those of a first.
 
@@ -202,9 +208,9 @@ def turned_alike(first: Floats, second: Floats) -> Floats:
     return second if alike else second[::-1]
 
 
-def _named(file: Path) -> tuple[str, str]:
-    """Return the camera and the pose that the name of an image states."""
-    if len(file.parts) > 1:
+def _named(file: Path, folder_is_camera: bool) -> tuple[str, str]:
+    """Return the camera and the pose that the name of an image states; its path is relative to the folder read."""
+    if folder_is_camera and len(file.parts) > 1:
         return file.parts[-2], file.stem
     match = re.match(r"(left|right|l|r|camera\d*|cam\d*)[-_ ]?(.*)$", file.stem, re.IGNORECASE)
     if match and match[2]:
@@ -223,8 +229,9 @@ def _of_table(path: Path, board: Board) -> tuple[Seen, Sizes]:
             sizes[match[1]] = (int(match[2]), int(match[3]))
     written = "\n".join(line for line in text.splitlines() if not line.startswith("#"))
     rows = csv.DictReader(io.StringIO(written), skipinitialspace=True)
-    if tuple(name.strip() for name in rows.fieldnames or ()) != _COLUMNS:
-        raise InputError(path, "header", ", ".join(rows.fieldnames or ()) or "nothing", ", ".join(_COLUMNS))
+    rows.fieldnames = [name.strip() for name in rows.fieldnames or ()]
+    if tuple(rows.fieldnames) != _COLUMNS:
+        raise InputError(path, "header", ", ".join(rows.fieldnames) or "nothing", ", ".join(_COLUMNS))
     seen: Seen = {}
     for number, row in enumerate(rows, 1):
         try:
@@ -241,7 +248,10 @@ def _of_table(path: Path, board: Board) -> tuple[Seen, Sizes]:
             raise InputError(path, row["camera"], "no size", f"a line # size {row['camera']} WIDTH HEIGHT")
         by_eye = seen.setdefault(row["pose"], {}).setdefault(row["camera"], {})
         by_eye[line_of_board * (board.columns - 1) + column] = pixel
-    return seen, sizes
+    cameras = [eye for eye in sizes if eye != "projector"]
+    if not 0 < len(cameras) <= 2:
+        raise _too_many(path, sizes)
+    return seen, dict(sorted(sizes.items(), key=lambda size: size[0] == "projector"))
 
 
 def _of_arrays(path: Path, arrays: Mapping[str, Any], board: Board) -> tuple[Seen, Sizes]:
@@ -273,7 +283,7 @@ def _size(path: Path, arrays: Mapping[str, Any]) -> tuple[int, int]:
     size = arrays.get("image_size", [arrays.get("image_width"), arrays.get("image_height")])
     try:
         width, height = (int(value) for value in np.asarray(size).ravel())
-    except (TypeError, ValueError):
+    except (OverflowError, TypeError, ValueError):
         raise InputError(path, "image_size", size, "width and height of the images [px]") from None
     if not (0 < width <= 65535 and 0 < height <= 65535):
         raise InputError(path, "image_size", f"{width} x {height}", "1 to 65535 px")

@@ -107,12 +107,13 @@ def _bias(now: Shortfall) -> Iterator[Change]:
         return
     task = now.study.task
     decision = task.decision.model_copy(update={"subtract_bias": True})
+    rules = {
+        name: measurement.decision.model_copy(update={"subtract_bias": True})
+        for name, measurement in task.measurements.items()
+        if measurement.decision is not None
+    }
     measurements = {
-        name: measurement
-        if measurement.decision is None
-        else measurement.model_copy(
-            update={"decision": measurement.decision.model_copy(update={"subtract_bias": True})}
-        )
+        name: measurement.model_copy(update={"decision": rules[name]}) if name in rules else measurement
         for name, measurement in task.measurements.items()
     }
     corrected = task.model_copy(update={"decision": decision, "measurements": measurements})
@@ -127,7 +128,8 @@ def _bias(now: Shortfall) -> Iterator[Change]:
 
     words = "with its bias subtracted"
     expected = {name: statement.standard_uncertainty for name, statement in able.items()}
-    keys = {"decision": {"subtract_bias": True}}
+    subtracts = {"decision": {"subtract_bias": True}}
+    keys = subtracts | ({"measurements": dict.fromkeys(rules, subtracts)} if rules else {})
     yield Change("bias", words, keys, (number,), expected, state, needs_trials=False)
 
 

@@ -85,7 +85,11 @@ def remedies_in_words(remedies: RemediesEntry | None) -> list[str]:
         return []
     lines = list[str]()
     for index, tried in enumerate(remedies.tried):
-        names = [name for name, measurement in remedies.measurements.items() if measurement.fits_by == index]
+        names = [
+            name
+            for name, measurement in remedies.measurements.items()
+            if measurement.fits_by == index and name in tried.measurements
+        ]
         if names:
             changed = [_changed(name, remedies.measurements[name], tried.measurements[name]) for name in names]
             verb = "fits" if len(names) == 1 else "fit"

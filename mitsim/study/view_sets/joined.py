@@ -12,7 +12,7 @@ orthogonal distances (:func:`characterisation.tasks.evaluation.measure_points`).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,7 +24,10 @@ from characterisation.files.arrays import Floats
 from characterisation.point_cloud import PointCloud
 from characterisation.scores.joining import pose_covariance
 from characterisation.tasks.evaluation import measure, measure_points
+from characterisation.tasks.result import Result
+from characterisation.tasks.task_file import Task
 from mitsim.study import MINIMUM_POINTS, SetTable
+from mitsim.study.virtual.form import measured_with_form
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.trials import Outcome
 from mitsim.study.virtual.world import Trial
@@ -36,11 +39,15 @@ _POSE_STREAM = 31
 
 @dataclass(frozen=True)
 class _MeasuredView:
-    """One view of a day: ``points`` (n, 3) [mm] of each feature, in the part frame by the assumed pose of the view."""
+    """One view of a day: ``points`` (n, 3) [mm] of each feature, in the part frame by the assumed pose of the view.
+
+    ``clouds(with_form)`` returns its labelled cloud, with or without the form deviation of the part.
+    """
 
     points: dict[str, Floats]
     assumed: Floats
-    cloud: PointCloud
+    clouds: Callable[[bool], PointCloud]
+    deviates: bool
 
 
 class JoinedMeasurements:
@@ -60,7 +67,8 @@ class JoinedMeasurements:
         """Return the points of one view on one day; its ``number`` in the set is that of its capture."""
         renderer, first = self.renderer, self.renderer.unknowns.draw(Trial(day))
         drawn = replace(renderer.unknowns.draw(Trial(day, number)), placed=first.placed, assumed=first.assumed)
-        cloud, assumed = renderer.cloud_of(view, drawn)
+        clouds, assumed = renderer.clouds_of(view, drawn)
+        cloud = clouds(True)
         rng = np.random.default_rng(np.random.SeedSequence([renderer.unknowns.seed, _POSE_STREAM, day, number]))
         # error of the assumed pose, a motion [w (rad), t (mm)]
         error = np.sqrt(np.diag(self.covariance)) * rng.standard_normal(6)
@@ -71,13 +79,17 @@ class JoinedMeasurements:
             nominal = renderer.study.task.features[name].nominal(assumed.inverse().matrix())
             kept = face_points[belonging(face_points, nominal, cloud.grid.origin)] if len(face_points) else face_points
             points[name] = kept @ motion[:3, :3].T + motion[:3, 3]
-        return _MeasuredView(points, assumed.matrix(), cloud)
+        return _MeasuredView(points, assumed.matrix(), clouds, renderer.deviates(drawn))
 
     def _measured(self, measured: Sequence[_MeasuredView], day: int) -> Outcome:
         task = self.renderer.study.task
         if len(measured) == 1:
-            motion = np.linalg.inv(measured[0].assumed)
-            results = measure(measured[0].cloud, task, motion, MINIMUM_POINTS, False)
+            motion, clouds = np.linalg.inv(measured[0].assumed), measured[0].clouds
+
+            def evaluate(task: Task, with_form: bool) -> dict[str, Result]:
+                return measure(clouds(with_form), task, motion, MINIMUM_POINTS, False)
+
+            results = measured_with_form(task, evaluate, measured[0].deviates)
         else:
             try:
                 points = self._join(measured, day)

@@ -19,7 +19,7 @@ change of the image position is far below a pixel, and that of the brightness fa
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -143,8 +143,18 @@ class RenderedMeasurements:
 
     def cloud_of(self, view: View, drawn: DrawnValues) -> tuple[PointCloud, Transform]:
         """Return the labelled cloud of a view for one draw, and the assumed pose of the sensor."""
+        clouds, assumed = self.clouds_of(view, drawn)
+        return clouds(True), assumed
+
+    def clouds_of(self, view: View, drawn: DrawnValues) -> tuple[Callable[[bool], PointCloud], Transform]:
+        """Return the labelled cloud of a view for one draw, with or without form deviation, and the assumed pose."""
         captured = self._captured(view, drawn)
-        return self._cloud(captured), captured.assumed
+        decoded = self.unlabelled_cloud(captured.capture, captured.drawn.decoder)
+        return partial(self._labelled, captured, decoded), captured.assumed
+
+    def deviates(self, drawn: DrawnValues) -> bool:
+        """Return whether the clouds of a draw have a form deviation."""
+        return bool(self._has_form and drawn.form)
 
     def outcome(self, capture: Capture, lit: TracedLight) -> Outcome:
         """Return the outcome of a capture of traced light, decoded and measured as in a trial."""
@@ -158,8 +168,7 @@ class RenderedMeasurements:
             cloud = self._labelled(captured, decoded, with_form)
             return measure(cloud, task, part_from_world, MINIMUM_POINTS, False)
 
-        deviates = bool(self._has_form and captured.drawn.form)
-        return Outcome.of(measured_with_form(self.study.task, evaluate, deviates))
+        return Outcome.of(measured_with_form(self.study.task, evaluate, self.deviates(captured.drawn)))
 
     def _captured(self, view: View, drawn: DrawnValues) -> _Captured:
         lit = self.lit(view, drawn)
@@ -173,7 +182,7 @@ class RenderedMeasurements:
 
     def _moves_faces(self, drawn: DrawnValues) -> bool:
         """Return whether the faces of a draw lie off their nominal places, by form or coat."""
-        return bool((self._has_form and drawn.form) or (self._has_coat and drawn.coat))
+        return self.deviates(drawn) or bool(self._has_coat and drawn.coat)
 
     def lit(self, view: View, drawn: DrawnValues) -> TracedLight:
         """Trace the light of one draw in a view, which all of its exposures share."""

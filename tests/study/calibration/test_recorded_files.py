@@ -84,6 +84,31 @@ def test_every_form_gives_the_same_corners(tmp_path):
                 np.testing.assert_allclose(board.pixels[name], pixels[name][number], rtol=1e-12, err_msg=file.name)
 
 
+def test_a_projector_is_never_the_reference_and_spaces_in_the_header_do_not_matter(tmp_path):
+    pixels = pixels_of(1)
+    write_table(tmp_path / "corners.csv", pixels)
+    text = (tmp_path / "corners.csv").read_text().replace("left", "projector").replace("column,row", "column ,row")
+    (tmp_path / "corners.csv").write_text(text)
+    corners = read_corners(tmp_path / "corners.csv", BOARD)
+    assert list(corners.sizes) == ["right", "projector"]
+    assert np.array_equal(corners.boards[3].pixels["projector"], pixels["left"][3])
+
+
+def test_corners_of_three_cameras_are_refused_not_dropped(tmp_path):
+    pixels = pixels_of(1, count=2)
+    write_table(tmp_path / "corners.csv", {**pixels, "third": pixels["left"]})
+    text = (tmp_path / "corners.csv").read_text()
+    (tmp_path / "corners.csv").write_text("# size third 1280 960\n" + text)
+    with pytest.raises(InputError, match="one or two cameras"):
+        read_corners(tmp_path / "corners.csv", BOARD)
+
+
+def test_the_size_of_images_is_a_finite_number(tmp_path):
+    np.savez(tmp_path / "corners.npz", imgpoints=pixels_of(1)["left"], image_size=[np.inf, 960])
+    with pytest.raises(InputError, match="image_size"):
+        read_corners(tmp_path / "corners.npz", BOARD)
+
+
 def test_corners_outside_the_images_are_refused(tmp_path):
     """Before, images of half the size had a calibration with the principal point in their corner."""
     pixels = pixels_of(1)
@@ -110,20 +135,22 @@ def test_corners_in_the_order_of_another_board_are_said(tmp_path):
         calibrate_checked(boards_of(mixed), BOARD, {"left": SIZE, "right": SIZE}, "x")
 
 
-def test_images_of_ros_give_the_corners_of_the_board(tmp_path):
+@pytest.mark.parametrize("folder", ["", "poses"])  # one folder of both cameras is not a camera
+def test_images_of_ros_give_the_corners_of_the_board(tmp_path, folder):
+    (tmp_path / folder).mkdir(exist_ok=True)
     squares = np.kron(np.indices((7, 9)).sum(axis=0) % 2, np.ones((40, 40)))
     for pose, angle in enumerate((0.0, 8.0)):
         for name, shift in (("left", 60), ("right", 90)):
             motion = cv2.getRotationMatrix2D((240, 200), angle, 1.0)
             motion[:, 2] += shift
             image = cv2.warpAffine(255 * squares.astype(np.uint8), motion, (640, 480), borderValue=200)
-            cv2.imwrite(str(tmp_path / f"{name}-{pose:04d}.png"), image)
+            cv2.imwrite(str(tmp_path / folder / f"{name}-{pose:04d}.png"), image)
     found = read_corners(tmp_path, BOARD)
     assert found.sizes == {"left": (640, 480), "right": (640, 480)} and len(found.boards) == 2
     for board in found.boards:  # the right image is the left one, shifted by 30 px along both axes
         np.testing.assert_allclose(board.pixels["right"] - board.pixels["left"], 30.0, atol=0.05)
     # the same images as a capture are recognised, whichever program reads them
-    pair = [str(tmp_path / f"{name}-0001.png") for name in ("left", "right")]
+    pair = [str(tmp_path / folder / f"{name}-0001.png") for name in ("left", "right")]
     images = {path: cv2.imread(path, cv2.IMREAD_GRAYSCALE)[None] for path in pair}
     assert [board.images.images_sha256 == images_digest(images) for board in found.boards] == [False, True]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,9 @@ from characterisation.statements.decision import demand
 from characterisation.statements.statement import Statement, statement
 from characterisation.statements.tolerance import plus_minus
 from characterisation.tasks.decision_table import Decision
+from characterisation.tasks.task_file import Task
 from mitsim.running.time_limit import TimeLimit
+from mitsim.study.remedies import changes as changes_module
 from mitsim.study.remedies.bounds import EXPOSURE, Effect, can_fit, least_shares, least_uncertainty
 from mitsim.study.remedies.change import Change, changed_file
 from mitsim.study.remedies.confirm import Remedies, find_remedies, of_missed, remedies_document
@@ -277,3 +280,34 @@ def test_more_than_four_measurements_that_fit_are_counted() -> None:
     )
     one = "(u 0.020 mm, before 0.80 mm)"
     assert line == f"with spray: a {one}, b {one}, c {one} and 3 more fit (40 virtual measurements)"
+
+
+def test_a_record_that_names_a_change_without_the_measurement_is_read_all_the_same() -> None:
+    entry = MissedEntry(unit="mm", standard_uncertainty=0.5, needed=0.2, demand=2.0, fits_by=0)
+    tried = {"change": "spray", "words": "sprayed", "keys": {}, "views": [1], "trials": 9, "measurements": {}}
+    entries = RemediesEntry.model_validate({"measurements": {"radius": entry.model_dump()}, "tried": [tried]})
+    assert not any("sprayed" in line for line in remedies_in_words(entries))
+
+
+def test_the_keys_of_a_subtracted_bias_are_those_of_every_rule_that_it_changes(monkeypatch) -> None:
+    task = Task.model_validate(
+        {
+            "features": {"ball": {"kind": "sphere", "point_mm": [0, 0, 0], "radius_mm": 5.0}},
+            "decision": {"guard_share": 0.25},
+            "measurements": {
+                name: {"kind": "radius", "features": ["ball"], "nominal": 5.0, "unit": "mm", "tolerance": 0.1, **rule}
+                for name, rule in {"plain": {}, "ruled": {"decision": {"guard_share": 0.5}}}.items()
+            },
+        }
+    )
+    errors = 0.3 + 0.01 * NORMAL
+    one = statement("ruled", "mm", errors, plus_minus(5.0, 0.1, Decision()))
+    now = SimpleNamespace(
+        study=SimpleNamespace(task=task),
+        session=None,
+        stated=SimpleNamespace(view=SimpleNamespace(number=7), statements=(one,)),
+        missed={"ruled": one},
+    )
+    (change,) = changes_module._bias(now)
+    subtracts = {"decision": {"subtract_bias": True}}
+    assert change.keys == {**subtracts, "measurements": {"ruled": subtracts}}
