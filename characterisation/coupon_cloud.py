@@ -209,8 +209,8 @@ def _cropped(cloud: PointCloud, window: Roi) -> PointCloud:
     """Crop a cloud and its grid to a window."""
     grid, inside = cloud.grid, window.slices
     bent = None if grid.normalised is None else grid.normalised[inside]
-    moved = replace(grid, cx=grid.cx - window.left, cy=grid.cy - window.top, width=window.width, height=window.height)
-    part = replace(moved, normalised=bent)
+    left, top, width, height = window.left, window.top, window.width, window.height
+    part = replace(grid, cx=grid.cx - left, cy=grid.cy - top, width=width, height=height, normalised=bent)
     return PointCloud(cloud.points[inside], cloud.status[inside], part, cloud.sensor, cloud.source, cloud.baseline)
 
 

@@ -5,7 +5,7 @@ Signal chain: window [px] -> its points -> robust fit along the view rays, seen 
 (:func:`characterisation.tasks.measurement_model.evaluate`).
 
 A window should contain one feature and little else. If fewer than :data:`LEAST_SHARE` of its points lie on the fitted
-surface, the result has no value and states this reason.
+surface, or they scatter widely about it, the result has no value and states this reason.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from characterisation.features.fitted import CylinderFit, PlaneFit, SphereFit
 from characterisation.features.form import fit_form, zone
 from characterisation.features.robust_fit import FitError
 from characterisation.features.starts import cylinder_start
+from characterisation.features.surfaces import lengths
 from characterisation.files.errors import InputError, nearest
 from characterisation.point_cloud import PointCloud
 from characterisation.region_of_interest import Roi
@@ -47,6 +48,10 @@ ShapeFit = PlaneFit | SphereFit | CylinderFit
 
 #: least share of a window's points on the fitted surface
 LEAST_SHARE = 0.5
+
+#: largest noise of a fit over the distance of its points. Points that are all false scatter over the range of a
+#: matcher, by 5 % or more; no sensor has noise of 3 %. *Assumed*
+MOST_NOISE = 0.03
 
 #: least number of points in a window
 LEAST_POINTS = 30
@@ -141,7 +146,12 @@ def measure_windows(cloud: PointCloud, plan: WindowPlan, frame: NDArray[np.float
     for name, (shape, window) in plan.features.items():
         points = window_points(window, cloud, name)
         counts[name] = len(points)
-        fits[name] = fit = _fit_shape(points, shape, cloud.grid.origin)
+        fit: ShapeFit | FitError
+        try:
+            fit = fit_shape(points, shape, cloud.grid.origin)
+        except FitError as error:
+            fit = FitError(f"{error}: does the window show one {shape}?")
+        fits[name] = fit
         if isinstance(fit, FitError):
             quantities = [*((quantity, "mm") for quantity in _QUANTITIES[shape]), *PLACE_QUANTITIES[shape]]
             results += [failed(f"{name} {quantity}", unit, str(fit), 0, len(points)) for quantity, unit in quantities]
@@ -176,25 +186,33 @@ _PAIR_FUNCTIONS: dict[tuple[PairKind, Shape, Shape], Callable[..., Any]] = {
 }
 
 
-def _fit_shape(points: NDArray[np.float64], shape: Shape, viewpoint: NDArray[np.float64]) -> ShapeFit | FitError:
-    """Return the fit of a shape to points (n, 3) [mm], or the error that says why there is none."""
-    try:
-        if len(points) < LEAST_POINTS:
-            raise FitError(f"{len(points)} points in the window, at least {LEAST_POINTS} are needed")
-        fit: ShapeFit
-        match shape:
-            case "plane":
-                fit = fit_plane(points, viewpoint)
-            case "sphere":
-                fit = fit_sphere(points, viewpoint)
-            case "cylinder":
-                fit = fit_cylinder(points, cylinder_start(points), viewpoint)
-        if fit.count < LEAST_SHARE * len(points):
-            share = f"{100 * fit.count / len(points):.0f} % of the {len(points)} points"
-            raise FitError(f"only {share} lie on the fitted {shape}")
-        return fit
-    except FitError as error:
-        return FitError(f"{error}: does the window show one {shape}?")
+def fit_shape(points: NDArray[np.float64], shape: Shape, viewpoint: NDArray[np.float64]) -> ShapeFit:
+    """Fit a shape to the points (n, 3) [mm] of a window, seen from a viewpoint (3,) [mm].
+
+    Raises
+    ------
+    FitError
+        If the points do not determine it, fewer than :data:`LEAST_SHARE` of them lie on it, or they scatter about it by
+        more than :data:`MOST_NOISE` of their distance.
+    """
+    if len(points) < LEAST_POINTS:
+        raise FitError(f"{len(points)} points in the window, at least {LEAST_POINTS} are needed")
+    fit: ShapeFit
+    match shape:
+        case "plane":
+            fit = fit_plane(points, viewpoint)
+        case "sphere":
+            fit = fit_sphere(points, viewpoint)
+        case "cylinder":
+            fit = fit_cylinder(points, cylinder_start(points), viewpoint)
+    if fit.count < LEAST_SHARE * len(points):
+        share = f"{100 * fit.count / len(points):.0f} % of the {len(points)} points"
+        raise FitError(f"only {share} lie on the fitted {shape}")
+    distance = float(np.median(lengths(points - viewpoint)))
+    if fit.residual_std > MOST_NOISE * distance:
+        scatter = f"the {len(points)} points scatter by {fit.residual_std:.3g} mm about the fitted {shape}"
+        raise FitError(f"{scatter}, {100 * fit.residual_std / distance:.2g} % of their distance")
+    return fit
 
 
 def _shape_results(

@@ -158,7 +158,9 @@ def verify(
         options.refuse_unused(context, "no --dots", "--dots PITCH: it is the uncertainty of their pitch", "printed")
     numbers = [] if dots is None else _plate_numbers(dots)
     read = read_capture(capture)
-    chosen = sensor_of(read, sensor, capture)
+    chosen = sensor_of(read, sensor, capture, "decoding")
+    for note in chosen.notes:
+        say(f"warning: {note}")
     covariance = calibration_covariance(chosen, chosen.unknowns.calibration, Path(sensor or ".").parent)
     cloud = None
     if dots is not None or len(read.images) < 2:

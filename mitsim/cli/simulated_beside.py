@@ -84,11 +84,11 @@ def beside_simulated(
         real += _with_coupon(recorded, name, target, target.window, figures)
         try:
             seen = seen_target(target.shape, target.window, recorded, name, target.distance)
+            say(f"simulating {preset.name} before {name}")
+            cloud, window = simulated_target(seen, recorded, preset, name, seed)
         except FitError as error:
             twin += [failed(result.name, result.unit, f"no twin: {error}") for result in real[len(twin) :]]
             continue
-        say(f"simulating {preset.name} before {name}")
-        cloud, window = simulated_target(seen, recorded, preset, name, seed)
         twin += _with_coupon(cloud, name, target, window, figures)
     return real, twin
 

@@ -71,6 +71,17 @@ def test_a_target_beside_the_field_of_view_is_refused(small):
         simulated_target(Target(far, Roi(0, 0, 4, 4)), recorded, load_sensor(small), "wall")
 
 
+@pytest.mark.parametrize("distance", [150, 5000])
+def test_a_target_that_the_decoder_does_not_search_has_no_twin(tmp_path, small, distance):
+    """Before, a plane through the false points of the matcher, with a small uncertainty."""
+    write_cloud(cloud_of(plane([0, 0, distance], [0, 0, -1])), tmp_path / "wall.ply")
+    options = (tmp_path / "wall.ply", "--plane", "wall=40,30,120,100", "--simulated", small)
+    document = json.loads(mitsim_here("measure", *options, "--json", code=None).stdout)["beside"]
+    settings = load_sensor(small).settings
+    searched = f"beyond {settings.near_mm:g} to {settings.far_mm:g} mm"
+    assert all(result["value"] is None and searched in result["reason"] for result in document["simulated"])
+
+
 @pytest.mark.parametrize("command", [["measure"], ["measure", "acceptance"]])
 def test_one_command_states_both(tmp_path, small, rng, command):
     write_cloud(cloud_of(plane([0, 0, 600], [0, 0, -1]), 0.5, rng), tmp_path / "wall.ply")

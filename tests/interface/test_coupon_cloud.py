@@ -1,5 +1,7 @@
 """F and sigma of clouds whose F and sigma are known, through the functions for people with clouds of their own."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -60,6 +62,18 @@ def test_a_window_keeps_the_background_out(rng):
     table = ch.measure_coupon(points, window=(20, 30, 170, 180))
     assert 20 + 6 <= table["column"].min() <= table["column"].max() < 190 - 6
     assert 30 + 6 <= table["row"].min() <= table["row"].max() < 210 - 6
+
+
+def test_a_window_of_a_grid_with_a_ray_for_each_pixel_is_cut_alike(rng):
+    """Before, the grid was resized before its rays were cut: ``ValueError: grid: normalised is ...``."""
+    points, pinhole = made(rng), ch.ViewGrid(FOCAL, FOCAL, 159.5, 119.5, WIDTH, HEIGHT)
+    rays = pinhole.rays()
+    traced = dataclasses.replace(pinhole, normalised=(rays[..., :2] / rays[..., 2:]).astype(np.float32))
+    of_pinhole, of_traced = (
+        ch.patch_metrics(points, grid=grid, window=(20, 30, 170, 180)) for grid in (pinhole, traced)
+    )
+    assert len(of_pinhole[0]) > 50
+    np.testing.assert_allclose(of_traced, of_pinhole, rtol=1e-3)
 
 
 def test_false_points_are_lost_points(rng):

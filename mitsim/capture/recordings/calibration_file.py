@@ -224,6 +224,7 @@ def _of_toml(path: Path, size: tuple[int, int] | None) -> Calibrated:
     if path.suffix.lower() == ".toml":
         written = read_toml_table(path)
         if "technology" not in written:
+            written.pop("unknowns", None)  # of statements; a sensor file of the same rig has them
             content, notes = with_calibration(path, written, size)
             table = validate(path, content, RigFile)
             rig = Rig({name: optics.camera() for name, optics in table.cameras.items()})

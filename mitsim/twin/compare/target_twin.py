@@ -14,16 +14,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from characterisation.features.fits import fit_plane, fit_sphere
 from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import Plane, Sphere, tangents
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, ViewGrid
 from characterisation.region_of_interest import Roi
-from characterisation.tasks.windows import LEAST_POINTS, window_points
+from characterisation.tasks.windows import fit_shape, window_points
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decoding.cloud import capture_cloud, decoder_settings
+from mitsim.decoding.depth_range import depths_of
 from mitsim.scene.load import Scene
 from mitsim.scene.test_targets import ball, plate
 from mitsim.sensor.sensor import Sensor
@@ -84,9 +85,8 @@ def seen_target(shape: str, window: Roi | None, cloud: PointCloud, name: str, di
     if distance is not None:
         axis = grid.rotation[:, 2]
         return Target(Plane(grid.origin + distance * axis, -axis), window)
-    if len(points) < LEAST_POINTS:
-        raise FitError(f"{len(points)} points in the window, at least {LEAST_POINTS} are needed")
-    fit = fit_plane(points, grid.origin) if shape == "plane" else fit_sphere(points, grid.origin)
+    fit = fit_shape(points, "plane" if shape == "plane" else "sphere", grid.origin)
+    assert isinstance(fit, Plane | Sphere)
     surface = Plane(fit.point, fit.normal) if isinstance(fit, Plane) else Sphere(fit.centre, fit.radius)
     return Target(surface, window)
 
@@ -111,6 +111,8 @@ def simulated_target(
 
     Raises
     ------
+    FitError
+        If more than half of the target lies beyond the depths that the sensor's decoder searches: all points are false.
     InputError
         If the sensor does not see the target.
 
@@ -118,11 +120,18 @@ def simulated_target(
     --------
     seen_target : the recorded one
     """
+    shown = _shown_points(target, recorded.grid)
+    near, far = sensor.settings.near_mm, sensor.settings.far_mm
+    depths = depths_of(shown, sensor.rig, sensor.settings)
+    depths = depths[depths > 0]
+    if len(depths) and not near <= np.median(depths) <= far:
+        extent = f"{depths.min():.0f} to {depths.max():.0f} mm"
+        raise FitError(f"at {extent}, beyond {near:g} to {far:g} mm, the depths that {sensor.name} searches")
     scene, pose = _scene(target.surface, sensor)
     capture = SimulatedSensor(sensor).capture(scene, pose, rendering=Rendering(samples=SAMPLES), seed=seed)
     settings, imager = decoder_settings(capture, sensor)
     cloud = capture_cloud(capture, settings, imager=imager)
-    window = _same_window(target, recorded.grid, cloud.grid)
+    window = _same_window(target, shown, cloud.grid)
     if window is None:
         found = f"{name} outside the field of view of {sensor.name}"
         raise InputError("--simulated", "", found, "a window that both sensors see")
@@ -142,23 +151,25 @@ def _scene(surface: Plane | Sphere, sensor: Sensor) -> tuple[Scene, Transform]:
     return plate(size, "matt white", sensor.wavelength_nm), Transform(turn, -turn @ middle)
 
 
-def _same_window(target: Target, recorded: ViewGrid, simulated: ViewGrid) -> Roi | None:
-    """Return the window of the simulated grid around what the recorded window shows of the target; None outside."""
+def _shown_points(target: Target, recorded: ViewGrid) -> Floats:
+    """Return points (n, 3) [mm] around what the recorded window shows of the target, in the sensor frame."""
     if isinstance(target.surface, Sphere):
-        reach = 1.05 * float(target.surface.radius)
-        seen = target.surface.centre + reach * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], float)
-        edge = 0
-    else:
-        window = target.window or Roi.whole(recorded.width, recorded.height)
-        columns, rows = np.meshgrid(
-            np.linspace(window.left, window.right - 1, _STEPS).round().astype(int),
-            np.linspace(window.top, window.bottom - 1, _STEPS).round().astype(int),
-        )
-        rays = recorded.rays_at(columns.ravel(), rows.ravel())
-        reach_of = ((target.surface.point - recorded.origin) @ target.surface.normal) / (rays @ target.surface.normal)
-        seen = recorded.origin + rays * reach_of[:, None]
-        edge = _EDGE_PX
-    pixels = simulated.project(seen)
+        around = 1.05 * float(target.surface.radius) * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
+        return np.asarray(target.surface.centre + around)
+    window = target.window or Roi.whole(recorded.width, recorded.height)
+    columns, rows = np.meshgrid(
+        np.linspace(window.left, window.right - 1, _STEPS).round().astype(int),
+        np.linspace(window.top, window.bottom - 1, _STEPS).round().astype(int),
+    )
+    rays = recorded.rays_at(columns.ravel(), rows.ravel())
+    reach_of = ((target.surface.point - recorded.origin) @ target.surface.normal) / (rays @ target.surface.normal)
+    return np.asarray(recorded.origin + rays * reach_of[:, None])
+
+
+def _same_window(target: Target, shown: Floats, simulated: ViewGrid) -> Roi | None:
+    """Return the window of the simulated grid around points (n, 3) of the target; None outside."""
+    edge = 0 if isinstance(target.surface, Sphere) else _EDGE_PX
+    pixels = simulated.project(shown)
     pixels = pixels[np.isfinite(pixels).all(axis=1)]
     if not len(pixels):
         return None

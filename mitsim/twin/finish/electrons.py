@@ -27,6 +27,7 @@ from mitsim.sensor.imager import Imager
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.sensor import Sensor
+from mitsim.sensor.sensor_file import Purpose
 
 
 @dataclass(frozen=True)
@@ -88,8 +89,8 @@ def linearised(levels: NDArray[np.unsignedinteger[Any]] | Floats, chip: Imager) 
     return np.asarray(chip.full_well * share**chip.gamma)
 
 
-def sensor_of(capture: Capture, name: str | None, where: str | Path) -> Sensor:
-    """Return the sensor of a name or file, by default the preset that a capture names.
+def sensor_of(capture: Capture, name: str | None, where: str | Path, purpose: Purpose = "simulation") -> Sensor:
+    """Return the sensor of a name or file, by default the preset that a capture names, loaded for a purpose.
 
     Raises
     ------
@@ -102,7 +103,7 @@ def sensor_of(capture: Capture, name: str | None, where: str | Path) -> Sensor:
         alike = [preset for preset, of_type in types.items() if of_type and of_type in capture.sensor.casefold()]
         hint = f"its type may be {' or '.join(alike)}" if alike else ""
         raise InputError("--sensor", "", found, f"one of {', '.join(presets())}, or the path of a .toml file", hint)
-    return load_sensor(capture.sensor if name is None else name)
+    return load_sensor(capture.sensor if name is None else name, purpose)
 
 
 def chip_of(capture: Capture, imager: Imager, where: str) -> Imager:

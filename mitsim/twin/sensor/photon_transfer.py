@@ -6,7 +6,8 @@ the imager has W', file electrons are kappa = W / W' of the true ones, and
 
     v = kappa mu + kappa^2 r^2 + q^2 / 12,        q the grey level's width in file electrons
 
-so the slope gives the full well, and the intercept the read noise r, including row noise.
+so the slope gives the full well, and the intercept the read noise r, including row noise. If the bins lie on a parabola
+instead, as with light that differs between the images, its slope and intercept at mu = 0 do.
 
 Fixed pattern: mean of the images -> finest detail (:mod:`mitsim.twin.finish.fine_detail`), which uniform light and
 lenses do not produce -> its variance less v / n -> dsnu^2 + (prnu mu)^2. A single image gives the sum of both: its
@@ -48,8 +49,11 @@ _FEWEST = 3
 #: least ratio of their largest and smallest means, which tells the slope from the offset; chosen
 _SPAN = 1.3
 
-#: standard uncertainties under 0 that an offset may lie by chance
+#: standard uncertainties under 0 that an offset may lie by chance, and over 0 the slope of a parabola
 _BY_CHANCE = 3.0
+
+#: standard uncertainties of a square term from which the line is a parabola, whose slope at 0 counts; chosen
+_CURVED_SIGMAS = 4.0
 
 #: efficiency of the median of squares against their mean (chi-square of one degree of freedom, recalled)
 _MEDIAN_EFFICIENCY = 0.37
@@ -57,7 +61,7 @@ _MEDIAN_EFFICIENCY = 0.37
 
 @dataclass(frozen=True)
 class TransferLine:
-    """Variance of the noise v = ``offset`` + ``slope`` mu in file electrons, their ``covariance`` (2, 2)."""
+    """Variance of the noise v = ``offset`` + ``slope`` mu in file electrons, about mu = 0; ``covariance`` (2, 2)."""
 
     offset: float
     slope: float
@@ -197,14 +201,26 @@ def _line(rows: list[tuple[float, float, float]]) -> TransferLine | None:
     mu, v, spread = (np.array(column) for column in zip(*rows, strict=True))
     if mu.max() < _SPAN * max(mu.min(), 1e-9):
         return None
-    design = np.column_stack([np.ones_like(mu), mu])
+    (offset, slope), covariance = _weighted(mu, v, spread, 2)
+    if len(rows) > _FEWEST:  # light that differs between repeats (speckle, flicker) adds a share of mu^2
+        (at_0, slope_at_0, square), wider = _weighted(mu, v, spread, 3)
+        if abs(square) > _CURVED_SIGMAS * np.sqrt(wider[2, 2]):
+            offset, slope, covariance = at_0, slope_at_0, wider
+    spread_0, slope_spread = np.sqrt(np.diag(covariance)[:2])
+    if not slope > (0 if len(covariance) == 2 else _BY_CHANCE * slope_spread) or offset < -_BY_CHANCE * spread_0:
+        return None
+    return TransferLine(float(offset), float(slope), covariance[:2, :2])
+
+
+def _weighted(mu: Floats, v: Floats, spread: Floats, terms: int) -> tuple[Floats, Floats]:
+    """Return the coefficients (terms,) of v = c_0 + c_1 mu + ..., and their covariance; ``spread``: variances of v."""
+    design = mu[:, None] ** np.arange(terms)
     expected = np.maximum(v, 1e-12)
     for _ in range(3):  # the variance of a bin follows from the line, not from its own random value
         weight = design / spread[:, None]
-        covariance = np.linalg.inv(weight.T @ design)
-        offset, slope = covariance @ (weight.T @ v)
-        before, expected = expected, np.maximum(offset + slope * mu, 1e-12)
+        scale = 1 / np.sqrt(np.einsum("ij,ij->j", weight, design))
+        covariance = np.linalg.inv((weight.T @ design) * np.outer(scale, scale)) * np.outer(scale, scale)
+        found = covariance @ (weight.T @ v)
+        before, expected = expected, np.maximum(design @ found, 1e-12)
         spread = spread * (expected / before) ** 2
-    if not slope > 0:
-        return None
-    return TransferLine(float(offset), float(slope), np.asarray(covariance))
+    return np.asarray(found), np.asarray(covariance)

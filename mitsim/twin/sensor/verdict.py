@@ -84,6 +84,7 @@ def verdict_of(agreements: tuple[DotAgreement, ...]) -> Verdict:
         "good": "the simulated dots agree with the recorded ones",
         "fair": f"the dots differ a little, most their {most}; the intervals contain it",
         "bad": f"no numbers of this file reproduce the dots; most differs their {most}. Start from another preset, or "
-        "check --window, the sheet and the exposure; F and sigma of this file are not those of the camera",
+        "check --window, the sheet, the exposure, and that repeats differ in nothing but noise; F and sigma of this "
+        "file are not those of the camera",
     }[worst.word]
     return Verdict(worst.word, f"{numbers}: {why}")

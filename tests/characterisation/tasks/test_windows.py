@@ -115,6 +115,14 @@ def test_a_window_that_shows_something_else_has_no_value_and_says_so(rng):
     assert repeatability([found])[0].count == 0
 
 
+def test_points_that_are_all_false_have_no_value(rng):
+    """Distances at random over a range, as false matches have: before, a plane of 23 mm noise, +- 0.1 mm."""
+    cloud = cloud_of(rng.uniform(370, 450, (160, 200)))
+    for result in measure_windows(cloud, WindowPlan({"wall": ("plane", None)})):
+        assert not result.possible
+        assert "% of their distance" in result.reason
+
+
 def test_a_window_outside_the_grid_is_refused():
     with pytest.raises(InputError, match="within 200 x 160 pixels"):
         measure_windows(cloud_of(corner()), WindowPlan({"a": ("plane", Roi(150, 5, 80, 60))}))

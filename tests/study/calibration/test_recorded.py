@@ -63,6 +63,28 @@ def test_intervals_hold_the_rig():
     assert 0.7 < square < 1.4
 
 
+@pytest.mark.parametrize("k3", [-0.09, 0.05])
+def test_the_third_coefficient_of_an_ordinary_lens_is_found(rng, k3):
+    """Before, a prior of 0.001 kept k3 near 0, and k1 and k2, 15 and 30 u off, took its place."""
+    distortion = np.array([-0.43676, 0.24510, 0.00015, 0.00019, k3])
+    lens = Camera(np.array([[1105.0, 0, 652], [0, 1105, 488], [0, 0, 1]]), distortion, 1280, 960)
+    board, views = Board(11, 8, 20.0, "glass"), []
+    for turn in np.arange(12) * np.pi / 6:  # boards in the middle, and out to the corners
+        axis, out = np.array([-np.sin(turn), np.cos(turn), 0.0]), np.array([np.cos(turn), np.sin(turn), 0.0])
+        place = Transform(Rotation.from_rotvec(0.5 * axis).as_matrix(), 120 * (len(views) % 3) * out + [0, 0, 500])
+        seen = lens.project(place.points(board.corners))
+        inside = np.flatnonzero(((seen > 3) & (seen < (1277, 957))).all(axis=1))
+        views.append(BoardView(place, inside, 0.08, 0.0))
+    corners = simulate_corners({"camera": lens}, board, views, rng).pixels["camera"]
+    boards = [RecordedBoard(view.corners, {"camera": seen}) for view, seen in zip(views, corners, strict=True)]
+    found = calibrate_recorded(boards, board, {"camera": (1280, 960)}, "simulated")
+    names, sigma = found.covariance.names, found.covariance.one_sigma
+    off = parameter_differences(found.rig, Rig({"camera": lens}), names)
+    assert sigma[names.index("camera.k3")] < 0.02
+    assert np.abs(off / sigma).max() < 4  # nine parameters; 4 u has a chance of 6e-4
+    assert off @ np.linalg.solve(found.covariance.covariance, off) < 33.7  # 0.9999 of chi square with 9
+
+
 def test_two_poses_are_too_few():
     with pytest.raises(InputError, match="3 or more"):
         calibrate_recorded(recorded(1, 2), BOARD, SIZES, "simulated")

@@ -121,6 +121,33 @@ def test_the_command_says_use_or_calibrate_again(good, turned, tmp_path):
     mitsim_here("calibrate", "verify", tmp_path / "bad", code=2)
 
 
+def test_a_rig_without_light_and_imager_can_be_verified(good, tmp_path):
+    """Before, a sensor file with the two tables that `mitsim calibrate` prints lacked 16 keys of a simulation."""
+    eyes = {name: (eye.matrix, eye.distortion) for name, eye in good.rig.cameras.items()}
+    right = good.rig.cameras["right"].sensor_from_camera.inverse()
+    storage = cv2.FileStorage(str(tmp_path / "unit.yml"), cv2.FILE_STORAGE_WRITE)
+    for number, (matrix, distortion) in enumerate(eyes.values(), 1):
+        storage.write(f"cameraMatrix{number}", matrix)
+        storage.write(f"distCoeffs{number}", distortion[:5])
+    for name, value in (("R", right.rotation), ("T", right.translation)):
+        storage.write(name, value)
+    for name, value in zip(("image_width", "image_height"), (752, 480), strict=True):
+        storage.write(name, value)
+    storage.release()
+    covariance = sensor_path("ensenso-n10").parent / "calibrations" / "ensenso-n10.toml"
+    tables = '[calibration]\nfile = "unit.yml"\ncameras = ["left", "right"]\nprojector = false\n'
+    tables += f'[unknowns.calibration]\ncovariance = "{covariance}"\n'
+    (tmp_path / "unit.toml").write_text('name = "unit 7"\n' + tables)
+    (tmp_path / "sensor.toml").write_text('name = "unit 7"\ntechnology = "active_stereo"\n' + tables)
+    (tmp_path / "images").mkdir()
+    for name, images in good.images.items():
+        cv2.imwrite(str(tmp_path / "images" / f"{name}_0.png"), images[0])
+    mitsim_here("import", tmp_path / "images", "--calibration", tmp_path / "unit.toml", "-o", tmp_path / "capture")
+    command = ("calibrate", "verify", tmp_path / "capture", "--board", "9x6x18:glass")
+    done = mitsim_here(*command, "--sensor", tmp_path / "sensor.toml")
+    assert done.stdout.splitlines()[-1].startswith("Use it")
+
+
 def test_a_capture_that_decided_the_calibration_is_told(good, turned, tmp_path):
     """Before, `Use it` was said of the very images that the calibration was fitted to."""
     covariance = sensor_path("ensenso-n10").parent / "calibrations" / "ensenso-n10.toml"

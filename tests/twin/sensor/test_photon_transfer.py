@@ -52,6 +52,20 @@ def test_intervals_of_gain_and_read_noise_hold_the_truth_as_often_as_they_say():
     assert (held.mean(axis=0) > 0.95 - 3 * 0.0126).all() and (held.mean(axis=0) < 0.95 + 3 * 0.0126).all()
 
 
+def test_light_that_differs_between_repeats_is_no_gain():
+    """Speckle drawn anew gives v = kappa mu + (0.02 mu)^2: before, full wells of a fifth of the truth, +- 1 %."""
+    held, even = [], np.tile(RAMP, (5, 1))
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        images = [expose(even * rng.normal(1, 0.02, even.shape), TRUE, None, Noise(), rng) for _ in range(8)]
+        value, spread = repeated_line([whole(np.stack(images))], FILE).full_well(FILE)
+        assert spread < 0.2 * value
+        held.append(abs(value - TRUE.full_well) < 1.96 * spread)
+    assert np.mean(held) > 0.95 - 3 * 0.04
+    images = [expose(RAMP * rng.normal(1, 0.2, RAMP.shape).clip(0), TRUE, None, Noise(), rng) for _ in range(8)]
+    assert repeated_line([whole(np.stack(images))], FILE) is None  # where speckle hides the shot noise
+
+
 @pytest.mark.parametrize(("gamma", "companding"), [(1.8, ()), (1.0, ((357.0, 357.0), (2048, 756), (4096, 1024)))])
 def test_a_curve_of_the_imager_is_undone_first(gamma, companding):
     chip = replace(TRUE, gamma=gamma, companding=companding)
