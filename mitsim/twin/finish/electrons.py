@@ -90,7 +90,18 @@ def linearised(levels: NDArray[np.unsignedinteger[Any]] | Floats, chip: Imager) 
 
 
 def sensor_of(capture: Capture, name: str | None, where: str | Path, purpose: Purpose = "simulation") -> Sensor:
-    """Return the sensor of a name or file, by default the preset that a capture names, loaded for a purpose.
+    """Return the sensor of a name or file, by default the preset that a capture names.
+
+    Parameters
+    ----------
+    capture
+        It may name its sensor.
+    name
+        Of a preset, or path of a sensor file; None for the capture's.
+    where
+        The capture, for errors.
+    purpose
+        What the sensor is for.
 
     Raises
     ------
