@@ -7,6 +7,7 @@ capture if there is one.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,9 @@ from mitsim.sensor.matcher import MatcherSettings
 
 #: suffixes of cloud files that are found in a folder
 _SUFFIXES = (".ply", ".pcd", ".zdf")
+
+#: options of reading that every command with clouds has
+_OPTIONS = {"--sensor", "--topic", "--frame", "--unit"}
 
 #: text that identifies a cloud file of ``mitsim decode``
 _MARK = b"\ncomment mitsim "
@@ -55,20 +59,26 @@ class InputCloud:
 def cloud_paths(paths: Iterable[Path]) -> list[Path]:
     """Return paths of clouds; a folder is replaced by the clouds and captures in it, sorted by name.
 
-    A folder that contains neither is kept.
+    Arrays and texts count where a folder has nothing else: beside clouds they may be notes and are left out, which is
+    said. A folder that contains none is kept.
     """
     out: list[Path] = []
     for path in paths:
         if not path.is_dir() or (path / "capture.json").exists():
             out.append(path)
             continue
+        entries = [entry for entry in sorted(path.iterdir()) if not entry.name.startswith(".")]
+        plain = [entry for entry in entries if is_array_or_text(entry)]
         contained = [
             entry
-            for entry in sorted(path.iterdir())
+            for entry in entries
             if (entry / "capture.json").exists() or (entry.is_file() and entry.suffix.lower() in _SUFFIXES)
         ]
+        if contained and plain:
+            left_out = ", ".join(entry.name for entry in plain[:3]) + ", ..." * (len(plain) > 3)
+            say(f"warning: {path}: left out {left_out}, beside clouds of other formats: name them to measure them")
         # a folder without them may be a recording as its device saved it
-        out += contained or [path]
+        out += contained or (plain if plain == entries else []) or [path]
     return out
 
 
@@ -121,8 +131,7 @@ def read_cloud(
             capture = read_organised_cloud(stored, unit=unit)
         except InputError as error:
             if not reference:
-                hint = f"{error.hint}; mitsim import has these options" if "--" in error.hint else error.hint
-                raise InputError(error.where, error.field, error.found, error.allowed, hint) from None
+                raise _of_import(error) from None
             return _plain(path, *plain_cloud(stored.points, path, unit, stored.unit))
     elif path.exists():
         kind = kind_of(path, sensor=sensor)
@@ -132,6 +141,8 @@ def read_cloud(
             capture = read_recording(path, options, kind).capture
         except NoGridError as error:
             return _plain(path, *plain_cloud(error.stored.points, path, unit, error.stored.unit))
+        except InputError as error:
+            raise _of_import(error) from None
     else:
         raise InputError(
             path,
@@ -151,6 +162,14 @@ def read_cloud(
 def _plain(path: Path, cloud: PointCloud, about: str) -> InputCloud:
     say(about)
     return InputCloud(path, cloud, None)
+
+
+def _of_import(error: InputError) -> InputError:
+    """Return an error that names where options are that reading has and its command lacks."""
+    if not {*re.findall("--[a-z]+", f"{error.allowed} {error.hint}")} - _OPTIONS:
+        return error
+    hint = "; ".join(filter(None, [error.hint, "mitsim import has these options"]))
+    return InputError(error.where, error.field, error.found, error.allowed, hint)
 
 
 def margin_of(settings: Settings) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 
+import cv2
 import numpy as np
 import pytest
 from scipy.io import savemat
@@ -372,3 +373,21 @@ def test_a_list_of_points_has_no_picture(tmp_path):
     )
     assert "without a grid" in done.stderr
     assert not (tmp_path / "p.png").exists()
+
+
+def test_a_folder_of_arrays_or_texts_is_measured(tmp_path):
+    """Before, the help promised folders of these, and they were recordings of an unknown kind."""
+    for name in ("1.xyz", "2.npy"):
+        save(tmp_path / name, plane())
+    done = mitsim_here("measure", tmp_path, "--plane", "floor")
+    assert "2/2" in done.stdout
+    save(tmp_path / "3.ply", plane())
+    done = mitsim_here("measure", tmp_path, "--plane", "floor")
+    assert "left out 1.xyz, 2.npy" in done.stderr
+
+
+def test_the_command_with_the_options_of_an_error_is_named(tmp_path):
+    """Before, `mitsim measure` asked for --calibration, which it lacks."""
+    cv2.imwrite(str(tmp_path / "depth.png"), np.full((48, 64), 500, np.uint16))
+    done = mitsim_here("measure", tmp_path / "depth.png", "--plane", "floor", code=2)
+    assert "--calibration FILE" in done.stderr and "mitsim import has these options" in done.stderr
