@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from characterisation.files.checked_files import is_file
 from characterisation.files.documents import read_toml
 from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
@@ -49,7 +50,10 @@ MINIMUM_POINTS = 100
 
 @dataclass(frozen=True)
 class Study:
-    """A study that has been read and checked."""
+    """A study that has been read and checked.
+
+    ``given_map`` is the ``performance_map`` that :func:`open_study` was called with; a file by its absolute path.
+    """
 
     path: Path
     file: StudyFile
@@ -59,6 +63,7 @@ class Study:
     candidates: Candidates
     campaign: Campaign | None
     performance_map: PerformanceMap | None
+    given_map: str | Path | None = None
 
     @property
     def views(self) -> list[View]:
@@ -183,7 +188,9 @@ def open_study(
         measured = frozenset(task.shapes)
         wanted = NeededFinishes(sensor, scene.where, seen_finishes(scene), depths, measured, rendered)
         chosen_map = map_with_finishes(chosen_map, wanted, ask)
-    return Study(path, file, scene, task, sensor, candidates, campaign, chosen_map)
+    if performance_map and is_file(Path(performance_map)):
+        performance_map = Path(performance_map).absolute()
+    return Study(path, file, scene, task, sensor, candidates, campaign, chosen_map, performance_map)
 
 
 def finishes_of_features(study: Study) -> dict[str, Finish | None]:
