@@ -98,6 +98,7 @@ def read_corners(path: str | Path, board: Board) -> RecordedCorners:
 
 def _together(path: Path, seen: Seen, sizes: Sizes, images: Mapping[str, FittedCapture]) -> RecordedCorners:
     """Return the poses whose corners all eyes see; ``seen`` has the pixels (2,) by pose, eye and corner."""
+    sizes = dict(sorted(sizes.items(), key=lambda item: item[0] == "projector"))  # the reference is a camera
     boards, left_out = [], []
     used: dict[str, dict[str, Floats]] = {}
     for pose, by_eye in seen.items():

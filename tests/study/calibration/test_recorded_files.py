@@ -57,7 +57,7 @@ def boards_of(pixels):
 
 
 def write_table(path, pixels):
-    lines = ["# size left 1280 960", "# size right 1280 960", "pose,camera,column,row,x_px,y_px"]
+    lines = [*(f"# size {name} 1280 960" for name in pixels), "pose,camera,column,row,x_px,y_px"]
     for name, values in pixels.items():
         for pose, places in enumerate(values):
             for corner, (x, y) in enumerate(places):
@@ -203,3 +203,13 @@ def test_files_without_corners_are_refused(tmp_path, name, text):
     (tmp_path / name).write_text(text)
     with pytest.raises(InputError):
         read_corners(tmp_path / name, BOARD)
+
+
+def test_the_reference_is_a_camera_whatever_the_order_of_the_sizes(tmp_path):
+    """Before, a projector named first was the reference, and the pose of the camera was lost: T was nearly 0."""
+    pixels = pixels_of(4)
+    write_table(tmp_path / "c.csv", {"projector": pixels["right"], "camera": pixels["left"]})
+    found = read_corners(tmp_path / "c.csv", BOARD)
+    assert list(found.sizes) == ["camera", "projector"]
+    rig = calibrate_checked(found.boards, BOARD, found.sizes, "x").calibration.rig
+    assert np.linalg.norm(rig.projector.centre) == pytest.approx(100.0, rel=0.02)
