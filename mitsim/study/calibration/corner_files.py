@@ -99,6 +99,9 @@ def read_corners(path: str | Path, board: Board) -> RecordedCorners:
 def _together(path: Path, seen: Seen, sizes: Sizes, images: Mapping[str, FittedCapture]) -> RecordedCorners:
     """Return the poses whose corners all eyes see; ``seen`` has the pixels (2,) by pose, eye and corner."""
     sizes = dict(sorted(sizes.items(), key=lambda item: item[0] == "projector"))  # the reference is a camera
+    if len(sizes) > 2 or set(sizes) == {"projector"}:
+        allowed = "one or two cameras, or a camera and a projector"
+        raise InputError(path, "cameras", ", ".join(sizes), allowed, "name images left and right")
     boards, left_out = [], []
     used: dict[str, dict[str, Floats]] = {}
     for pose, by_eye in seen.items():
@@ -169,8 +172,6 @@ def _of_images(path: Path, board: Board) -> tuple[Seen, Sizes, dict[str, FittedC
             by_camera[cameras[1]] = dict(enumerate(turned_alike(first, second)))
     if not files:
         raise InputError(path, "", "no image", f"images {', '.join(sorted(_IMAGES))} of the board")
-    if len(sizes) > 2:
-        raise InputError(path, "", f"images of {', '.join(sizes)}", "one or two cameras", "name them left and right")
     images = {
         pose: FittedCapture(
             name=f"{path / pose}", images_sha256=joined_digest(by_camera[camera] for camera in sorted(by_camera))

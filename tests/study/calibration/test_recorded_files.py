@@ -213,3 +213,11 @@ def test_the_reference_is_a_camera_whatever_the_order_of_the_sizes(tmp_path):
     assert list(found.sizes) == ["camera", "projector"]
     rig = calibrate_checked(found.boards, BOARD, found.sizes, "x").calibration.rig
     assert np.linalg.norm(rig.projector.centre) == pytest.approx(100.0, rel=0.02)
+
+
+@pytest.mark.parametrize("names", [("left", "right", "third"), ("left", "projector", "right"), ("projector",)])
+def test_eyes_that_no_calibration_file_holds_are_refused(tmp_path, names):
+    """Before, the third camera was left out of the file, which had R twice for a projector beside two cameras."""
+    write_table(tmp_path / "c.csv", dict.fromkeys(names, pixels_of(4)["left"]))
+    with pytest.raises(InputError, match="allowed: one or two cameras, or a camera and a projector"):
+        read_corners(tmp_path / "c.csv", BOARD)
