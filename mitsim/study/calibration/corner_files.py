@@ -224,24 +224,29 @@ def _of_table(path: Path, board: Board) -> tuple[Seen, Sizes]:
         if match := re.match(r"#\s*size\s+(\S+)\s+(\d{1,5})\s+(\d{1,5})\s*$", line):
             sizes[match[1]] = (int(match[2]), int(match[3]))
     written = "\n".join(line for line in text.splitlines() if not line.startswith("#"))
-    rows = csv.DictReader(io.StringIO(written), skipinitialspace=True)
-    if tuple(name.strip() for name in rows.fieldnames or ()) != _COLUMNS:
-        raise InputError(path, "header", ", ".join(rows.fieldnames or ()) or "nothing", ", ".join(_COLUMNS))
+    lines = csv.reader(io.StringIO(written), skipinitialspace=True)
+    try:
+        rows = [[cell.strip() for cell in line] for line in lines if line]
+    except csv.Error as error:
+        raise InputError(path, "", str(error), "lines of values with commas between them") from None
+    header = rows.pop(0) if rows else []
+    if tuple(header) != _COLUMNS:
+        raise InputError(path, "header", ", ".join(header)[:200] or "nothing", ", ".join(_COLUMNS))
     seen: Seen = {}
     for number, row in enumerate(rows, 1):
         try:
-            column, line_of_board = int(row["column"]), int(row["row"])
-            pixel = np.array([float(row["x_px"]), float(row["y_px"])])
-        except (TypeError, ValueError):
-            values = str(list(row.values()))[:60]
-            raise InputError(path, f"row {number}", values, "whole numbers, and two pixels") from None
+            pose, camera = row[:2]
+            column, line_of_board = (int(cell) for cell in row[2:4])
+            pixel = np.array([float(cell) for cell in row[4:6]]).reshape(2)
+        except ValueError:
+            raise InputError(path, f"row {number}", str(row)[:60], "whole numbers, and two pixels") from None
         inside = 0 <= column < board.columns - 1 and 0 <= line_of_board < board.rows - 1
         if not inside or not np.isfinite(pixel).all():
             corners = f"corners 0 to {board.columns - 2} and 0 to {board.rows - 2} of the board, with finite pixels"
             raise InputError(path, f"row {number}", f"corner {column}, {line_of_board}", corners)
-        if row["camera"] not in sizes:
-            raise InputError(path, row["camera"], "no size", f"a line # size {row['camera']} WIDTH HEIGHT")
-        by_eye = seen.setdefault(row["pose"], {}).setdefault(row["camera"], {})
+        if camera not in sizes:
+            raise InputError(path, camera, "no size", f"a line # size {camera} WIDTH HEIGHT")
+        by_eye = seen.setdefault(pose, {}).setdefault(camera, {})
         by_eye[line_of_board * (board.columns - 1) + column] = pixel
     return seen, sizes
 

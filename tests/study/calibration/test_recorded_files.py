@@ -76,6 +76,8 @@ def test_every_form_gives_the_same_corners(tmp_path):
         for number, values in enumerate(pixels.values(), 1):
             storage.write(f"image_points{number}", values)
         storage.release()
+    spaced = (tmp_path / "corners.csv").read_text().replace(",", " , ")
+    (tmp_path / "spaced.csv").write_text(spaced)
     for file in sorted(tmp_path.iterdir()):
         found = read_corners(file, BOARD)
         assert found.sizes == {"left": SIZE, "right": SIZE} and not found.left_out
@@ -191,6 +193,8 @@ def test_an_argument_that_is_neither_sensor_nor_recording_is_named(tmp_path):
         ("a.csv", "pose,camera\n"),
         ("a.csv", "# size left 10 10\npose,camera,column,row,x_px,y_px\n0,left,99,0,1,1\n"),
         ("a.csv", "pose,camera,column,row,x_px,y_px\n0,left,0,0,1,1\n"),
+        ("a.csv", "pose,camera,column,row,x_px,y_px\n0\n"),
+        ("a.csv", '"' + "x" * 200_000),
         ("a.yml", "%YAML:1.0\n---\nimage_points: [1, 2\n"),
         ("a.yml", "%YAML:1.0\n---\nother: 3\n"),
         ("a.npz", "no archive"),
