@@ -267,8 +267,8 @@ def _of_arrays(path: Path, arrays: Mapping[str, Any], board: Board) -> tuple[See
     for eye, values in by_eye.items():
         try:
             pixels = np.asarray(values, float).reshape(-1, count, 2)
-        except (TypeError, ValueError):
-            shape = f"{np.asarray(values, object).shape}"
+        except (OverflowError, TypeError, ValueError):
+            shape = f"{values.shape}" if isinstance(values, np.ndarray) else str(values)[:60]
             raise InputError(path, eye, shape, f"(poses, {count}, 2), for {board}", "check --board") from None
         for pose, corners in enumerate(pixels):
             finite = np.isfinite(corners).all(axis=1)
@@ -280,7 +280,7 @@ def _size(path: Path, arrays: Mapping[str, Any]) -> tuple[int, int]:
     size = arrays.get("image_size", [arrays.get("image_width"), arrays.get("image_height")])
     try:
         width, height = (int(value) for value in np.asarray(size).ravel())
-    except (TypeError, ValueError):
+    except (OverflowError, TypeError, ValueError):
         raise InputError(path, "image_size", size, "width and height of the images [px]") from None
     if not (0 < width <= 65535 and 0 < height <= 65535):
         raise InputError(path, "image_size", f"{width} x {height}", "1 to 65535 px")
