@@ -20,7 +20,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -153,8 +153,9 @@ def _of_images(path: Path, board: Board) -> tuple[Seen, Sizes, dict[str, FittedC
     seen: Seen = {}
     sizes: Sizes = {}
     digests: dict[str, dict[str, bytes]] = {}
-    for file in files:
-        camera, pose = _named(file.relative_to(path))
+    for file, (camera, pose) in _named(files, path).items():
+        if camera in digests.get(pose, {}):
+            raise InputError(file, "", f"a second image of {camera}, pose {pose}", "one of each pose by each camera")
         image = read_grey(file)
         size = (image.shape[1], image.shape[0])
         if sizes.setdefault(camera, size) != size:
@@ -204,11 +205,24 @@ def turned_alike(first: Floats, second: Floats) -> Floats:
     return second if alike else second[::-1]
 
 
-def _named(file: Path) -> tuple[str, str]:
+def _named(files: Sequence[Path], path: Path) -> dict[Path, tuple[str, str]]:
+    """Return the camera and the pose of every image below ``path``.
+
+    A folder is a camera, unless the names of its images state several.
+    """
+    by_name = {file: _by_name(file) for file in files}
+    stated: dict[Path, set[str]] = {}
+    for file, (camera, pose) in by_name.items():
+        stated.setdefault(file.parent, set()).update({camera} if pose != file.stem else ())
+    return {
+        file: named if file.parent == path or len(stated[file.parent]) > 1 else (file.parent.name, file.stem)
+        for file, named in by_name.items()
+    }
+
+
+def _by_name(file: Path) -> tuple[str, str]:
     """Return the camera and the pose that the name of an image states."""
-    if len(file.parts) > 1:
-        return file.parts[-2], file.stem
-    match = re.match(r"(left|right|l|r|camera\d*|cam\d*)[-_ ]?(.*)$", file.stem, re.IGNORECASE)
+    match = re.match(r"(left|right|[lr](?=[-_ \d])|camera\d*|cam\d*)[-_ ]?(.*)$", file.stem, re.IGNORECASE)
     if match and match[2]:
         return {"l": "left", "r": "right"}.get(match[1].lower(), match[1].lower()), match[2]
     match = re.match(r"(.*?)[-_ ](left|right|l|r)$", file.stem, re.IGNORECASE)

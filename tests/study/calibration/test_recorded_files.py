@@ -112,14 +112,21 @@ def test_corners_in_the_order_of_another_board_are_said(tmp_path):
         calibrate_checked(boards_of(mixed), BOARD, {"left": SIZE, "right": SIZE}, "x")
 
 
-def test_images_of_ros_give_the_corners_of_the_board(tmp_path):
+def write_images(folder, name="{camera}-{pose:04d}.png"):
+    """Images of the board by two cameras at two poses; the right one is shifted by 30 px along both axes."""
     squares = np.kron(np.indices((7, 9)).sum(axis=0) % 2, np.ones((40, 40)))
     for pose, angle in enumerate((0.0, 8.0)):
-        for name, shift in (("left", 60), ("right", 90)):
+        for camera, shift in (("left", 60), ("right", 90)):
             motion = cv2.getRotationMatrix2D((240, 200), angle, 1.0)
             motion[:, 2] += shift
             image = cv2.warpAffine(255 * squares.astype(np.uint8), motion, (640, 480), borderValue=200)
-            cv2.imwrite(str(tmp_path / f"{name}-{pose:04d}.png"), image)
+            file = folder / name.format(camera=camera, pose=pose)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(file), image)
+
+
+def test_images_of_ros_give_the_corners_of_the_board(tmp_path):
+    write_images(tmp_path)
     found = read_corners(tmp_path, BOARD)
     assert found.sizes == {"left": (640, 480), "right": (640, 480)} and len(found.boards) == 2
     for board in found.boards:  # the right image is the left one, shifted by 30 px along both axes
@@ -228,3 +235,29 @@ def test_eyes_that_no_calibration_file_holds_are_refused(tmp_path, names):
     write_table(tmp_path / "c.csv", dict.fromkeys(names, pixels_of(4)["left"]))
     with pytest.raises(InputError, match="allowed: one or two cameras, or a camera and a projector"):
         read_corners(tmp_path / "c.csv", BOARD)
+
+
+@pytest.mark.parametrize(
+    "name, cameras",
+    [
+        ("{camera}/{pose:04d}.png", ["left", "right"]),
+        ("poses/{camera}-{pose:04d}.png", ["left", "right"]),
+        ("poses/{pose:04d}_{camera}.png", ["left", "right"]),
+        ("unit-{camera}/room{pose}.png", ["unit-left", "unit-right"]),
+    ],
+)
+def test_a_folder_whose_images_name_two_cameras_is_no_camera(tmp_path, name, cameras):
+    """Before, the images of both were calibrated as those of one camera, named after the folder."""
+    write_images(tmp_path, name)
+    found = read_corners(tmp_path, BOARD)
+    assert list(found.sizes) == cameras and len(found.boards) == 2
+    for board in found.boards:
+        np.testing.assert_allclose(board.pixels[cameras[1]] - board.pixels[cameras[0]], 30.0, atol=0.05)
+
+
+def test_images_of_one_pose_in_two_folders_are_refused(tmp_path):
+    """Before, the later ones replaced the others."""
+    for place in ("monday", "tuesday"):
+        write_images(tmp_path, place + "/{camera}-{pose:04d}.png")
+    with pytest.raises(InputError, match=r"tuesday.*: found a second image of left, pose 0000"):
+        read_corners(tmp_path, BOARD)
