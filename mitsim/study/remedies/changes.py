@@ -106,15 +106,14 @@ def _bias(now: Shortfall) -> Iterator[Change]:
     if not able:
         return
     task = now.study.task
-    decision = task.decision.model_copy(update={"subtract_bias": True})
-    measurements = {
-        name: measurement
-        if measurement.decision is None
-        else measurement.model_copy(
-            update={"decision": measurement.decision.model_copy(update={"subtract_bias": True})}
-        )
-        for name, measurement in task.measurements.items()
-    }
+    key = {"subtract_bias": True}
+    decision, measurements = task.decision.model_copy(update=key), dict(task.measurements)
+    keys: dict[str, Any] = {"decision": key}
+    for name, measurement in task.measurements.items():
+        if measurement.decision is not None:
+            own = measurement.decision.model_copy(update=key)
+            measurements[name] = measurement.model_copy(update={"decision": own})
+            keys.setdefault("measurements", {})[name] = {"decision": key}
     corrected = task.model_copy(update={"decision": decision, "measurements": measurements})
     session, number = now.session, now.stated.view.number
     most = max(statement.trials for statement in now.stated.statements)
@@ -127,7 +126,6 @@ def _bias(now: Shortfall) -> Iterator[Change]:
 
     words = "with its bias subtracted"
     expected = {name: statement.standard_uncertainty for name, statement in able.items()}
-    keys = {"decision": {"subtract_bias": True}}
     yield Change("bias", words, keys, (number,), expected, state, needs_trials=False)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -18,10 +20,12 @@ from characterisation.statements.tolerance import plus_minus
 from characterisation.tasks.decision_table import Decision
 from mitsim.running.time_limit import TimeLimit
 from mitsim.study.remedies.bounds import EXPOSURE, Effect, can_fit, least_shares, least_uncertainty
-from mitsim.study.remedies.change import Change, changed_file
+from mitsim.study.remedies.change import Change, Shortfall, changed_file
+from mitsim.study.remedies.changes import changes
 from mitsim.study.remedies.confirm import Remedies, find_remedies, of_missed, remedies_document
 from mitsim.study.remedies.entries import MissedEntry, RemediesEntry, UntriedChange, remedies_in_words
 from mitsim.study.tables import StudyFile
+from tests.two_balls import TASK
 
 #: equally likely errors of a standard normal distribution
 NORMAL = norm.ppf((np.arange(200) + 0.5) / 200)
@@ -200,6 +204,19 @@ def test_the_nearest_of_insufficient_changes_is_named() -> None:
     assert lines == ["a (u 0.80 mm, 0.12 mm needed): none of 2 changes tried helps"]
     nothing = RemediesEntry.model_validate(remedies_document(Remedies(missed("a"))))
     assert remedies_in_words(nothing) == ["a: by its budget, no single change that mitsim knows suffices"]
+
+
+def test_the_keys_of_the_bias_name_every_decision_that_they_change() -> None:
+    """Before, the measurement kept its own decision in a task with these keys."""
+    one = stated("radius", 0.05, bias=2.0)
+    measurement = TASK.measurements["radius"].model_copy(update={"decision": Decision()})
+    for own in ({}, {"radius": measurement}):
+        task = TASK.model_copy(update={"measurements": TASK.measurements | own})
+        view = SimpleNamespace(view=SimpleNamespace(number=1), statements=[one])
+        now = SimpleNamespace(study=SimpleNamespace(task=task), session=None, stated=view, missed={"radius": one})
+        keys = next(changes(cast(Shortfall, now))).keys
+        changed = {"decision": {"subtract_bias": True}}
+        assert keys == changed | ({"measurements": {"radius": changed}} if own else {})
 
 
 def test_keys_of_a_change_replace_single_keys_of_the_study() -> None:
