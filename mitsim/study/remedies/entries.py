@@ -78,6 +78,14 @@ class RemediesEntry(PartialDocument):
         ]
         return {**document, "untried": untried}
 
+    @model_validator(mode="after")
+    def _of_tried(self) -> RemediesEntry:
+        for name, measurement in self.measurements.items():
+            index = measurement.fits_by
+            if index is not None and not (0 <= index < len(self.tried) and name in self.tried[index].measurements):
+                raise ValueError(f"fits_by {index} of {name} must be the index of a change tried that has {name}")
+        return self
+
 
 def remedies_in_words(remedies: RemediesEntry | None) -> list[str]:
     """Return lines such as ``sprayed matt white: pillar1_radius fits, u 0.58 to 0.03 mm (40 virtual measurements)``."""

@@ -286,6 +286,16 @@ def test_remedies_of_an_older_run_still_read() -> None:
         RemediesEntry.model_validate(document | {"measurements": 3})
 
 
+@pytest.mark.parametrize("fits_by, name", [(0, "b"), (1, "a"), (-1, "a")])
+def test_a_measurement_that_fits_by_no_change_tried_is_refused(fits_by: int, name: str) -> None:
+    """Before, a change without the measurement gave a KeyError, and one that does not exist no line at all."""
+    spray = Fake("spray", ("a",), a=0.02)
+    document = remedies_document(find_remedies(missed("a", "b"), [spray.change], 40))
+    document["measurements"][name]["fits_by"] = fits_by
+    with pytest.raises(ValidationError, match=f"fits_by {fits_by} of {name} must be the index of a change"):
+        RemediesEntry.model_validate(document)
+
+
 def test_more_than_four_measurements_that_fit_are_counted() -> None:
     names = "abcdef"
     spray = Fake("spray", tuple(names), a=0.02, b=0.02, c=0.02, d=0.02, e=0.02, f=0.02)
