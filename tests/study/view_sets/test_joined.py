@@ -10,10 +10,12 @@ import pytest
 from characterisation.point_cloud import PointCloud, ViewGrid
 from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.statement import statement
+from characterisation.tasks.evaluation import measure
 from mitsim.sensor.transforms import Transform
 from mitsim.study import SetTable
 from mitsim.study.view_sets.confirmed_set import TriedSet, confirmed_entry, joining_in_words, set_table, write_set_csv
 from mitsim.study.view_sets.joined import JoinedMeasurements
+from mitsim.study.virtual.trials import Outcome
 from tests.two_balls import TASK
 
 #: the balls are seen from 500 mm above
@@ -67,6 +69,12 @@ class Maker:
     def cloud_of(self, view, world):
         self.captures.append((view.number, world))
         return cloud(self.seen[view.number], self.sigma, world.seed), FROM_ABOVE
+
+    def run(self, jobs):
+        motion = FROM_ABOVE.inverse().matrix()
+        for job in jobs:
+            seen, _ = self.cloud_of(job.view, self.unknowns.draw(job.trial))
+            yield job, Outcome.of(measure(seen, TASK, motion, 100, False))
 
 
 def errors(seen, table, days=200, sigma=0.0):
