@@ -236,7 +236,7 @@ def _sights(table: ViewsTable, sensor: Sensor, target: Floats) -> list[_Sight]:
         return sights
     asked = [(direction, roll) for direction in directions for roll in table.rolls_deg]
     free = [_Sight(*pair, partial(_free_pose, table, sensor, target, *pair)) for pair in asked]
-    if stage is None:
+    if stage is None or not free:
         return free
     turns = stage_from_sensor(sensor, 1.0).rotation @ np.stack([sight.pose(1.0).rotation.T for sight in free])
     reach = reach_rotations(stage, turns)
