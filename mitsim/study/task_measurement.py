@@ -157,7 +157,7 @@ class ViewStatement(PartialDocument):
         """
         if sensor != self.sensor:
             raise InputError(self.path, "sensor", self.sensor, f"{sensor}, the sensor of the cloud")
-        difference = _pose(self.path, self.world_from_sensor).inverse() @ pose
+        difference = _pose(self.path, "world_from_sensor", self.world_from_sensor).inverse() @ pose
         distance_mm = float(np.linalg.norm(difference.translation))
         rotation_deg = math.degrees(math.acos(min(max((float(np.trace(difference.rotation)) - 1) / 2, -1.0), 1.0)))
         if distance_mm > SAME_PLACE_MM or rotation_deg > SAME_ANGLE_DEG:
@@ -269,7 +269,7 @@ def read_pose(path: Path, view: int | None = None) -> Transform:
         If the file cannot be read, has no pose or no such view, or its matrix is not a rigid motion.
     """
     table = read_json_object(path, "pose.json of a capture, poses.json of a run, or statement.json")
-    matrix = table.get("world_from_sensor")
+    key, matrix = "world_from_sensor", table.get("world_from_sensor")
     if "views" in table:
         try:
             poses = {int(entry["view"]): entry["part_from_sensor"] for entry in table["views"]}
@@ -277,27 +277,23 @@ def read_pose(path: Path, view: int | None = None) -> Transform:
             raise InputError(
                 path, "views", f"entries that cannot be read ({error!r})", "a list as mitsim run writes it"
             ) from None
+        if not poses:
+            raise InputError(path, "views", "no view", "a list as mitsim run writes it")
         if view not in poses:
-            raise InputError(
-                "--view",
-                "",
-                "none" if view is None else view,
-                f"a view of {path}: {min(poses, default=0)} to {max(poses, default=0)}",
-            )
-        matrix = poses[view]
-    return _pose(path, matrix)
+            allowed = f"a view of {path}: {min(poses)} to {max(poses)}"
+            raise InputError("--view", "", "none" if view is None else view, allowed)
+        key, matrix = f"views.part_from_sensor of view {view}", poses[view]
+    return _pose(path, key, matrix)
 
 
-def _pose(path: Path, matrix: Any) -> Transform:
+def _pose(path: Path, key: str, matrix: Any) -> Transform:
     try:
         rows = np.array(matrix, float).reshape(4, 4)
         pose = Transform.from_matrix(rows)
     except (OverflowError, TypeError, ValueError):
-        raise InputError(path, "world_from_sensor", repr(matrix)[:60], "a 4 x 4 matrix, rows first [mm]") from None
+        raise InputError(path, key, repr(matrix)[:60], "a 4 x 4 matrix, rows first [mm]") from None
     if not is_motion(rows) or not is_rotation(pose.rotation, 1e-4) or not np.isfinite(pose.translation).all():
-        raise InputError(
-            path, "world_from_sensor", "a matrix that is not a rigid motion", "a rotation, and a translation in mm"
-        )
+        raise InputError(path, key, "a matrix that is not a rigid motion", "a rotation, and a translation in mm")
     return pose
 
 
