@@ -20,7 +20,7 @@ from mitsim.study import StatementTable
 from mitsim.study.choose.ranking import rank_keys
 from mitsim.study.choose.sensor_result import SensorResult, ordered, stated_demand
 from mitsim.study.statement_document import statement_document
-from mitsim.study.virtual.race import ALL, Raced, RaceRules, shortlist, standings
+from mitsim.study.virtual.race import ALL, Raced, shortlist, standings
 
 #: largest number of views raced for each measurement; chosen
 SHORTLIST = 3
@@ -84,8 +84,8 @@ def race_and_state(result: SensorResult, count: int, limit: TimeLimit) -> None:
     before = next(iter(result.stated), None)
     if result.raced is None:
         table = result.session.study.file.race
-        most = min(RACE_TRIALS, table.trials)
-        rules = RaceRules(min(SHORTLIST, table.shortlist), most, table.margin, table.loss, each=True)
+        fewer = {"shortlist": min(SHORTLIST, table.shortlist), "trials": min(RACE_TRIALS, table.trials)}
+        rules = table.model_copy(update={**fewer, "each": True})
         result.raced = result.session.race(result.scores, rules, limit.part(_RACE_SHARE))
         view = result.raced.leader(ALL) if len(result.raced.views) else before
     else:
@@ -158,8 +158,7 @@ def race_as_stated(result: SensorResult) -> Raced:
     """Return the race of a sensor, or of its stated views alone if there was no time for one."""
     if result.raced is not None:
         return result.raced
-    table, numbers = result.session.study.file.race, list(result.stated)
-    rules = RaceRules(len(numbers), 0, table.margin, table.loss)
+    rules, numbers = result.session.study.file.race.model_copy(update={"each": False}), list(result.stated)
     trials = dict.fromkeys(numbers, 0)
     return standings(result.scores.sel(view=numbers), numbers, result.session.race_trials, trials, rules)
 

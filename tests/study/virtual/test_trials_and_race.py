@@ -11,7 +11,8 @@ import xarray as xr
 
 from characterisation.files.documents import validate
 from characterisation.tasks.task_file import Task
-from mitsim.study.virtual.race import ALL, Job, RaceRules, run_race, shortlist
+from mitsim.study import RaceTable
+from mitsim.study.virtual.race import ALL, Job, run_race, shortlist
 from mitsim.study.virtual.race_tables import raced_errors, with_race
 from mitsim.study.virtual.trials import Outcome, TrialFolder
 from mitsim.study.virtual.world import Trial
@@ -63,7 +64,7 @@ def scores_of(u, chance=None, tolerance=(np.nan, np.nan)):
     )
 
 
-RULES = RaceRules(shortlist=5, most=200, margin=0.1, loss=0.02, each=True)
+RULES = RaceTable(shortlist=5, trials=200, margin=0.1, loss=0.02, each=True)
 
 
 def race(maker, scores, folder, rules=RULES, over=lambda: False, after_round=lambda _: None):
@@ -127,7 +128,7 @@ def test_only_the_view_for_all_measurements_is_asked_for_by_default(tmp_path):
     spreads = [[1.0, 1.0, 3.0, 3.0, 3.0, 3.0], [1.0, 3.0, 3.0, 3.0, 3.0, 3.0]]  # two equals for the first
     trials = {}
     for each in (False, True):
-        rules = RaceRules(shortlist=5, most=60, margin=0.1, loss=0.05, each=each)
+        rules = RaceTable(shortlist=5, trials=60, margin=0.1, loss=0.05, each=each)
         raced = race(KnownMaker(spreads), scores_of(spreads), tmp_path / str(each), rules)
         assert raced.decided and raced.leader(ALL) == 0
         trials[each] = raced.trials
@@ -136,7 +137,7 @@ def test_only_the_view_for_all_measurements_is_asked_for_by_default(tmp_path):
 
 def test_between_equals_the_race_ends_by_expected_loss(tmp_path):
     """No view of equals can be told to be the best, and no trial is worth that."""
-    rules = RaceRules(shortlist=2, most=2000, margin=0.02, loss=0.05)
+    rules = RaceTable(shortlist=2, trials=2000, margin=0.02, loss=0.05)
     raced = race(KnownMaker(np.ones((2, 2))), scores_of(np.ones((2, 2))), tmp_path, rules)
     best = raced.standings[ALL]
     assert raced.decided and best.loss <= 0.05
