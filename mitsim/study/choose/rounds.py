@@ -135,7 +135,7 @@ def able_to_win(results: Sequence[SensorResult], rivals: Sequence[SensorResult])
     larger by the factor that a race is expected to gain.
     """
     stated = [result for result in ordered(results) if result.stated]
-    keys = rank_keys([result.demands() for result in stated], stated[0].has_tolerance, [True] * len(stated))
+    keys = rank_keys([result.demands() for result in stated], stated[0].has_tolerance)
     first = keys[0]
     highest = max(first[1], default=math.inf) * math.exp(_STANDARD_ERRORS * _relative_error(stated[0]))
     out = []
@@ -187,7 +187,7 @@ def _finish(result: SensorResult, view: int) -> None:
 def _better(result: SensorResult, views: Sequence[int]) -> int:
     """Return the stated view that makes more measurements, or else has the less demanding ones."""
     demands = [[stated_demand(statement) for statement in result.stated[view].statements] for view in views]
-    keys = rank_keys(demands, result.has_tolerance, [True] * len(views))
+    keys = rank_keys(demands, result.has_tolerance)
     return views[min(range(len(views)), key=keys.__getitem__)]
 
 

@@ -27,7 +27,7 @@ from mitsim.scene.load import bounds_of
 from mitsim.sensor.drift import Drift
 from mitsim.sensor.working_volume import nearest_standoff
 from mitsim.study import ExposureTable, SetTable, StatementTable, finishes_of_features
-from mitsim.study.remedies.bounds import EXPOSURE, SURFACE, Effect, can_fit, least_shares, least_uncertainty
+from mitsim.study.remedies.bounds import EXPOSURE, Effect, can_fit, least_shares, least_uncertainty
 from mitsim.study.remedies.change import (
     SCREENING_FACTOR,
     Change,
@@ -304,7 +304,7 @@ def _spray(now: Shortfall) -> Iterator[Change]:
         return
     keys = {"sprayed": True}
     changed = ChangedStudy(now, "spray", lambda: reopened(study, keys), partial(same_direction, view=view))
-    expected = possible(now, SURFACE)
+    expected = possible(now, EXPOSURE)
     yield Change("spray", "sprayed matt white", keys, (view.number,), expected, changed.state, release=changed.release)
 
 

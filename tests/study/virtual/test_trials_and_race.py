@@ -4,6 +4,7 @@ import json
 import math
 import tomllib
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -230,7 +231,7 @@ def test_reasons_are_kept_with_their_trials_and_old_lines_have_none(tmp_path):
     assert again.reasons(3, [Trial(0), Trial(1)], "radius") == []
 
 
-FOLDED = {"angle": 3}
+FOLDED = {"angle": SimpleNamespace(shape=(3,))}
 
 
 def test_deviations_are_kept_to_the_last_bit_with_their_gaps(tmp_path):
@@ -291,7 +292,7 @@ def test_captures_of_a_day_are_about_the_same_part(tmp_path):
     assert place.stated.std() == pytest.approx(2, rel=0.15)
     np.testing.assert_array_equal(size, np.full(400, 0.5))
     again = [Trial(day.day, 1) for day in days]
-    np.testing.assert_array_equal(trials.stated_errors(3, again)[0], place.stated)
+    np.testing.assert_array_equal(trials.errors_of_parts(3, again)[0].stated, place.stated)
 
 
 def test_trials_of_another_study_are_moved_aside_and_not_used(tmp_path):
