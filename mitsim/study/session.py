@@ -26,7 +26,7 @@ from mitsim.running.executor import Executor
 from mitsim.running.progress import say
 from mitsim.running.time_limit import TimeLimit
 from mitsim.sensor.exposure import PlannedExposure
-from mitsim.study import StatementTable, Study
+from mitsim.study import RaceTable, StatementTable, Study
 from mitsim.study.exposures.exposure_plan import PlanRules
 from mitsim.study.exposures.planned import kept_plan, rendered, stated_exposures, with_exposure
 from mitsim.study.run_files import claim_folder
@@ -35,11 +35,10 @@ from mitsim.study.virtual.plan import (
     measured_by,
     measurements_of,
     race_rendering,
-    race_rules,
     study_digest,
     trial_digest,
 )
-from mitsim.study.virtual.race import Raced, RaceRules, run_race
+from mitsim.study.virtual.race import Raced, run_race
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.screening import screen
 from mitsim.study.virtual.spread_out import SpreadMeasurements
@@ -168,7 +167,7 @@ class Session:
     def race(
         self,
         scores: xr.Dataset,
-        rules: RaceRules | None = None,
+        rules: RaceTable | None = None,
         limit: TimeLimit | None = None,
         after_round: Callable[[Raced], None] = lambda _: None,
     ) -> Raced:
@@ -185,7 +184,7 @@ class Session:
         after_round
             Receives the state after every round but the last.
         """
-        rules = race_rules(self.study.file.race) if rules is None else rules
+        rules = self.study.file.race if rules is None else rules
         limit = TimeLimit() if limit is None else limit
         return run_race(self.study.views, scores, self.race_runner, self.race_trials, rules, limit.over, after_round)
 

@@ -277,10 +277,12 @@ def read_pose(path: Path, view: int | None = None) -> Transform:
             raise InputError(
                 path, "views", f"entries that cannot be read ({error!r})", "a list as mitsim run writes it"
             ) from None
+        if not poses:
+            raise InputError(path, "views", "no view", "a list as mitsim run writes it")
         if view not in poses:
-            some = f"{min(poses)} to {max(poses)}" if poses else "it has none"
-            raise InputError("--view", "", "none" if view is None else view, f"a view of {path}: {some}")
-        key, matrix = f"views, view {view}: part_from_sensor", poses[view]
+            allowed = f"a view of {path}: {min(poses)} to {max(poses)}"
+            raise InputError("--view", "", "none" if view is None else view, allowed)
+        key, matrix = f"views.part_from_sensor of view {view}", poses[view]
     return _pose(path, key, matrix)
 
 

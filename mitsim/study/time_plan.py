@@ -86,16 +86,20 @@ class TimePlan:
 
     def statement_limit(self, limit: TimeLimit) -> TimeLimit:
         """Return the limit of the statement, which starts now."""
-        after = self.statement + self.remedies + self.sets
-        return limit.part(self.statement / after if after > 0 else 1.0, self._pictures(limit))
+        return limit.part(self._share(self.statement), self._pictures(limit))
 
     def rest_limit(self, limit: TimeLimit) -> TimeLimit:
-        """Return the limit of what starts now and may take all time but that of the set, pictures and report."""
-        return limit.part(1.0 - (_SET_SHARE if self.sets else 0.0), self._pictures(limit))
+        """Return the limit of statement and changes, which start now: all time but that of set, pictures and report."""
+        return limit.part(self._share(self.statement + self.remedies), self._pictures(limit))
 
     def last_limit(self, limit: TimeLimit) -> TimeLimit:
         """Return the limit of what starts now and may take all time but that of clouds and page."""
         return limit.part(1.0, self.page(limit))
+
+    def _share(self, seconds: float) -> float:
+        """Return the planned share of some steps in the time between race and pictures."""
+        after = self.statement + self.remedies + self.sets
+        return seconds / after if after > 0 else 1.0
 
     def _pictures(self, limit: TimeLimit) -> float:
         """Return the time [s] that is kept for pictures and report."""

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -477,7 +478,7 @@ def _trials(folder):
     from mitsim.study.virtual.trials import Outcome, TrialFolder
     from mitsim.study.virtual.world import Trial
 
-    trials = TrialFolder(folder / "trials", "0123", ["a", "b"], {"a": 2})
+    trials = TrialFolder(folder / "trials", "0123", ["a", "b"], {"a": SimpleNamespace(shape=(2,))})
     for day in range(5):
         trials.add(3, Trial(day), Outcome({"a": 0.1 * day, "b": float("nan")}, {}, {"a": [0.1 * day, float("nan")]}))
     return folder / "trials" / "view_0003.jsonl"
@@ -486,7 +487,7 @@ def _trials(folder):
 def _read_trials(path):
     from mitsim.study.virtual.trials import TrialFolder
 
-    found = TrialFolder(path.parent, "0123", ["a", "b"], {"a": 2})
+    found = TrialFolder(path.parent, "0123", ["a", "b"], {"a": SimpleNamespace(shape=(2,))})
     trials = list(found.known(3))
     found.errors(3, trials)
     found.deviations(3, trials, "a")

@@ -9,15 +9,17 @@ For each kind of trials, the file has a digest of everything that determines the
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.files.datasets import Schema, Variable, read_dataset
 from characterisation.files.errors import InputError
+from characterisation.statements.one_sided import stated_errors
 from mitsim.maps.campaign.run import write_netcdf
 from mitsim.study.virtual.trials import Outcome, TrialFolder
 from mitsim.study.virtual.world import Trial
@@ -36,6 +38,15 @@ _SCHEMA = Schema(
     },
     hint="remove `measured` from the cases file to measure everything again",
 )
+
+
+def errors_of(folder: TrialFolder, view: int, trials: Sequence[Trial]) -> Floats:
+    """Return the errors (measurements, n) of finished trials that a statement is about, NaN without a value.
+
+    Those of a value that folds are at the limit of its tolerance.
+    """
+    errors = folder.errors_of_parts(view, trials)
+    return np.array([stated_errors(error) for error in errors], float).reshape(len(errors), len(trials))
 
 
 def write_trials(path: Path, folders: Mapping[str, TrialFolder], views: list[int]) -> None:

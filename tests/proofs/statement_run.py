@@ -32,6 +32,7 @@ from tests.proofs.case_trials import (
     measured_choice,
     trials_by_kind,
 )
+from tests.proofs.kept_trials import errors_of
 from tests.proofs.part_cases import PartCase
 
 Floats = NDArray[np.float64]
@@ -118,5 +119,5 @@ def _stated(case: PartCase, trials_of_kind: dict[str, Session], view: View, why:
     tool, apart, count = trials_of_kind["tool"], trials_of_kind["apart"], case.file.stated_worlds
     stated = tool.state(view)
     measure_worlds(case, "apart", apart, [view], {view.number: days(count)})
-    errors = apart.trials.stated_errors(view.number, days(count))
+    errors = errors_of(apart.trials, view.number, days(count))
     return JudgedView(view.number, why, tuple(stated.statements), errors)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -109,7 +111,8 @@ def test_a_file_of_other_trials_is_not_taken_up(tmp_path):
 
 
 def test_deviations_are_kept_with_their_trials(tmp_path):
-    names, folded = ["size", "place", "flat"], {"place": 2, "flat": 3}
+    names, sizes = ["size", "place", "flat"], {"place": 2, "flat": 3}
+    folded = {name: SimpleNamespace(shape=(size,)) for name, size in sizes.items()}
     mine = TrialFolder(tmp_path / "mine", "a" * 16, names, folded)
     deviations = {"place": [0.25, -1.5], "flat": [0.5, np.nan, 2.0]}
     mine.add(3, Trial(0), Outcome(dict.fromkeys(names, 0.25), {}, deviations))

@@ -90,6 +90,24 @@ def test_files_without_a_pose_are_refused(text, match, tmp_path):
         read_pose(path)
 
 
+@pytest.mark.parametrize("matrix", [[1, 2], (2 * np.eye(4)).tolist()])
+def test_a_wrong_pose_of_a_run_is_named_by_its_key_and_view(matrix, tmp_path):
+    """Before, the message named world_from_sensor, a key that such a file does not have."""
+    poses = tmp_path / "poses.json"
+    poses.write_text(json.dumps({"views": [{"view": 3, "part_from_sensor": matrix}]}), encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        read_pose(poses, 3)
+    assert caught.value.field == "views.part_from_sensor of view 3"
+
+
+def test_a_run_without_views_has_no_pose(tmp_path):
+    """Before, the views 0 to 0 were allowed."""
+    (tmp_path / "poses.json").write_text('{"views": []}', encoding="utf-8")
+    with pytest.raises(InputError, match="found no view") as caught:
+        read_pose(tmp_path / "poses.json", 0)
+    assert caught.value.field == "views"
+
+
 def test_a_file_that_is_no_statement_is_refused(tmp_path):
     path = tmp_path / "statement.json"
     path.write_text('{"sensor": "x"}', encoding="utf-8")

@@ -229,11 +229,12 @@ def test_where_no_view_is_left_the_first_reason_is_told(n10):
     stage = {"axes": [{**CRADLE, "limits_deg": [80, 81]}, TURN]}
     with pytest.raises(InputError, match=r"all of them impossible.*the first: stage: cradle 0\.0 deg beyond 80 to 81"):
         candidate_views(table(stage=stage, lowest_elevation_deg=80), n10, [500], np.zeros(3), NOTHING, where="a.toml")
-    with pytest.raises(InputError, match="no direction above it") as caught:
-        candidate_views(
-            table(subdivisions=0, lowest_elevation_deg=80, up=(1, 1, 0.4)), n10, [500], np.zeros(3), NOTHING
-        )
-    assert caught.value.field == "views.lowest_elevation_deg"
+    for axes in (None, [CRADLE, TURN], [CRADLE, TURN, {**CRADLE, "name": "third"}]):
+        chosen = {} if axes is None else {"stage": {"axes": axes}}
+        none = table(subdivisions=0, lowest_elevation_deg=80, up=(1, 1, 0.4), **chosen)
+        with pytest.raises(InputError, match="no direction above it") as caught:
+            candidate_views(none, n10, [500], np.zeros(3), NOTHING)
+        assert caught.value.field == "views.lowest_elevation_deg"
 
 
 def study(folder, scenes, views):

@@ -202,18 +202,28 @@ def measured_points(sensor: Sensor, points: Floats, true: Rig, path: tuple[float
     cameras = list(sensor.measuring_rig.cameras)
     if len(cameras) == 2:
         other, other_nominal = true.cameras[cameras[1]], nominal.cameras[cameras[1]]
-        return _by_disparity(nominal.reference, pixels, other_nominal, other_nominal.rays(other.project(points)))
+        return triangulated(nominal.reference, pixels, other_nominal, other_nominal.rays(other.project(points)))[0]
     assert true.projector is not None and nominal.projector is not None
     if sensor.technology == "reference_stereo":
         seen = true.projector.project(points)
-        return _by_disparity(nominal.reference, pixels, nominal.projector, nominal.projector.rays(seen))
+        return triangulated(nominal.reference, pixels, nominal.projector, nominal.projector.rays(seen))[0]
     component = _component(sensor)
     coordinate = true.projector.project(points)[:, component]
     return _by_coordinate(start, ray, nominal.projector, coordinate, component, sensor.working_range_mm)
 
 
-def _by_disparity(camera: Camera, pixels: Floats, other: Camera, other_rays: Floats) -> Floats:
-    """Return points on a camera's rectified rows, from the positions of the other eye's rays along them."""
+def triangulated(camera: Camera, pixels: Floats, other: Camera, other_rays: Floats) -> tuple[Floats, Floats]:
+    """Return points (n, 3) [mm] that two eyes see, on rectified rows of the first, and row errors (n,) [px].
+
+    Parameters
+    ----------
+    camera, other
+        Eyes, in the sensor frame.
+    pixels
+        (n, 2) [px] of the points in the first.
+    other_rays
+        Rays (n, 3) of the points in the frame of the other.
+    """
     pair = stereo_rectification(camera, other)
     left = camera.rays(pixels) @ pair.rotation_left.T
     right = other_rays @ pair.rotation_right.T
@@ -221,7 +231,8 @@ def _by_disparity(camera: Camera, pixels: Floats, other: Camera, other_rays: Flo
     columns = left[:, 0] * pair.matrix_left[0, 0] + pair.matrix_left[0, 2]
     other_columns = right[:, 0] * pair.matrix_right[0, 0] + pair.matrix_right[0, 2]
     depth = pair.depth(columns - other_columns)
-    return camera.sensor_from_camera.points((left * depth[:, None]) @ pair.rotation_left)
+    points = camera.sensor_from_camera.points((left * depth[:, None]) @ pair.rotation_left)
+    return points, np.asarray(pair.matrix_left[0, 0] * (right[:, 1] - left[:, 1]))
 
 
 def _by_coordinate(

@@ -6,8 +6,8 @@ Signal chain: folder of images, table of corners, OpenCV's file or arrays -> pix
 Four forms are read:
 
 - **A folder of images.** Camera and pose follow from the names: ``left-0001.png`` and ``right-0001.png``, as ROS's
-  calibrator saves them, or two folders, such as ``left`` and ``right``, with images of equal names. Names without a
-  camera belong to one camera. The corners are found by ``cv2.findChessboardCornersSB``.
+  calibrator saves them, or folders ``left`` and ``right`` with images of equal names. Names without a camera belong to
+  one camera. The corners are found by ``cv2.findChessboardCornersSB``.
 - **A table**, ``.csv``: columns ``pose, camera, column, row, x_px, y_px``. ``column`` and ``row`` count the inner
   corners from 0. A camera named ``projector`` is a projector. Lines ``# size CAMERA WIDTH HEIGHT`` give the sizes.
 - **OpenCV's file**, ``.yml``, ``.yaml``, ``.xml`` or ``.json`` of its calibration sample: ``image_points`` (poses,
@@ -20,7 +20,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -98,6 +98,10 @@ def read_corners(path: str | Path, board: Board) -> RecordedCorners:
 
 def _together(path: Path, seen: Seen, sizes: Sizes, images: Mapping[str, FittedCapture]) -> RecordedCorners:
     """Return the poses whose corners all eyes see; ``seen`` has the pixels (2,) by pose, eye and corner."""
+    sizes = dict(sorted(sizes.items(), key=lambda item: item[0] == "projector"))  # the reference is a camera
+    if len(sizes) > 2 or set(sizes) == {"projector"}:
+        allowed = "one or two cameras, or a camera and a projector"
+        raise InputError(path, "cameras", ", ".join(sizes), allowed, "name images left and right")
     boards, left_out = [], []
     used: dict[str, dict[str, Floats]] = {}
     for pose, by_eye in seen.items():
@@ -149,9 +153,9 @@ def _of_images(path: Path, board: Board) -> tuple[Seen, Sizes, dict[str, FittedC
     seen: Seen = {}
     sizes: Sizes = {}
     digests: dict[str, dict[str, bytes]] = {}
-    folders = {file.parent for file in files}
-    for file in files:
-        camera, pose = _named(file.relative_to(path), len(folders) > 1)
+    for file, (camera, pose) in _named(files, path).items():
+        if camera in digests.get(pose, {}):
+            raise InputError(file, "", f"a second image of {camera}, pose {pose}", "one of each pose by each camera")
         image = read_grey(file)
         size = (image.shape[1], image.shape[0])
         if sizes.setdefault(camera, size) != size:
@@ -169,8 +173,6 @@ def _of_images(path: Path, board: Board) -> tuple[Seen, Sizes, dict[str, FittedC
             by_camera[cameras[1]] = dict(enumerate(turned_alike(first, second)))
     if not files:
         raise InputError(path, "", "no image", f"images {', '.join(sorted(_IMAGES))} of the board")
-    if len(sizes) > 2:
-        raise _too_many(path, sizes)
     images = {
         pose: FittedCapture(
             name=f"{path / pose}", images_sha256=joined_digest(by_camera[camera] for camera in sorted(by_camera))
@@ -193,11 +195,6 @@ def found_corners(image: NDArray[np.generic], board: Board) -> Floats | None:
     return np.asarray(corners, float).reshape(-1, 2) if detected else None
 
 
-def _too_many(path: Path, cameras: Iterable[str]) -> InputError:
-    hint = "name them left and right; calibrate pairs of more cameras one by one"
-    return InputError(path, "", f"corners of {', '.join(cameras)}", "one or two cameras", hint)
-
-
 def turned_alike(first: Floats, second: Floats) -> Floats:
     """Return the corners (n, 2) [px] of a second camera in the order of those of a first.
 
@@ -208,11 +205,24 @@ def turned_alike(first: Floats, second: Floats) -> Floats:
     return second if alike else second[::-1]
 
 
-def _named(file: Path, folder_is_camera: bool) -> tuple[str, str]:
-    """Return the camera and the pose that the name of an image states; its path is relative to the folder read."""
-    if folder_is_camera and len(file.parts) > 1:
-        return file.parts[-2], file.stem
-    match = re.match(r"(left|right|l|r|camera\d*|cam\d*)[-_ ]?(.*)$", file.stem, re.IGNORECASE)
+def _named(files: Sequence[Path], path: Path) -> dict[Path, tuple[str, str]]:
+    """Return the camera and the pose of every image below ``path``.
+
+    A folder is a camera, unless the names of its images state several.
+    """
+    by_name = {file: _by_name(file) for file in files}
+    stated: dict[Path, set[str]] = {}
+    for file, (camera, pose) in by_name.items():
+        stated.setdefault(file.parent, set()).update({camera} if pose != file.stem else ())
+    return {
+        file: named if file.parent == path or len(stated[file.parent]) > 1 else (file.parent.name, file.stem)
+        for file, named in by_name.items()
+    }
+
+
+def _by_name(file: Path) -> tuple[str, str]:
+    """Return the camera and the pose that the name of an image states."""
+    match = re.match(r"(left|right|[lr](?=[-_ \d])|camera\d*|cam\d*)[-_ ]?(.*)$", file.stem, re.IGNORECASE)
     if match and match[2]:
         return {"l": "left", "r": "right"}.get(match[1].lower(), match[1].lower()), match[2]
     match = re.match(r"(.*?)[-_ ](left|right|l|r)$", file.stem, re.IGNORECASE)
@@ -228,30 +238,31 @@ def _of_table(path: Path, board: Board) -> tuple[Seen, Sizes]:
         if match := re.match(r"#\s*size\s+(\S+)\s+(\d{1,5})\s+(\d{1,5})\s*$", line):
             sizes[match[1]] = (int(match[2]), int(match[3]))
     written = "\n".join(line for line in text.splitlines() if not line.startswith("#"))
-    rows = csv.DictReader(io.StringIO(written), skipinitialspace=True)
-    rows.fieldnames = [name.strip() for name in rows.fieldnames or ()]
-    if tuple(rows.fieldnames) != _COLUMNS:
-        raise InputError(path, "header", ", ".join(rows.fieldnames) or "nothing", ", ".join(_COLUMNS))
+    lines = csv.reader(io.StringIO(written), skipinitialspace=True)
+    try:
+        rows = [[cell.strip() for cell in line] for line in lines if line]
+    except csv.Error as error:
+        raise InputError(path, "", str(error), "lines of values with commas between them") from None
+    header = rows.pop(0) if rows else []
+    if tuple(header) != _COLUMNS:
+        raise InputError(path, "header", ", ".join(header)[:200] or "nothing", ", ".join(_COLUMNS))
     seen: Seen = {}
     for number, row in enumerate(rows, 1):
         try:
-            column, line_of_board = int(row["column"]), int(row["row"])
-            pixel = np.array([float(row["x_px"]), float(row["y_px"])])
-        except (TypeError, ValueError):
-            values = str(list(row.values()))[:60]
-            raise InputError(path, f"row {number}", values, "whole numbers, and two pixels") from None
+            pose, camera = row[:2]
+            column, line_of_board = (int(cell) for cell in row[2:4])
+            pixel = np.array([float(cell) for cell in row[4:6]]).reshape(2)
+        except ValueError:
+            raise InputError(path, f"row {number}", str(row)[:60], "whole numbers, and two pixels") from None
         inside = 0 <= column < board.columns - 1 and 0 <= line_of_board < board.rows - 1
         if not inside or not np.isfinite(pixel).all():
             corners = f"corners 0 to {board.columns - 2} and 0 to {board.rows - 2} of the board, with finite pixels"
             raise InputError(path, f"row {number}", f"corner {column}, {line_of_board}", corners)
-        if row["camera"] not in sizes:
-            raise InputError(path, row["camera"], "no size", f"a line # size {row['camera']} WIDTH HEIGHT")
-        by_eye = seen.setdefault(row["pose"], {}).setdefault(row["camera"], {})
+        if camera not in sizes:
+            raise InputError(path, camera, "no size", f"a line # size {camera} WIDTH HEIGHT")
+        by_eye = seen.setdefault(pose, {}).setdefault(camera, {})
         by_eye[line_of_board * (board.columns - 1) + column] = pixel
-    cameras = [eye for eye in sizes if eye != "projector"]
-    if not 0 < len(cameras) <= 2:
-        raise _too_many(path, sizes)
-    return seen, dict(sorted(sizes.items(), key=lambda size: size[0] == "projector"))
+    return seen, sizes
 
 
 def _of_arrays(path: Path, arrays: Mapping[str, Any], board: Board) -> tuple[Seen, Sizes]:
@@ -270,8 +281,8 @@ def _of_arrays(path: Path, arrays: Mapping[str, Any], board: Board) -> tuple[See
     for eye, values in by_eye.items():
         try:
             pixels = np.asarray(values, float).reshape(-1, count, 2)
-        except (TypeError, ValueError):
-            shape = f"{np.asarray(values, object).shape}"
+        except (OverflowError, TypeError, ValueError):
+            shape = f"{values.shape}" if isinstance(values, np.ndarray) else str(values)[:60]
             raise InputError(path, eye, shape, f"(poses, {count}, 2), for {board}", "check --board") from None
         for pose, corners in enumerate(pixels):
             finite = np.isfinite(corners).all(axis=1)

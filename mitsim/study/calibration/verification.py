@@ -23,12 +23,12 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.decoding.plate import Plate, image_on_grid, plate_dots, plate_scale
-from mitsim.sensor.camera import Camera, Rig, stereo_rectification
+from mitsim.sensor.camera import Rig
 from mitsim.sensor.published_lengths import PublishedLengths
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import moved, parameter_names, path_error
 from mitsim.sensor.sensor import Sensor
-from mitsim.study.calibration.accuracy import measured_points
+from mitsim.study.calibration.accuracy import measured_points, triangulated
 from mitsim.study.calibration.board import Board
 from mitsim.study.calibration.corner_files import found_corners, turned_alike
 
@@ -154,7 +154,7 @@ def corners_of_board(capture: Capture, board: Board, cloud: PointCloud | None) -
     if len(names) > 1 and all(name in pixels for name in names[:2]):
         first, second = (capture.rig.cameras[name] for name in names[:2])
         second_pixels = turned_alike(pixels[names[0]], pixels[names[1]])
-        points, rows = triangulated(first, pixels[names[0]], second, second_pixels)
+        points, rows = triangulated(first, pixels[names[0]], second, second.rays(second_pixels))
     elif cloud is not None and names[0] in pixels:
         points, rows = _on_plane(capture, pixels[names[0]], cloud), np.empty(0)
     else:
@@ -230,7 +230,8 @@ def verify(
         scales.append(_spread(points) / _spread(nominal))
         if len(artefact.rows_px):
             pixels, second_pixels = (eye.project(artefact.points) for eye in list(true.cameras.values())[:2])
-            shifts.append(float(np.mean(triangulated(cameras[0], pixels, cameras[1], second_pixels)[1])))
+            second_rays = cameras[1].rays(second_pixels)
+            shifts.append(float(np.mean(triangulated(cameras[0], pixels, cameras[1], second_rays)[1])))
     rigs = float(np.sqrt(np.mean((np.array(scales) - 1) ** 2)))
     distance = float(np.linalg.norm(artefact.points - rig.reference.centre, axis=1).mean())
     rows = artefact.rows_px
@@ -255,29 +256,6 @@ def parameters_of(covariance: RigCovariance, rig: Rig) -> RigCovariance:
     chosen = [index for index, name in enumerate(covariance.names) if name in rig_names or name.startswith("path.")]
     names = tuple(covariance.names[index] for index in chosen)
     return replace(covariance, names=names, covariance=covariance.covariance[np.ix_(chosen, chosen)])
-
-
-def triangulated(first: Camera, pixels: Floats, second: Camera, second_pixels: Floats) -> tuple[Floats, Floats]:
-    """Return points (n, 3) [mm] that two cameras see, on rectified rows of the first, and row errors (n,) [px].
-
-    Parameters
-    ----------
-    first, second
-        Cameras, in the sensor frame.
-    pixels, second_pixels
-        (n, 2) [px] of the points in the first and in the second camera.
-    """
-    pair = stereo_rectification(first, second)
-    left, right = _rectified(first, pixels, pair.rotation_left), _rectified(second, second_pixels, pair.rotation_right)
-    f, columns = pair.matrix_left[0, 0], left[:, 0] * pair.matrix_left[0, 0] + pair.matrix_left[0, 2]
-    depth = pair.depth(columns - right[:, 0] * f - pair.matrix_right[0, 2])
-    points = first.sensor_from_camera.points((left * depth[:, None]) @ pair.rotation_left)
-    return np.asarray(points), np.asarray(f * (right[:, 1] - left[:, 1]))
-
-
-def _rectified(camera: Camera, pixels: Floats, rotation: Floats) -> Floats:
-    rays = camera.rays(pixels) @ rotation.T
-    return np.asarray(rays / rays[:, 2:])
 
 
 def _on_plane(capture: Capture, pixels: Floats, cloud: PointCloud) -> Floats:

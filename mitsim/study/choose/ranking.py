@@ -48,7 +48,7 @@ def rank_key(demands: Iterable[float], impossible: int | None = None) -> RankKey
     return len(every) - len(possible) if impossible is None else impossible, tuple(possible)
 
 
-def rank_keys(demands: ArrayLike, has_tolerance: ArrayLike, references: ArrayLike) -> list[RankKey]:
+def rank_keys(demands: ArrayLike, has_tolerance: ArrayLike, references: ArrayLike = True) -> list[RankKey]:
     """Return the key of every sensor.
 
     Parameters
@@ -60,7 +60,7 @@ def rank_keys(demands: ArrayLike, has_tolerance: ArrayLike, references: ArrayLik
         Whether a measurement (measurement,) has a tolerance. If one has, only those with a tolerance are compared: the
         others have no limit. Impossible ones count with and without tolerance.
     references
-        Sensors (sensor,) whose least demand is 1 if there are no tolerances.
+        Sensors (sensor,) whose least demand is 1 if there are no tolerances; by default all.
     """
     table, compared = np.asarray(demands, float), np.asarray(has_tolerance, bool)
     impossible = (~np.isfinite(table)).sum(axis=1)
@@ -74,7 +74,7 @@ def relative_to_least(demands: ArrayLike, references: ArrayLike) -> Floats:
     If no reference can make a measurement, the least of all sensors counts. Impossible ones stay infinite.
     """
     table = np.where(np.isfinite(np.asarray(demands, float)), demands, np.inf)
-    chosen = np.asarray(references, bool)
+    chosen = np.broadcast_to(np.asarray(references, bool), len(table))
     least = np.min(table, axis=0, initial=np.inf, where=chosen[:, None])
     least = np.where(np.isfinite(least), least, np.min(table, axis=0, initial=np.inf))
     return np.where(np.isfinite(table), table / np.where(np.isfinite(least), least, 1.0), np.inf)

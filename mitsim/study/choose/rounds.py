@@ -20,7 +20,7 @@ from mitsim.study import StatementTable
 from mitsim.study.choose.ranking import rank_keys
 from mitsim.study.choose.sensor_result import SensorResult, ordered, stated_demand
 from mitsim.study.statement_document import statement_document
-from mitsim.study.virtual.race import ALL, Raced, RaceRules, shortlist, standings
+from mitsim.study.virtual.race import ALL, Raced, shortlist, standings
 
 #: largest number of views raced for each measurement; chosen
 SHORTLIST = 3
@@ -84,8 +84,8 @@ def race_and_state(result: SensorResult, count: int, limit: TimeLimit) -> None:
     before = next(iter(result.stated), None)
     if result.raced is None:
         table = result.session.study.file.race
-        most = min(RACE_TRIALS, table.trials)
-        rules = RaceRules(min(SHORTLIST, table.shortlist), most, table.margin, table.loss, each=True)
+        fewer = {"shortlist": min(SHORTLIST, table.shortlist), "trials": min(RACE_TRIALS, table.trials)}
+        rules = table.model_copy(update={**fewer, "each": True})
         result.raced = result.session.race(result.scores, rules, limit.part(_RACE_SHARE))
         view = result.raced.leader(ALL) if len(result.raced.views) else before
     else:
@@ -135,7 +135,7 @@ def able_to_win(results: Sequence[SensorResult], rivals: Sequence[SensorResult])
     larger by the factor that a race is expected to gain.
     """
     stated = [result for result in ordered(results) if result.stated]
-    keys = rank_keys([result.demands() for result in stated], stated[0].has_tolerance, [True] * len(stated))
+    keys = rank_keys([result.demands() for result in stated], stated[0].has_tolerance)
     first = keys[0]
     highest = max(first[1], default=math.inf) * math.exp(_STANDARD_ERRORS * _relative_error(stated[0]))
     out = []
@@ -158,8 +158,7 @@ def race_as_stated(result: SensorResult) -> Raced:
     """Return the race of a sensor, or of its stated views alone if there was no time for one."""
     if result.raced is not None:
         return result.raced
-    table, numbers = result.session.study.file.race, list(result.stated)
-    rules = RaceRules(len(numbers), 0, table.margin, table.loss)
+    rules, numbers = result.session.study.file.race.model_copy(update={"each": False}), list(result.stated)
     trials = dict.fromkeys(numbers, 0)
     return standings(result.scores.sel(view=numbers), numbers, result.session.race_trials, trials, rules)
 
@@ -188,7 +187,7 @@ def _finish(result: SensorResult, view: int) -> None:
 def _better(result: SensorResult, views: Sequence[int]) -> int:
     """Return the stated view that makes more measurements, or else has the less demanding ones."""
     demands = [[stated_demand(statement) for statement in result.stated[view].statements] for view in views]
-    keys = rank_keys(demands, result.has_tolerance, [True] * len(views))
+    keys = rank_keys(demands, result.has_tolerance)
     return views[min(range(len(views)), key=keys.__getitem__)]
 
 

@@ -141,7 +141,7 @@ def _complete(winner: SensorResult) -> None:
 
 def _promising(results: list[SensorResult]) -> list[SensorResult]:
     """Return the sensors worth a virtual measurement, best first: at least one if any sensor can measure at all."""
-    keys = rank_keys([result.screened for result in results], results[0].has_tolerance, [True] * len(results))
+    keys = rank_keys([result.screened for result in results], results[0].has_tolerance)
     for result, reason in zip(results, unpromising(keys, any(results[0].has_tolerance)), strict=True):
         result.unpromising = reason
     order = sorted(range(len(results)), key=keys.__getitem__)

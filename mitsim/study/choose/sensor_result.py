@@ -83,7 +83,6 @@ def stated_demand(statement: Statement) -> float:
 def ordered(results: Sequence[SensorResult]) -> list[SensorResult]:
     """Return measured sensors before screened ones, each by their impossible and then their worst measurements."""
     stated = [bool(result.stated) for result in results]
-    references = stated if any(stated) else [True] * len(results)
-    keys = rank_keys([result.demands() for result in results], results[0].has_tolerance, references)
+    keys = rank_keys([result.demands() for result in results], results[0].has_tolerance, stated)
     order = sorted(range(len(results)), key=lambda i: (not stated[i], keys[i]))
     return [results[i] for i in order]

@@ -37,9 +37,8 @@ class Effect:
 #: groups whose effect depends on the light that the part returns
 _OF_LIGHT = ("finish", "light", "unit", "decoder", "beyond_map", INTERACTION, NOISE)
 
-#: a change of the light on the imagers, and one of the surface
+#: a change of the light on the imagers, by the exposure or by the surface
 EXPOSURE = Effect(dict.fromkeys(_OF_LIGHT, 0.0), unbiased=True)
-SURFACE = EXPOSURE
 
 
 def least_uncertainty(stated: Statement, effect: Effect) -> float:

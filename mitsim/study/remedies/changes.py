@@ -27,7 +27,7 @@ from mitsim.scene.load import bounds_of
 from mitsim.sensor.drift import Drift
 from mitsim.sensor.working_volume import nearest_standoff
 from mitsim.study import ExposureTable, SetTable, StatementTable, finishes_of_features
-from mitsim.study.remedies.bounds import EXPOSURE, SURFACE, Effect, can_fit, least_shares, least_uncertainty
+from mitsim.study.remedies.bounds import EXPOSURE, Effect, can_fit, least_shares, least_uncertainty
 from mitsim.study.remedies.change import (
     SCREENING_FACTOR,
     Change,
@@ -106,16 +106,14 @@ def _bias(now: Shortfall) -> Iterator[Change]:
     if not able:
         return
     task = now.study.task
-    decision = task.decision.model_copy(update={"subtract_bias": True})
-    rules = {
-        name: measurement.decision.model_copy(update={"subtract_bias": True})
-        for name, measurement in task.measurements.items()
-        if measurement.decision is not None
-    }
-    measurements = {
-        name: measurement.model_copy(update={"decision": rules[name]}) if name in rules else measurement
-        for name, measurement in task.measurements.items()
-    }
+    key = {"subtract_bias": True}
+    decision, measurements = task.decision.model_copy(update=key), dict(task.measurements)
+    keys: dict[str, Any] = {"decision": key}
+    for name, measurement in task.measurements.items():
+        if measurement.decision is not None:
+            own = measurement.decision.model_copy(update=key)
+            measurements[name] = measurement.model_copy(update={"decision": own})
+            keys.setdefault("measurements", {})[name] = {"decision": key}
     corrected = task.model_copy(update={"decision": decision, "measurements": measurements})
     session, number = now.session, now.stated.view.number
     most = max(statement.trials for statement in now.stated.statements)
@@ -128,8 +126,6 @@ def _bias(now: Shortfall) -> Iterator[Change]:
 
     words = "with its bias subtracted"
     expected = {name: statement.standard_uncertainty for name, statement in able.items()}
-    subtracts = {"decision": {"subtract_bias": True}}
-    keys = subtracts | ({"measurements": dict.fromkeys(rules, subtracts)} if rules else {})
     yield Change("bias", words, keys, (number,), expected, state, needs_trials=False)
 
 
@@ -308,7 +304,7 @@ def _spray(now: Shortfall) -> Iterator[Change]:
         return
     keys = {"sprayed": True}
     changed = ChangedStudy(now, "spray", lambda: reopened(study, keys), partial(same_direction, view=view))
-    expected = possible(now, SURFACE)
+    expected = possible(now, EXPOSURE)
     yield Change("spray", "sprayed matt white", keys, (view.number,), expected, changed.state, release=changed.release)
 
 

@@ -78,6 +78,14 @@ class RemediesEntry(PartialDocument):
         ]
         return {**document, "untried": untried}
 
+    @model_validator(mode="after")
+    def _of_tried(self) -> RemediesEntry:
+        for name, measurement in self.measurements.items():
+            index = measurement.fits_by
+            if index is not None and not (0 <= index < len(self.tried) and name in self.tried[index].measurements):
+                raise ValueError(f"fits_by {index} of {name} must be the index of a change tried that has {name}")
+        return self
+
 
 def remedies_in_words(remedies: RemediesEntry | None) -> list[str]:
     """Return lines such as ``sprayed matt white: pillar1_radius fits, u 0.58 to 0.03 mm (40 virtual measurements)``."""
@@ -85,11 +93,7 @@ def remedies_in_words(remedies: RemediesEntry | None) -> list[str]:
         return []
     lines = list[str]()
     for index, tried in enumerate(remedies.tried):
-        names = [
-            name
-            for name, measurement in remedies.measurements.items()
-            if measurement.fits_by == index and name in tried.measurements
-        ]
+        names = [name for name, measurement in remedies.measurements.items() if measurement.fits_by == index]
         if names:
             changed = [_changed(name, remedies.measurements[name], tried.measurements[name]) for name in names]
             verb = "fits" if len(names) == 1 else "fit"

@@ -184,6 +184,8 @@ def state_set(session: Session, chosen: ViewSet, over: Callable[[], bool] = lamb
     study, renderer, table = session.study, session.renderer, session.study.file.set
     assert table is not None and renderer is not None  # clouds drawn from a map cannot be joined
     content = ["set", list(chosen.views), table.joining, list(table.pose_known), _JOINING_VERSION]
+    if len(chosen.views) == 1:
+        content = ["view", *chosen.views]  # nothing is joined
     decided_by = with_exposure(session.digest, None, content)
     trials = TrialFolder.of(session.folder / "set_trials" / decided_by, decided_by, study.task)
     runner = JoinedMeasurements(renderer, [study.view(number) for number in chosen.views], table)

@@ -12,8 +12,8 @@ orthogonal distances (:func:`characterisation.tasks.evaluation.measure_points`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,13 +21,10 @@ from characterisation.features.best_fit import best_fit, motion_matrix
 from characterisation.features.fits import belonging
 from characterisation.features.robust_fit import FitError
 from characterisation.files.arrays import Floats
-from characterisation.point_cloud import PointCloud
 from characterisation.scores.joining import pose_covariance
-from characterisation.tasks.evaluation import measure, measure_points
-from characterisation.tasks.result import Result
-from characterisation.tasks.task_file import Task
+from characterisation.tasks.evaluation import measure_points
 from mitsim.study import MINIMUM_POINTS, SetTable
-from mitsim.study.virtual.form import measured_with_form
+from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.trials import Outcome
 from mitsim.study.virtual.world import Trial
@@ -35,19 +32,6 @@ from mitsim.views import View
 
 #: seed of the streams of pose errors, different from those of the groups of unknowns
 _POSE_STREAM = 31
-
-
-@dataclass(frozen=True)
-class _MeasuredView:
-    """One view of a day: ``points`` (n, 3) [mm] of each feature, in the part frame by the assumed pose of the view.
-
-    ``clouds(with_form)`` returns its labelled cloud, with or without the form deviation of the part.
-    """
-
-    points: dict[str, Floats]
-    assumed: Floats
-    clouds: Callable[[bool], PointCloud]
-    deviates: bool
 
 
 class JoinedMeasurements:
@@ -60,15 +44,21 @@ class JoinedMeasurements:
 
     def run(self, days: Iterable[int]) -> Iterable[tuple[int, Outcome]]:
         """Yield the outcome of every virtual measurement, day by day."""
+        if len(self.views) == 1:
+            jobs = [Job(self.views[0], Trial(day)) for day in days]
+            yield from ((job.trial.day, outcome) for job, outcome in self.renderer.run(jobs))
+            return
         for day in days:
             yield day, self._measured([self._measure_view(view, k, day) for k, view in enumerate(self.views)], day)
 
-    def _measure_view(self, view: View, number: int, day: int) -> _MeasuredView:
-        """Return the points of one view on one day; its ``number`` in the set is that of its capture."""
+    def _measure_view(self, view: View, number: int, day: int) -> dict[str, Floats]:
+        """Return the points (n, 3) [mm] of each feature of one view on one day, part frame by its assumed pose.
+
+        The ``number`` of the view in the set is that of its capture.
+        """
         renderer, first = self.renderer, self.renderer.unknowns.draw(Trial(day))
         drawn = replace(renderer.unknowns.draw(Trial(day, number)), placed=first.placed, assumed=first.assumed)
-        clouds, assumed = renderer.clouds_of(view, drawn)
-        cloud = clouds(True)
+        cloud, assumed = renderer.cloud_of(view, drawn)
         rng = np.random.default_rng(np.random.SeedSequence([renderer.unknowns.seed, _POSE_STREAM, day, number]))
         # error of the assumed pose, a motion [w (rad), t (mm)]
         error = np.sqrt(np.diag(self.covariance)) * rng.standard_normal(6)
@@ -79,39 +69,30 @@ class JoinedMeasurements:
             nominal = renderer.study.task.features[name].nominal(assumed.inverse().matrix())
             kept = face_points[belonging(face_points, nominal, cloud.grid.origin)] if len(face_points) else face_points
             points[name] = kept @ motion[:3, :3].T + motion[:3, 3]
-        return _MeasuredView(points, assumed.matrix(), clouds, renderer.deviates(drawn))
+        return points
 
-    def _measured(self, measured: Sequence[_MeasuredView], day: int) -> Outcome:
+    def _measured(self, measured: Sequence[dict[str, Floats]], day: int) -> Outcome:
         task = self.renderer.study.task
-        if len(measured) == 1:
-            motion, clouds = np.linalg.inv(measured[0].assumed), measured[0].clouds
+        try:
+            points = self._join(measured, day)
+        except FitError as error:
+            names = task.measurements
+            return Outcome(dict.fromkeys(names, math.nan), dict.fromkeys(names, f"the views do not join: {error}"))
+        return Outcome.of(measure_points(points, task, MINIMUM_POINTS, False))
 
-            def evaluate(task: Task, with_form: bool) -> dict[str, Result]:
-                return measure(clouds(with_form), task, motion, MINIMUM_POINTS, False)
-
-            results = measured_with_form(task, evaluate, measured[0].deviates)
-        else:
-            try:
-                points = self._join(measured, day)
-            except FitError as error:
-                names = task.measurements
-                return Outcome(dict.fromkeys(names, math.nan), dict.fromkeys(names, f"the views do not join: {error}"))
-            results = measure_points(points, task, MINIMUM_POINTS, False)
-        return Outcome.of(results)
-
-    def _join(self, measured: Sequence[_MeasuredView], day: int) -> dict[str, Floats]:
+    def _join(self, measured: Sequence[dict[str, Floats]], day: int) -> dict[str, Floats]:
         """Return the points of every feature from all views together."""
         motions = [np.eye(4)] * len(measured)
         if self.table.joining == "best_fit":
             task = self.renderer.study.task
             shapes = {name: task.features[name].nominal() for name in task.shapes}
-            motions = best_fit([view.points for view in measured], shapes, self.centre, self.covariance, day)
+            motions = best_fit(measured, shapes, self.centre, self.covariance, day)
         return {
             name: np.concatenate(
                 [
-                    view.points[name] @ motion[:3, :3].T + motion[:3, 3]
-                    for view, motion in zip(measured, motions, strict=True)
+                    points[name] @ motion[:3, :3].T + motion[:3, 3]
+                    for points, motion in zip(measured, motions, strict=True)
                 ]
             )
-            for name in measured[0].points
+            for name in measured[0]
         }

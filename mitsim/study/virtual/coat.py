@@ -22,7 +22,7 @@ from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.raycast import Surfaces
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.unknowns import CoatUnknowns
-from mitsim.study.virtual.form import along_rays
+from mitsim.study.virtual.form import along_rays, random_waves
 
 #: finish of the faces that are sprayed: no part is made of it
 SPRAY = "matt_white"
@@ -44,11 +44,7 @@ class Coat:
 
     def thickness(self, positions: NDArray[np.floating], extent: float) -> Floats:
         """Return the thickness (n,) [mm] at positions (n, 3) [mm] on a part of an extent [mm]; nowhere below 0."""
-        rng = np.random.default_rng(_WAVES_SEED)
-        directions = rng.standard_normal((_WAVES, 3))
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        waves = directions * (2 * np.pi / (extent * rng.uniform(0.5, 2.0, (_WAVES, 1))))
-        phases = positions @ waves.T
+        phases = positions @ random_waves(_WAVES, extent, np.random.default_rng(_WAVES_SEED)).T
         cosines, sines = np.split(self.amplitudes, 2)
         deviation = (np.cos(phases) @ cosines + np.sin(phases) @ sines) / np.sqrt(_WAVES)
         return np.asarray(self.mean * np.maximum(1 + self.spread * deviation, 0.0))

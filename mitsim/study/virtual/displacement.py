@@ -1,16 +1,78 @@
-"""Displace the decoded points of a trial by the errors of the path length and the expansion of the part."""
+"""Displace the decoded points of a trial by the errors of path length and expansion, and by form and coat of the part.
+
+Signal chain: decoded cloud -> path length and expansion -> form and coat of the faces that each pixel meets -> cloud
+with the labels of its faces, to measure.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.arrays import Floats
 from characterisation.point_cloud import PointCloud
+from mitsim.scene.load import Scene
+from mitsim.scene.ray_casting.raycast import Surfaces
 from mitsim.sensor.transforms import Transform
+from mitsim.sensor.unknowns import UnknownsTable
+from mitsim.study.virtual.coat import coated, coated_shapes
+from mitsim.study.virtual.form import form_deviation
 from mitsim.study.virtual.world import DrawnValues
+
+
+class RealFaces:
+    """Faces of a part with the form and the coat of a draw."""
+
+    def __init__(self, scene: Scene, table: UnknownsTable) -> None:
+        self.scene, self.table = scene, table
+        self._has_form = any(table.form.features.values())
+        self._has_coat = bool(coated_shapes(scene, table.coat))
+
+    def deviate(self, drawn: DrawnValues) -> bool:
+        """Return whether the faces of a draw have a form deviation."""
+        return bool(self._has_form and drawn.form)
+
+    def lie_off(self, drawn: DrawnValues) -> bool:
+        """Return whether the faces of a draw lie off their nominal places, by form or coat."""
+        return self.deviate(drawn) or bool(self._has_coat and drawn.coat)
+
+    def labelled(
+        self,
+        cloud: PointCloud,
+        drawn: DrawnValues,
+        assumed: Transform,
+        surfaces: Surfaces | None,
+        labels: NDArray[np.int16],
+        with_form: bool = True,
+    ) -> PointCloud:
+        """Return a decoded cloud with the errors of path, temperature, coat and, if asked for, form of the part.
+
+        Parameters
+        ----------
+        cloud
+            Organised cloud, sensor frame.
+        drawn
+            Draw of the trial.
+        assumed
+            Pose of the sensor that the evaluation assumes.
+        surfaces
+            Nominal shape and normal that each pixel meets, sensor frame; None if no face lies off its place.
+        labels
+            (H, W) number of the shape of each pixel.
+        with_form
+            Whether faces deviate from their form.
+        """
+        scene, table = self.scene, self.table
+        points = displaced(cloud, drawn, assumed, scene.centre)
+        if surfaces is not None:
+            form = table.form.features if drawn.form and with_form else {}
+            points = form_deviation(points, surfaces, scene, form, assumed, cloud.grid, drawn.form)
+            if drawn.coat:
+                points = coated(points, surfaces, scene, table.coat, assumed, cloud.grid, drawn.coat)
+        return replace(cloud, points=points, feature=labels, feature_names=scene.names)
 
 
 def displaced(

@@ -152,8 +152,13 @@ def along_rays(
 
 def random_field(positions: NDArray[np.floating], extent: float, rng: np.random.Generator) -> NDArray[np.float64]:
     """Return a smooth field of variance 1 at positions (n, 3) [mm]; wavelengths are 0.5 to 2 times ``extent`` [mm]."""
-    directions = rng.standard_normal((_WAVES, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    waves = directions * (2 * np.pi / (extent * rng.uniform(0.5, 2.0, (_WAVES, 1))))
+    waves = random_waves(_WAVES, extent, rng)
     phases = rng.uniform(0, 2 * np.pi, _WAVES)
     return np.asarray(np.sqrt(2 / _WAVES) * np.cos(positions @ waves.T + phases).sum(axis=1))
+
+
+def random_waves(count: int, extent: float, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Return wave vectors (count, 3) [rad/mm] of random directions; wavelengths are 0.5 to 2 times ``extent`` [mm]."""
+    directions = rng.standard_normal((count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return np.asarray(directions * (2 * np.pi / (extent * rng.uniform(0.5, 2.0, (count, 1)))))

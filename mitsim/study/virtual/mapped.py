@@ -38,9 +38,8 @@ from mitsim.sensor.sensor import Sensor
 from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.study.calibration.accuracy import measured_points
 from mitsim.study.virtual.beyond_map import beyond_map
-from mitsim.study.virtual.coat import coated, coated_shapes
-from mitsim.study.virtual.displacement import displaced
-from mitsim.study.virtual.form import form_deviation, measured_with_form
+from mitsim.study.virtual.displacement import RealFaces
+from mitsim.study.virtual.form import measured_with_form
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.screening import screen
 from mitsim.study.virtual.trials import Outcome
@@ -73,8 +72,7 @@ class MappedMeasurements:
         self.geometry = sensor_geometry(study.sensor)
         self.predictor = Predictor.of_sensor(study.sensor, self.geometry)
         self._characterised: dict[int, CharacterisedScene] = {}
-        self._has_form = any(unknowns.table.form.features.values())
-        self._has_coat = bool(coated_shapes(study.scene, unknowns.table.coat))
+        self.faces = RealFaces(study.scene, unknowns.table)
         self._beyond_sizes = beyond_map().of(study.sensor) if BEYOND in unknowns.varied else None
         self._predicted: dict[int, dict[str, float]] = {}
         self._folded = folded_values(study.task)
@@ -99,28 +97,19 @@ class MappedMeasurements:
         rng = np.random.default_rng(drawn.seed)
         cloud = self.predictor.predict(self._scene(drawn.finish), true, rng, correlated=True)
         labels = self.predictor.quick_labels(self.study.scene, assumed)
-        moves_faces = (self._has_form and drawn.form) or (self._has_coat and drawn.coat)
-        surfaces = self.predictor.surfaces(self.study.scene, assumed) if moves_faces else None
+        surfaces = self.predictor.surfaces(self.study.scene, assumed) if self.faces.lie_off(drawn) else None
         return cloud, drawn, labels, surfaces
 
     def _finish(self, drawing: tuple[PointCloud, DrawnValues, NDArray[np.int16], Surfaces | None], job: Job) -> Outcome:
         cloud, drawn, labels, surfaces = drawing
-        scene, assumed = self.study.scene, drawn.assumed.inverse() @ job.view.world_from_sensor
+        assumed = drawn.assumed.inverse() @ job.view.world_from_sensor
         cloud = replace(cloud, points=moved_by_calibration(cloud, self.study.sensor, drawn))
-        points = displaced(cloud, drawn, assumed, scene.centre)
-        table = self.unknowns.table
 
         def evaluate(task: Task, with_form: bool) -> dict[str, Result]:
-            moved = points
-            if surfaces is not None:
-                form = table.form.features if drawn.form and with_form else {}
-                moved = form_deviation(moved, surfaces, scene, form, assumed, cloud.grid, drawn.form)
-                if drawn.coat:
-                    moved = coated(moved, surfaces, scene, table.coat, assumed, cloud.grid, drawn.coat)
-            labelled = replace(cloud, points=moved, feature=labels, feature_names=scene.names)
+            labelled = self.faces.labelled(cloud, drawn, assumed, surfaces, labels, with_form)
             return measure(labelled, task, assumed.inverse().matrix(), MINIMUM_POINTS, False)
 
-        results = measured_with_form(self.study.task, evaluate, bool(self._has_form and drawn.form))
+        results = measured_with_form(self.study.task, evaluate, self.faces.deviate(drawn))
         return self._with_beyond(Outcome.of(results), job.view, drawn)
 
     def _predict(self, views: dict[int, View]) -> None:

@@ -24,9 +24,8 @@ from mitsim.running.version import __version__
 from mitsim.scene.xml_check import named_digests
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.matcher import MatcherSettings
-from mitsim.study import RaceTable, Study
+from mitsim.study import Study
 from mitsim.study.virtual.mapped import MappedMeasurements
-from mitsim.study.virtual.race import RaceRules
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.world import BEYOND, Unknowns
 
@@ -129,11 +128,6 @@ def measurements_of(
     if measured_by(study) == "map":
         return MappedMeasurements(study, unknowns)
     return RenderedMeasurements(study, unknowns, rendering_of(study), separate_light)
-
-
-def race_rules(table: RaceTable) -> RaceRules:
-    """Return the rules of a race."""
-    return RaceRules(table.shortlist, table.trials, table.margin, table.loss, table.each)
 
 
 def map_digest(study: Study) -> str:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from characterisation.files.arrays import Floats
 from characterisation.statements.selection import Standing, joint_samples, judge
 from mitsim.running.progress import say, say_progress, track
+from mitsim.study import RaceTable
 from mitsim.study.virtual.trials import Outcome, TrialFolder
 from mitsim.study.virtual.world import Trial
 from mitsim.views import View
@@ -97,22 +98,6 @@ def complete(
         trials.add(job.view.number, job.trial, outcome)
         if over():
             break
-
-
-@dataclass(frozen=True)
-class RaceRules:
-    """Rules of a race: ``shortlist`` views, at most ``most`` trials of each view.
-
-    The choice for all measurements is made if the risk of its view is expected to exceed the least by no more than the
-    share ``loss``. ``margin`` is that of the stated probability: within it a view is nearly the best. With ``each``,
-    the best view of each measurement alone is asked for as well: each has a shortlist and is a choice to make.
-    """
-
-    shortlist: int
-    most: int
-    margin: float
-    loss: float
-    each: bool = False
 
 
 @dataclass(frozen=True)
@@ -196,7 +181,7 @@ def run_race(
     scores: xr.Dataset,
     runner: TrialRunner,
     trials: TrialFolder,
-    rules: RaceRules,
+    rules: RaceTable,
     over: Callable[[], bool] = lambda: False,
     after_round: Callable[[Raced], None] = lambda _: None,
 ) -> Raced:
@@ -272,7 +257,7 @@ def run_race(
 
 
 def standings(
-    scores: xr.Dataset, numbers: Sequence[int], trials: TrialFolder, counts: dict[int, int], rules: RaceRules
+    scores: xr.Dataset, numbers: Sequence[int], trials: TrialFolder, counts: dict[int, int], rules: RaceTable
 ) -> Raced:
     """Return the state of the race after some trials of each view.
 
@@ -313,7 +298,7 @@ def standings(
     return Raced(np.array(numbers), by_name, errors, decided, rules.margin)
 
 
-def asked(names: Iterable[str], rules: RaceRules) -> list[str]:
+def asked(names: Iterable[str], rules: RaceTable) -> list[str]:
     """Return the names of the choices that the race has to make."""
     return list(names) if rules.each else [ALL]
 
@@ -344,7 +329,7 @@ def _first_trials(count: int) -> list[Trial]:
     return [Trial(day) for day in range(count)]
 
 
-def _next_round(raced: Raced, counts: dict[int, int], rules: RaceRules) -> dict[int, int]:
+def _next_round(raced: Raced, counts: dict[int, int], rules: RaceTable) -> dict[int, int]:
     """Return the number of trials after the next round, for the views that get more."""
     wanted = {}
     for name in asked(raced.standings, rules):
@@ -354,8 +339,8 @@ def _next_round(raced: Raced, counts: dict[int, int], rules: RaceRules) -> dict[
         rivals = [int(v) for v in np.argsort(-standing.gain, kind="stable") if standing.gain[v] > _LEAST_GAIN]
         for index in [standing.leader, *rivals[:_CHALLENGERS]]:
             number = int(raced.views[index])
-            if counts[number] < rules.most:
-                wanted[number] = min(counts[number] + BATCH, rules.most)
+            if counts[number] < rules.trials:
+                wanted[number] = min(counts[number] + BATCH, rules.trials)
     return wanted
 
 

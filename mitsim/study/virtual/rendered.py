@@ -19,7 +19,7 @@ change of the image position is far below a pixel, and that of the brightness fa
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -47,11 +47,10 @@ from mitsim.sensor.pattern import DotPattern, another_mask
 from mitsim.sensor.room_light import exposures_in_room
 from mitsim.sensor.transforms import Transform
 from mitsim.study import MINIMUM_POINTS, Study
-from mitsim.study.virtual.coat import coated, coated_shapes
-from mitsim.study.virtual.displacement import displaced
+from mitsim.study.virtual.displacement import RealFaces
 from mitsim.study.virtual.drawn_decoder import drawn_decoder
 from mitsim.study.virtual.drawn_part import DrawnPart
-from mitsim.study.virtual.form import form_deviation, measured_with_form
+from mitsim.study.virtual.form import measured_with_form
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.trials import Outcome
 from mitsim.study.virtual.view_light import LightOfViews, ViewLight, regions, seen_surfaces
@@ -107,8 +106,7 @@ class RenderedMeasurements:
         reach = _PLACEMENTS * unknowns.table.pose.placement_mm if "pose" in unknowns.varied else 0.0
         self.corners = np.concatenate([corners + step for step in reach * _CUBE_CORNERS])
         self.part, self.views = DrawnPart(study, unknowns), LightOfViews()
-        self._has_form = any(unknowns.table.form.features.values())
-        self._has_coat = bool(coated_shapes(study.scene, unknowns.table.coat))
+        self.faces = RealFaces(study.scene, unknowns.table)
 
     def exposed_as(self, planned: PlannedExposure | None) -> RenderedMeasurements:
         """Return the same measurements with other exposures than the sensor's own; prepared data is shared."""
@@ -143,18 +141,8 @@ class RenderedMeasurements:
 
     def cloud_of(self, view: View, drawn: DrawnValues) -> tuple[PointCloud, Transform]:
         """Return the labelled cloud of a view for one draw, and the assumed pose of the sensor."""
-        clouds, assumed = self.clouds_of(view, drawn)
-        return clouds(True), assumed
-
-    def clouds_of(self, view: View, drawn: DrawnValues) -> tuple[Callable[[bool], PointCloud], Transform]:
-        """Return the labelled cloud of a view for one draw, with or without form deviation, and the assumed pose."""
         captured = self._captured(view, drawn)
-        decoded = self.unlabelled_cloud(captured.capture, captured.drawn.decoder)
-        return partial(self._labelled, captured, decoded), captured.assumed
-
-    def deviates(self, drawn: DrawnValues) -> bool:
-        """Return whether the clouds of a draw have a form deviation."""
-        return bool(self._has_form and drawn.form)
+        return self._cloud(captured), captured.assumed
 
     def outcome(self, capture: Capture, lit: TracedLight) -> Outcome:
         """Return the outcome of a capture of traced light, decoded and measured as in a trial."""
@@ -168,7 +156,7 @@ class RenderedMeasurements:
             cloud = self._labelled(captured, decoded, with_form)
             return measure(cloud, task, part_from_world, MINIMUM_POINTS, False)
 
-        return Outcome.of(measured_with_form(self.study.task, evaluate, self.deviates(captured.drawn)))
+        return Outcome.of(measured_with_form(self.study.task, evaluate, self.faces.deviate(captured.drawn)))
 
     def _captured(self, view: View, drawn: DrawnValues) -> _Captured:
         lit = self.lit(view, drawn)
@@ -177,12 +165,8 @@ class RenderedMeasurements:
     def _with_labels(self, capture: Capture, drawn: DrawnValues, assumed: Transform) -> _Captured:
         """Return a capture with the labels of its pixels and, if faces have moved, their nominal surfaces."""
         labels = self.predictor.quick_labels(self.study.scene, assumed)
-        surfaces = self.predictor.surfaces(self.study.scene, assumed) if self._moves_faces(drawn) else None
+        surfaces = self.predictor.surfaces(self.study.scene, assumed) if self.faces.lie_off(drawn) else None
         return _Captured(capture, drawn, assumed, surfaces, labels)
-
-    def _moves_faces(self, drawn: DrawnValues) -> bool:
-        """Return whether the faces of a draw lie off their nominal places, by form or coat."""
-        return self.deviates(drawn) or bool(self._has_coat and drawn.coat)
 
     def lit(self, view: View, drawn: DrawnValues) -> TracedLight:
         """Trace the light of one draw in a view, which all of its exposures share."""
@@ -262,15 +246,9 @@ class RenderedMeasurements:
         return self._labelled(captured, self.unlabelled_cloud(captured.capture, captured.drawn.decoder), True)
 
     def _labelled(self, captured: _Captured, cloud: PointCloud, with_form: bool) -> PointCloud:
-        """Return a decoded cloud with the errors of path, temperature, coat and, if asked for, form of the part."""
-        scene, table, drawn, pose = self.study.scene, self.unknowns.table, captured.drawn, captured.assumed
-        points = displaced(cloud, drawn, pose, scene.centre)
-        if captured.surfaces is not None:
-            form = table.form.features if drawn.form and with_form else {}
-            points = form_deviation(points, captured.surfaces, scene, form, pose, cloud.grid, drawn.form)
-            if drawn.coat:
-                points = coated(points, captured.surfaces, scene, table.coat, pose, cloud.grid, drawn.coat)
-        return replace(cloud, points=points, feature=captured.labels, feature_names=scene.names)
+        return self.faces.labelled(
+            cloud, captured.drawn, captured.assumed, captured.surfaces, captured.labels, with_form
+        )
 
     def _view_light(self, view: View) -> ViewLight:
         """Return what all draws of a view share, made at its nominal pose and calibration on first use."""

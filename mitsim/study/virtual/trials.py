@@ -27,7 +27,7 @@ from characterisation.files.arrays import Floats
 from characterisation.files.atomic_io import json_values
 from characterisation.files.documents import Document
 from characterisation.files.errors import InputError
-from characterisation.statements.one_sided import OneSidedErrors, stated_errors
+from characterisation.statements.one_sided import OneSidedErrors
 from characterisation.tasks.folded import FoldedValue, folded_values
 from characterisation.tasks.result import Result
 from characterisation.tasks.task_file import Task
@@ -74,8 +74,8 @@ class _KeptTrial(Document):
 class TrialFolder:
     """Trials of one study in a folder, one file for each view; ``digest`` identifies the study.
 
-    ``folded`` has the number of deviations of every measurement whose values fold. A kept trial that lacks them is
-    measured again. ``folded_values`` describes these values, for the errors of parts that deviate.
+    ``folded_values`` describes the measurements whose values fold; ``folded`` has the number of deviations of each. A
+    kept trial that lacks them is measured again.
     """
 
     def __init__(
@@ -83,19 +83,17 @@ class TrialFolder:
         folder: str | Path,
         digest: str,
         measurements: Sequence[str],
-        folded: Mapping[str, int] | None = None,
         folded_values: Mapping[str, FoldedValue] | None = None,
     ) -> None:
         self.folder, self.digest, self.measurements = Path(folder), digest, tuple(measurements)
-        self.folded, self.folded_values = dict(folded or {}), dict(folded_values or {})
+        self.folded_values = dict(folded_values or {})
+        self.folded = {name: math.prod(value.shape) for name, value in self.folded_values.items()}
         self._outcomes: dict[int, dict[Trial, Outcome]] = {}
 
     @classmethod
     def of(cls, folder: str | Path, digest: str, task: Task) -> TrialFolder:
         """Return the trials of a task in a folder."""
-        folded = folded_values(task)
-        counts = {name: math.prod(value.shape) for name, value in folded.items()}
-        return cls(folder, digest, list(task.measurements), counts, folded)
+        return cls(folder, digest, list(task.measurements), folded_values(task))
 
     def known(self, view: int) -> dict[Trial, Outcome]:
         """Return the finished trials of a view; the file is read once."""
@@ -148,14 +146,6 @@ class TrialFolder:
             self._one_sided(self.folded_values[name], view, trials) if name in self.folded_values else plain[m]
             for m, name in enumerate(self.measurements)
         ]
-
-    def stated_errors(self, view: int, trials: Sequence[Trial]) -> Floats:
-        """Return the errors (measurements, n) of finished trials that a statement is about, NaN without a value.
-
-        Those of a value that folds are at the limit of its tolerance.
-        """
-        errors = self.errors_of_parts(view, trials)
-        return np.array([stated_errors(error) for error in errors], float).reshape(len(errors), len(trials))
 
     def _one_sided(self, folded: FoldedValue, view: int, trials: Sequence[Trial]) -> OneSidedErrors:
         vectors = self.deviations(view, trials, folded.name).reshape(len(trials), *folded.shape)

@@ -24,6 +24,7 @@ from mitsim.study.session import Session
 from mitsim.study.virtual.study_unknowns import study_unknowns
 from mitsim.study.virtual.trials import Outcome, TrialFolder
 from mitsim.study.virtual.world import Trial
+from tests.proofs.kept_trials import errors_of
 from tests.proofs.laboratory.cases import Judged
 from tests.proofs.laboratory.worlds import Laboratory
 
@@ -120,7 +121,7 @@ def run_rows(rows: Sequence[Judged], folder: Path, workers: Executor | None = No
             stated[row.name] = tuple(statement_of(row, folder, workers))
         worlds = [Trial(number) for number in range(row.file.worlds)]
         out += [
-            Found(row, decoder, stated[row.name], of_decoder.stated_errors(row.view, worlds))
+            Found(row, decoder, stated[row.name], errors_of(of_decoder, row.view, worlds))
             for decoder, of_decoder in trials.items()
         ]
     return out

@@ -18,8 +18,9 @@ from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.published_lengths import PublishedLengths
 from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.transforms import Transform
+from mitsim.study.calibration.accuracy import triangulated
 from mitsim.study.calibration.board import Board
-from mitsim.study.calibration.verification import corners_of_board, triangulated, verify
+from mitsim.study.calibration.verification import corners_of_board, verify
 from mitsim.twin.sensor.run import sensor_path
 from tests.shell import mitsim_here
 
@@ -81,7 +82,7 @@ def seen_through(n10, true, base):
     """The known points of ``base`` as the nominal rig measures what a true rig sees, without noise."""
     pixels = [eye.project(PLACE.points(BOARD.corners)) for eye in true.cameras.values()]
     first, second = n10.rig.cameras.values()
-    points, rows = triangulated(first, pixels[0], second, pixels[1])
+    points, rows = triangulated(first, pixels[0], second, second.rays(pixels[1]))
     spread = [np.sqrt(((one - one.mean(axis=0)) ** 2).sum()) for one in (points, BOARD.corners)]
     return replace(base, points=points, rows_px=rows, scale=float(spread[0] / spread[1]))
 

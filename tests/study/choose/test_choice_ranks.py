@@ -96,13 +96,14 @@ def test_possible_measurements_count_first_then_the_worst_then_the_next_worst():
 def test_without_tolerances_demands_are_relative_to_the_least_of_the_known_sensors():
     rows = [[2.0, INF, 9.0], [1.0, INF, 3.0], [0.5, INF, INF]]
     assert relative_to_least(rows, [True, True, False]).tolist() == [[2, INF, 3], [1, INF, 1], [0.5, INF, INF]]
-    assert rank_keys(rows, [False] * 3, [True] * 3) == [(1, (4.0, 3.0)), (1, (2.0, 1.0)), (2, (1.0,))]
+    assert rank_keys(rows, [False] * 3, [False] * 3) == rank_keys(rows, [False] * 3)  # none is known: the least of all
+    assert rank_keys(rows, [False] * 3) == [(1, (4.0, 3.0)), (1, (2.0, 1.0)), (2, (1.0,))]
 
 
 def test_a_unit_without_a_limit_does_not_hide_a_limit_but_counts_where_impossible():
     """In mm, 50 of the second measurement would be the worst by far."""
     rows = [[0.5, 50.0], [0.6, 0.1], [0.1, INF]]
-    assert rank_keys(rows, [True, False], [True] * 3) == [(0, (0.5,)), (0, (0.6,)), (1, (0.1,))]
+    assert rank_keys(rows, [True, False]) == [(0, (0.5,)), (0, (0.6,)), (1, (0.1,))]
 
 
 def test_a_measurement_that_no_sensor_can_make_excludes_none():

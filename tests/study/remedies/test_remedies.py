@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -17,14 +18,14 @@ from characterisation.statements.decision import demand
 from characterisation.statements.statement import Statement, statement
 from characterisation.statements.tolerance import plus_minus
 from characterisation.tasks.decision_table import Decision
-from characterisation.tasks.task_file import Task
 from mitsim.running.time_limit import TimeLimit
-from mitsim.study.remedies import changes as changes_module
 from mitsim.study.remedies.bounds import EXPOSURE, Effect, can_fit, least_shares, least_uncertainty
-from mitsim.study.remedies.change import Change, changed_file
+from mitsim.study.remedies.change import Change, Shortfall, changed_file
+from mitsim.study.remedies.changes import changes
 from mitsim.study.remedies.confirm import Remedies, find_remedies, of_missed, remedies_document
 from mitsim.study.remedies.entries import MissedEntry, RemediesEntry, UntriedChange, remedies_in_words
 from mitsim.study.tables import StudyFile
+from tests.two_balls import TASK
 
 #: equally likely errors of a standard normal distribution
 NORMAL = norm.ppf((np.arange(200) + 0.5) / 200)
@@ -205,6 +206,19 @@ def test_the_nearest_of_insufficient_changes_is_named() -> None:
     assert remedies_in_words(nothing) == ["a: by its budget, no single change that mitsim knows suffices"]
 
 
+def test_the_keys_of_the_bias_name_every_decision_that_they_change() -> None:
+    """Before, the measurement kept its own decision in a task with these keys."""
+    one = stated("radius", 0.05, bias=2.0)
+    measurement = TASK.measurements["radius"].model_copy(update={"decision": Decision()})
+    for own in ({}, {"radius": measurement}):
+        task = TASK.model_copy(update={"measurements": TASK.measurements | own})
+        view = SimpleNamespace(view=SimpleNamespace(number=1), statements=[one])
+        now = SimpleNamespace(study=SimpleNamespace(task=task), session=None, stated=view, missed={"radius": one})
+        keys = next(changes(cast(Shortfall, now))).keys
+        changed = {"decision": {"subtract_bias": True}}
+        assert keys == changed | ({"measurements": {"radius": changed}} if own else {})
+
+
 def test_keys_of_a_change_replace_single_keys_of_the_study() -> None:
     unknowns = {"calibration": {"row_mrad": 0.5}, "light": {"room": "dark cell"}}
     file = StudyFile.model_validate(
@@ -272,6 +286,16 @@ def test_remedies_of_an_older_run_still_read() -> None:
         RemediesEntry.model_validate(document | {"measurements": 3})
 
 
+@pytest.mark.parametrize("fits_by, name", [(0, "b"), (1, "a"), (-1, "a")])
+def test_a_measurement_that_fits_by_no_change_tried_is_refused(fits_by: int, name: str) -> None:
+    """Before, a change without the measurement gave a KeyError, and one that does not exist no line at all."""
+    spray = Fake("spray", ("a",), a=0.02)
+    document = remedies_document(find_remedies(missed("a", "b"), [spray.change], 40))
+    document["measurements"][name]["fits_by"] = fits_by
+    with pytest.raises(ValidationError, match=f"fits_by {fits_by} of {name} must be the index of a change"):
+        RemediesEntry.model_validate(document)
+
+
 def test_more_than_four_measurements_that_fit_are_counted() -> None:
     names = "abcdef"
     spray = Fake("spray", tuple(names), a=0.02, b=0.02, c=0.02, d=0.02, e=0.02, f=0.02)
@@ -280,34 +304,3 @@ def test_more_than_four_measurements_that_fit_are_counted() -> None:
     )
     one = "(u 0.020 mm, before 0.80 mm)"
     assert line == f"with spray: a {one}, b {one}, c {one} and 3 more fit (40 virtual measurements)"
-
-
-def test_a_record_that_names_a_change_without_the_measurement_is_read_all_the_same() -> None:
-    entry = MissedEntry(unit="mm", standard_uncertainty=0.5, needed=0.2, demand=2.0, fits_by=0)
-    tried = {"change": "spray", "words": "sprayed", "keys": {}, "views": [1], "trials": 9, "measurements": {}}
-    entries = RemediesEntry.model_validate({"measurements": {"radius": entry.model_dump()}, "tried": [tried]})
-    assert not any("sprayed" in line for line in remedies_in_words(entries))
-
-
-def test_the_keys_of_a_subtracted_bias_are_those_of_every_rule_that_it_changes(monkeypatch) -> None:
-    task = Task.model_validate(
-        {
-            "features": {"ball": {"kind": "sphere", "point_mm": [0, 0, 0], "radius_mm": 5.0}},
-            "decision": {"guard_share": 0.25},
-            "measurements": {
-                name: {"kind": "radius", "features": ["ball"], "nominal": 5.0, "unit": "mm", "tolerance": 0.1, **rule}
-                for name, rule in {"plain": {}, "ruled": {"decision": {"guard_share": 0.5}}}.items()
-            },
-        }
-    )
-    errors = 0.3 + 0.01 * NORMAL
-    one = statement("ruled", "mm", errors, plus_minus(5.0, 0.1, Decision()))
-    now = SimpleNamespace(
-        study=SimpleNamespace(task=task),
-        session=None,
-        stated=SimpleNamespace(view=SimpleNamespace(number=7), statements=(one,)),
-        missed={"ruled": one},
-    )
-    (change,) = changes_module._bias(now)
-    subtracts = {"decision": {"subtract_bias": True}}
-    assert change.keys == {**subtracts, "measurements": {"ruled": subtracts}}

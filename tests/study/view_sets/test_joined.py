@@ -10,11 +10,12 @@ import pytest
 from characterisation.point_cloud import PointCloud, ViewGrid
 from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.statement import statement
-from characterisation.tasks.task_file import Task
+from characterisation.tasks.evaluation import measure
 from mitsim.sensor.transforms import Transform
 from mitsim.study import SetTable
 from mitsim.study.view_sets.confirmed_set import TriedSet, confirmed_entry, joining_in_words, set_table, write_set_csv
 from mitsim.study.view_sets.joined import JoinedMeasurements
+from mitsim.study.virtual.trials import Outcome
 from tests.two_balls import TASK
 
 #: the balls are seen from 500 mm above
@@ -65,12 +66,15 @@ class Maker:
             seed=1, draw=lambda trial: World(trial.day % 3, still, still, 1000 * trial.day + trial.capture)
         )
 
-    def clouds_of(self, view, world):
+    def cloud_of(self, view, world):
         self.captures.append((view.number, world))
-        return lambda with_form: cloud(self.seen[view.number], self.sigma, world.seed), FROM_ABOVE
+        return cloud(self.seen[view.number], self.sigma, world.seed), FROM_ABOVE
 
-    def deviates(self, world) -> bool:
-        return False
+    def run(self, jobs):
+        motion = FROM_ABOVE.inverse().matrix()
+        for job in jobs:
+            seen, _ = self.cloud_of(job.view, self.unknowns.draw(job.trial))
+            yield job, Outcome.of(measure(seen, TASK, motion, 100, False))
 
 
 def errors(seen, table, days=200, sigma=0.0):
@@ -95,36 +99,6 @@ def test_features_of_different_views_are_off_by_both_poses():
 def test_a_set_of_one_view_knows_no_error_of_joining():
     found, _ = errors([("left", "right")], table(joining_mm=5.0, joining_deg=1.0), days=5)
     assert np.abs(found["apart"]).max() < 1e-3
-
-
-def test_a_set_of_one_view_measures_form_without_the_drawn_form_as_a_view_does():
-    class Face(Maker):
-        def clouds_of(self, view, world):
-            x, y = np.meshgrid(np.linspace(-20, 20, 40), np.linspace(-20, 20, 40))
-            flat = np.stack([x, y, np.zeros_like(x)], axis=-1)
-
-            def seen(with_form: bool) -> PointCloud:
-                face = flat + [0, 0, 0.5] * np.sin(x / 5)[..., None] if with_form else flat
-                points = FROM_ABOVE.inverse().points(face).astype(np.float32)
-                none, grid = np.zeros((40, 40), np.uint8), ViewGrid(1.0, 1.0, 0.0, 0.0, 40, 40)
-                return PointCloud(
-                    points, none, grid, "s", "simulated", feature=none.astype(np.int16), feature_names=("face",)
-                )
-
-            return seen, FROM_ABOVE
-
-        def deviates(self, world) -> bool:
-            return True
-
-    maker = Face([("face",)])
-    maker.study.task = Task.model_validate(
-        {
-            "features": {"face": {"kind": "plane", "point_mm": [0.0, 0.0, 0.0], "direction": [0.0, 0.0, 1.0]}},
-            "measurements": {"flat": {"kind": "flatness", "features": ["face"], "nominal": 0.0, "unit": "mm"}},
-        }
-    )
-    _, outcome = next(iter(JoinedMeasurements(maker, [SimpleNamespace(number=0)], table()).run([0])))
-    assert abs(outcome.errors["flat"]) < 1e-3
 
 
 def test_clouds_joined_exactly_have_no_error():

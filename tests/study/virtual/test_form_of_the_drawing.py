@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mitsim.study import SetTable
+from mitsim.study.view_sets.joined import JoinedMeasurements
 from mitsim.study.virtual.form import drawn_form, measured_with_form
 from mitsim.study.virtual.plan import measurements_of
 from mitsim.study.virtual.race import Job
@@ -73,3 +75,15 @@ def test_a_form_is_measured_once_and_the_rest_with_it(flat) -> None:
     assert list(found) == list(task.measurements)
     assert [name for name, with_form in found.items() if not with_form] == ["flat"]
     assert sorted(name for _, names in asked for name in names) == sorted(task.measurements)
+
+
+def test_a_set_of_one_view_is_measured_like_the_view(flat) -> None:
+    """Before, its flatness had the form of the drawing as well."""
+    study = flat(coat={"thickness_um": [0, 0]})
+    maker = measurements_of(study, study_unknowns(study))
+    view = min(study.views, key=lambda one: abs(one.elevation_deg - 45))
+    ((_, alone),) = maker.run([Job(view, Trial(3))])
+    ((day, joined),) = JoinedMeasurements(maker, [view], SetTable()).run([3])
+    assert day == 3 and np.isfinite(alone.errors["flat"])
+    assert joined.errors == alone.errors
+    np.testing.assert_equal(joined.deviations, alone.deviations)

@@ -6,7 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.maps.shipped import map_path
 from mitsim.study import StudyFile, open_study
+from mitsim.study.remedies.change import reopened
 from mitsim.study.session import Session
 from mitsim.study.virtual import spread_out
 from mitsim.study.virtual.plan import race_rendering
@@ -76,3 +79,27 @@ def test_orders_of_slow_trials_are_short(study, tmp_path, monkeypatch):
             assert [job for job, _ in spread.run(jobs)] == jobs
     assert sizes[0] == [4, 4] and sizes[-1] == [1] * 8
     assert [2] * 4 in sizes
+
+
+def test_workers_and_changed_studies_open_the_map_that_was_given(study, tmp_path, monkeypatch):
+    """Before, a sensor without a shipped map failed in every worker, and in every change that reopens the study."""
+    sensor = tmp_path / "own.toml"
+    preset = Path(study.file.sensor).read_text()
+    sensor.write_text(preset.replace('name = "ensenso-n10"', 'name = "own"', 1))
+    covariance = "ensenso-n10-calibration.toml"
+    (tmp_path / covariance).write_text((Path(study.file.sensor).parent / covariance).read_text())
+    data = PerformanceMap.load(map_path("ensenso-n10")).data.copy()
+    data.attrs["sensor"] = "own"
+    PerformanceMap(data).save(tmp_path / "map.nc")
+    monkeypatch.chdir(tmp_path)
+    own = open_study(
+        SCENES / "study.toml", study.file.model_copy(update={"sensor": str(sensor)}), performance_map="map.nc"
+    )
+    monkeypatch.chdir(SCENES)
+    assert reopened(own, {"sprayed": True}).performance_map is own.performance_map
+    monkeypatch.setattr(spread_out, "_prepared", {})
+    session = Session(own, tmp_path)
+    jobs = [Job(own.views[1], Trial(0))]
+    ((_, made),) = SpreadMeasurements(_Here(), session.renderer, session.digest).run(jobs)
+    ((_, expected),) = session.renderer.run(jobs)
+    np.testing.assert_array_equal(list(made.errors.values()), list(expected.errors.values()))

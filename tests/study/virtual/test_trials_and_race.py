@@ -4,6 +4,7 @@ import json
 import math
 import tomllib
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ import xarray as xr
 
 from characterisation.files.documents import validate
 from characterisation.tasks.task_file import Task
-from mitsim.study.virtual.race import ALL, Job, RaceRules, run_race, shortlist
+from mitsim.study import RaceTable
+from mitsim.study.virtual.race import ALL, Job, run_race, shortlist
 from mitsim.study.virtual.race_tables import raced_errors, with_race
 from mitsim.study.virtual.trials import Outcome, TrialFolder
 from mitsim.study.virtual.world import Trial
@@ -63,7 +65,7 @@ def scores_of(u, chance=None, tolerance=(np.nan, np.nan)):
     )
 
 
-RULES = RaceRules(shortlist=5, most=200, margin=0.1, loss=0.02, each=True)
+RULES = RaceTable(shortlist=5, trials=200, margin=0.1, loss=0.02, each=True)
 
 
 def race(maker, scores, folder, rules=RULES, over=lambda: False, after_round=lambda _: None):
@@ -127,7 +129,7 @@ def test_only_the_view_for_all_measurements_is_asked_for_by_default(tmp_path):
     spreads = [[1.0, 1.0, 3.0, 3.0, 3.0, 3.0], [1.0, 3.0, 3.0, 3.0, 3.0, 3.0]]  # two equals for the first
     trials = {}
     for each in (False, True):
-        rules = RaceRules(shortlist=5, most=60, margin=0.1, loss=0.05, each=each)
+        rules = RaceTable(shortlist=5, trials=60, margin=0.1, loss=0.05, each=each)
         raced = race(KnownMaker(spreads), scores_of(spreads), tmp_path / str(each), rules)
         assert raced.decided and raced.leader(ALL) == 0
         trials[each] = raced.trials
@@ -136,7 +138,7 @@ def test_only_the_view_for_all_measurements_is_asked_for_by_default(tmp_path):
 
 def test_between_equals_the_race_ends_by_expected_loss(tmp_path):
     """No view of equals can be told to be the best, and no trial is worth that."""
-    rules = RaceRules(shortlist=2, most=2000, margin=0.02, loss=0.05)
+    rules = RaceTable(shortlist=2, trials=2000, margin=0.02, loss=0.05)
     raced = race(KnownMaker(np.ones((2, 2))), scores_of(np.ones((2, 2))), tmp_path, rules)
     best = raced.standings[ALL]
     assert raced.decided and best.loss <= 0.05
@@ -229,7 +231,7 @@ def test_reasons_are_kept_with_their_trials_and_old_lines_have_none(tmp_path):
     assert again.reasons(3, [Trial(0), Trial(1)], "radius") == []
 
 
-FOLDED = {"angle": 3}
+FOLDED = {"angle": SimpleNamespace(shape=(3,))}
 
 
 def test_deviations_are_kept_to_the_last_bit_with_their_gaps(tmp_path):
@@ -290,7 +292,7 @@ def test_captures_of_a_day_are_about_the_same_part(tmp_path):
     assert place.stated.std() == pytest.approx(2, rel=0.15)
     np.testing.assert_array_equal(size, np.full(400, 0.5))
     again = [Trial(day.day, 1) for day in days]
-    np.testing.assert_array_equal(trials.stated_errors(3, again)[0], place.stated)
+    np.testing.assert_array_equal(trials.errors_of_parts(3, again)[0].stated, place.stated)
 
 
 def test_trials_of_another_study_are_moved_aside_and_not_used(tmp_path):
