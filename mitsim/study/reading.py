@@ -39,7 +39,7 @@ from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
 from mitsim.study.screened_errors import needed_by_tolerance
-from mitsim.study.tables import ExposureTable, StudyFile
+from mitsim.study.tables import CharacterisationTable, ExposureTable, StudyFile
 from mitsim.views import Candidates, View, candidate_views
 from mitsim.views.standoffs import characterised_range, chosen_standoffs
 from mitsim.views.view_scores import MATT_WHITE
@@ -50,10 +50,7 @@ MINIMUM_POINTS = 100
 
 @dataclass(frozen=True)
 class Study:
-    """A study that has been read and checked.
-
-    ``given_map`` is the ``performance_map`` that :func:`open_study` was called with; a file by its absolute path.
-    """
+    """A study that has been read and checked."""
 
     path: Path
     file: StudyFile
@@ -63,7 +60,6 @@ class Study:
     candidates: Candidates
     campaign: Campaign | None
     performance_map: PerformanceMap | None
-    given_map: str | Path | None = None
 
     @property
     def views(self) -> list[View]:
@@ -136,6 +132,8 @@ def open_study(
     0
     """
     file = read_toml(path, StudyFile) if file is None else file
+    if performance_map is not None:
+        file = _with_map(file, performance_map)
     path = Path(path)
     folder = path.parent
     own_sensor = folder / file.sensor if file.sensor.endswith(".toml") else file.sensor
@@ -155,7 +153,7 @@ def open_study(
     radius = float(np.linalg.norm(scene.bounds[1] - scene.bounds[0])) / 2
     standoffs = chosen_standoffs(path, file.views, sensor, radius)
     campaign, chosen_map = None, None
-    if file.characterisation.campaign and performance_map is None:
+    if file.characterisation.campaign:
         near, far = sensor.working_range_mm
         around = [max(math.floor(standoffs[0] - radius), near), min(math.ceil(standoffs[-1] + radius), far)]
         campaign = read_campaign(folder / file.characterisation.campaign, sensor, around)
@@ -165,7 +163,7 @@ def open_study(
         distances = list(campaign.distances)
     else:
         map_name = file.characterisation.map or sensor.name
-        if not performance_map and not file.characterisation.map and sensor.name not in shipped_maps():
+        if not file.characterisation.map and sensor.name not in shipped_maps():
             raise InputError(
                 path,
                 "characterisation.map",
@@ -173,7 +171,7 @@ def open_study(
                 'map = "map.nc" or campaign = "campaign.toml" in [characterisation]',
                 f"mitsim map make CAMPAIGN --sensor {own_sensor} -o FOLDER writes FOLDER/map.nc",
             )
-        chosen_map = read_map(performance_map or map_name, sensor, "." if performance_map else folder)
+        chosen_map = read_map(map_name, sensor, folder)
         distances = chosen_map.data["distance"].values.tolist()
         samples = chosen_map.known
     _check_finishes(path, scene, task, samples)
@@ -188,9 +186,7 @@ def open_study(
         measured = frozenset(task.shapes)
         wanted = NeededFinishes(sensor, scene.where, seen_finishes(scene), depths, measured, rendered)
         chosen_map = map_with_finishes(chosen_map, wanted, ask)
-    if performance_map and is_file(Path(performance_map)):
-        performance_map = Path(performance_map).absolute()
-    return Study(path, file, scene, task, sensor, candidates, campaign, chosen_map, performance_map)
+    return Study(path, file, scene, task, sensor, candidates, campaign, chosen_map)
 
 
 def finishes_of_features(study: Study) -> dict[str, Finish | None]:
@@ -229,6 +225,13 @@ def read_map(name: str | Path, sensor: Sensor, folder: str | Path = ".") -> Perf
     if attributes.get("sensor_checksum", sensor_checksum(sensor)) != sensor_checksum(sensor):
         say(f"{file} was made with another version of {sensor.name}, whose parameters have changed since")
     return performance_map
+
+
+def _with_map(file: StudyFile, performance_map: str | Path) -> StudyFile:
+    """Return the study with a map for its campaign or map, by a path that holds for workers and in any folder."""
+    name = str(Path(performance_map).resolve()) if is_file(Path(performance_map)) else str(performance_map)
+    table = CharacterisationTable(map=name if str(performance_map) else file.characterisation.map)
+    return file.model_copy(update={"characterisation": table})
 
 
 def _with_limits(path: str | Path, file: StudyFile, task: Task) -> StudyFile:

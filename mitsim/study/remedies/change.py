@@ -145,8 +145,7 @@ def changed_file(file: StudyFile, keys: Mapping[str, Any]) -> StudyFile:
 def reopened(study: Study, keys: Mapping[str, Any]) -> Study:
     """Open a study with keys of its file replaced; its map is kept."""
     by_map = measured_by(study) == "map"
-    file = changed_file(study.file, keys)
-    opened = open_study(study.path, file, performance_map=study.given_map, mapped=by_map)
+    opened = open_study(study.path, changed_file(study.file, keys), mapped=by_map)
     return opened if by_map else replace(opened, performance_map=study.performance_map)
 
 

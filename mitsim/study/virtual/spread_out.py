@@ -5,7 +5,7 @@ prepares the study's sensor once (:class:`mitsim.study.virtual.rendered.Rendered
 
 A trial depends only on study, view and trial number, so every worker gives the same result. If a worker dies, another
 makes its trials. :mod:`mitsim.running.cluster` describes the requirements of a cluster, and who can run code on whose
-machine. Workers read the study's scene, task, sensor and map at the same paths.
+machine. Workers read the study's scene, task and sensor at the same paths.
 """
 
 from __future__ import annotations
@@ -49,7 +49,6 @@ class TrialOrder:
     digest: str
     jobs: tuple[Job, ...]
     rendering: Rendering
-    given_map: str | Path | None
     planned: PlannedExposure | None = None
 
 
@@ -64,9 +63,10 @@ class SpreadMeasurements:
     def __init__(self, workers: Executor, renderer: RenderedMeasurements, digest: str) -> None:
         self.workers, self.renderer = workers, renderer
         self._seconds: deque[float] = deque(maxlen=_REMEMBERED)  # of a trial in the last orders
-        study, unknowns, rendering = renderer.study, renderer.unknowns, renderer.rendering
-        path, apart = str(Path(study.path).absolute()), renderer.separate_light
-        self._order = TrialOrder(path, study.file, unknowns, apart, digest, (), rendering, study.given_map)
+        path = str(Path(renderer.study.path).absolute())
+        self._order = TrialOrder(
+            path, renderer.study.file, renderer.unknowns, renderer.separate_light, digest, (), renderer.rendering
+        )
 
     def exposed_as(self, planned: PlannedExposure | None) -> SpreadMeasurements:
         """Return the same measurements with other exposures than the sensor's own."""
@@ -126,8 +126,7 @@ def make_trials(order: TrialOrder) -> list[Outcome]:
 
         backend.activate(None)
         _prepared.clear()
-        # trials are rendered: the map only limits the views
-        study = open_study(order.path, order.file, performance_map=order.given_map, mapped=False)
+        study = open_study(order.path, order.file, mapped=False)  # trials are rendered
         _prepared[order.digest] = RenderedMeasurements(study, order.unknowns, order.rendering, order.separate_light)
     if order.rendering != _prepared[order.digest].rendering:
         _prepared[order.digest] = _prepared[order.digest].rendered_as(order.rendering)
