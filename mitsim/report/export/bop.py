@@ -48,6 +48,9 @@ from mitsim.sensor.transforms import Transform
 #: wavelength for loading scenes; only their geometry is used
 _ANY_NM = 550.0
 
+#: largest thickness of a flat object, relative to its length: rounding of coordinates in single precision
+_FLAT = 1e-6
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -162,22 +165,21 @@ def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train
     scenes: dict[tuple[Any, ...], tuple[Scene, list[Scene]]] = {}  # by file and parameters
     camera: dict[str, Any] = {}
     with atomic_folder(output) as partial:
-        for source in track(sources, "export"):
-            capture = read_capture(source.folder)
-            key = source.scene, *sorted(source.parameters.items())
-            if key not in scenes:
+        for source in sources:
+            if _key(source) not in scenes:
                 scene = load_scene(source.scene, _ANY_NM, dict(source.parameters))
-                scenes[key] = scene, [scene.only(*names) for names in objects_of(scene.names, patterns)]
-                _check_same_objects(scenes[key], next(iter(scenes.values())), source)
-            frame, scale = bop_frame(capture, *scenes[key], source.folder)
+                scenes[_key(source)] = scene, [scene.only(*names) for names in objects_of(scene.names, patterns)]
+                _check_same_objects(scenes[_key(source)], next(iter(scenes.values())), source)
+        first, objects = next(iter(scenes.values()))
+        _write_models(partial / "models", objects)
+        for source in track(sources, "export"):
+            frame, scale = bop_frame(read_capture(source.folder), *scenes[_key(source)], source.folder)
             folder = partial / split / f"{finishes.index(source.finish) + 1:06d}"
             _write_frame(frame, folder, len(tables[source.finish]["camera"]), scale, tables[source.finish])
             camera = camera or _camera_file(frame.grid, scale)
         for number, finish in enumerate(finishes, 1):
             for name, table in tables[finish].items():
                 _write_json(partial / split / f"{number:06d}" / f"scene_{name}.json", table)
-        first, objects = next(iter(scenes.values()))
-        _write_models(partial / "models", objects)
         _write_json(partial / "camera.json", camera)
         _write_json(partial / "statuses.json", {str(status.value): status.name.lower() for status in Status})
         _write_json(partial / "features.json", {str(k): name for k, name in enumerate(first.names, 1)})
@@ -185,6 +187,10 @@ def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train
         described = _about(sources, finishes, split, [part.names for part in objects])
         (partial / "dataset_info.md").write_text(described, encoding="utf-8")
     return len(sources)
+
+
+def _key(source: Source) -> tuple[Any, ...]:
+    return source.scene, *sorted(source.parameters.items())
 
 
 def _check_same_objects(found: tuple[Scene, list[Scene]], first: tuple[Scene, list[Scene]], source: Source) -> None:
@@ -325,6 +331,10 @@ def _write_models(folder: Path, objects: Sequence[Scene]) -> None:
     table: dict[str, Any] = {}
     for number, scene in enumerate(objects, 1):
         corners = triangles(scene)
+        if not len(corners):
+            raise InputError(
+                "--object", "", f"{', '.join(scene.names)}, which light passes", "at least one solid shape"
+            )
         mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
         written = trimesh.exchange.ply.export_ply(mesh, encoding="ascii", vertex_normal=True)
         (folder / f"obj_{number:06d}.ply").write_bytes(written)
@@ -336,10 +346,12 @@ def _write_models(folder: Path, objects: Sequence[Scene]) -> None:
 
 
 def _diameter(vertices: NDArray[np.float64]) -> float:
-    """Return the largest distance between any two vertices; they lie on the convex hull, or all in a plane."""
-    flat = np.ptp(vertices, axis=0).min() < 1e-9
-    corners = np.unique(vertices, axis=0) if flat else vertices[ConvexHull(vertices).vertices]
-    return float(pdist(corners).max())
+    """Return the largest distance between any two vertices: corners of the convex hull, or of a flat outline."""
+    centred = vertices - vertices.mean(axis=0)
+    along = centred @ np.linalg.svd(centred, full_matrices=False)[2].T
+    sides = np.ptp(along, axis=0)
+    spanned = along[:, sides > _FLAT * sides.max()]
+    return float(pdist(vertices[ConvexHull(spanned).vertices]).max()) if spanned.shape[1] > 1 else float(sides.max())
 
 
 def _write_json(path: Path, table: Any) -> None:

@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.cli.program import app
+from mitsim.report.export import bop
 from mitsim.report.export.bop import depth_scale, find_sources, on_pinhole, write_bop
 from tests.report.export.test_export_command import export
 
@@ -146,6 +147,24 @@ def test_model_and_its_information_are_those_of_the_part(data_set):
     corners = np.unique(model.vertices.round(6), axis=0)
     far = max(np.linalg.norm(corners - one, axis=1).max() for one in corners)
     assert info["diameter"] == pytest.approx(far, rel=1e-5)
+
+
+def test_a_flat_object_has_a_diameter_at_any_tilt():
+    plate = np.array([[-80.0, -50, 0], [80, -50, 0], [-80, 50, 0], [80, 50, 0], [3, 4, 0]])
+    for turn in np.radians([0, 7, 45]):
+        tilted = plate @ [[1, 0, 0], [0, np.cos(turn), np.sin(turn)], [0, -np.sin(turn), np.cos(turn)]] + [5, 9, 300]
+        assert bop._diameter(tilted) == pytest.approx(np.hypot(160, 100))
+    assert bop._diameter(np.outer([0.0, 1, 4], [1, 1, 1])) == pytest.approx(4 * 3**0.5)  # on a line
+
+
+def test_a_fault_of_a_model_costs_no_views(data_set, tmp_path, monkeypatch):
+    open_air = '<shape type="sphere" id="air"><float name="radius" value="9"/><bsdf type="null"/></shape></scene>'
+    (tmp_path / "air.xml").write_text(SCENE.read_text().replace("</scene>", open_air))
+    source = replace(find_sources(data_set / "captures")[0], scene=tmp_path / "air.xml")
+    monkeypatch.setattr(bop, "bop_frame", lambda *a: pytest.fail("a view is decoded"))
+    with pytest.raises(InputError, match=r"air, which light passes.*solid"):
+        write_bop([source], tmp_path / "data", patterns=["pillar1*", "air"])
+    assert not (tmp_path / "data").exists()
 
 
 def test_objects_are_groups_of_shapes_that_hide_one_another(data_set, tmp_path):
