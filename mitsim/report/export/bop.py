@@ -5,8 +5,9 @@ depth on the pixels of one pinhole camera -> files of BOP (bop_toolkit, docs/bop
 folders for data without a place in BOP.
 
 The camera is the cloud's grid: for a stereo sensor its rectified left image, else its camera without distortion. Each
-pixel takes depth and status from the nearest pixel of the cloud, and grey values by linear interpolation. Nothing is
-filled in: depth is 0 without a point, and ``status`` gives the reason.
+pixel takes depth and status from the nearest pixel of the cloud, carried along the surface's slope to the pixel's own
+ray, and grey values by linear interpolation. Nothing is filled in: depth is 0 without a point, and ``status`` gives the
+reason.
 
 An object is a group of the scene's shapes; the other shapes are its surroundings. Without groups it is the whole scene.
 All objects are in the part frame, so all have the same pose: that of the part frame in the camera's.
@@ -239,17 +240,37 @@ def bop_frame(capture: Capture, scene: Scene, objects: Sequence[Scene], where: s
 
 
 def on_pinhole(cloud: PointCloud, grid: ViewGrid) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Return depth [mm] and status (H, W) of a cloud on a pinhole's pixels, from the nearest pixels of its grid."""
+    """Return depth [mm] and status (H, W) of a cloud on a pinhole's pixels.
+
+    Both are those of the nearest pixel of the grid. Its depth is carried to the pinhole's ray along a plane, on which
+    1/depth is linear, with the slope toward the neighbours on either side.
+    """
     depth = (cloud.points.astype(np.float64) - cloud.grid.origin) @ cloud.grid.rotation[:, 2]
     if cloud.grid.normalised is None:
         return depth, cloud.status
-    pixel = np.rint(cloud.grid.project(grid.origin + 1000.0 * grid.rays()))
+    exact = cloud.grid.project(grid.origin + 1000.0 * grid.rays())
+    pixel = np.rint(exact)
     last = np.array([grid.width, grid.height]) - 1
     inside = np.asarray(np.isfinite(pixel).all(-1) & (pixel >= 0).all(-1) & (pixel <= last).all(-1))
     column, row = np.moveaxis(np.where(inside[..., None], pixel, 0).astype(np.intp), -1, 0)
-    return np.where(inside, depth[row, column], np.nan), np.where(
+    inverse = 1 / depth
+    carried = inverse[row, column]
+    for k, axis in enumerate((1, 0)):
+        carried = carried + (exact - pixel)[..., k] * _slope(inverse, axis)[row, column]
+    return np.where(inside, 1 / carried, np.nan), np.where(
         inside, cloud.status[row, column], np.uint8(Status.NO_SURFACE)
     )
+
+
+def _slope(inverse: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+    """Return the change of 1/depth per pixel along an axis.
+
+    It is the smaller one of both sides, because the other may lead over an edge, and 0 without neighbours.
+    """
+    steps = np.diff(inverse, axis=axis, prepend=np.nan, append=np.nan)
+    before, after = (np.take(steps, range(k, k + inverse.shape[axis]), axis) for k in (0, 1))
+    least = np.fmin(np.abs(before), np.abs(after))
+    return np.nan_to_num(np.where(np.abs(before) == least, before, after))
 
 
 def depth_scale(far: float) -> float:
