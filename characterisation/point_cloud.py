@@ -197,7 +197,8 @@ class PointCloud:
         (H, W) int16 index into ``feature_names``, -1 where a pixel belongs to no feature; None when unlabelled.
     sigma
         (H, W) float32 [mm], expected standard deviation along the view ray: from the performance map for a predicted
-        cloud, from the imager's noise for a decoded one. None if unknown.
+        cloud, from the imager's noise for a decoded one. None if unknown: no imager is stated, and its noise cannot be
+        measured in the images (from 2000 usable pixels on).
     """
 
     points: NDArray[np.float32]

@@ -81,7 +81,7 @@ def make(
     if compact is not None:
         performance_map.save(compact, compact=True)
     write_map_figures(performance_map, output)
-    for line in spread_in_words(performance_map):
+    for line in [*spread_in_words(performance_map), *plan.file.edge_in_words()]:
         say(line)
     say(f"map: {output / 'map.nc'}")
 

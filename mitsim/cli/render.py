@@ -45,7 +45,11 @@ def render(
         ),
     ] = 0.0,
     noise: Annotated[
-        str, typer.Option(help="Noise sources: all, none, a list (shot,read), or all but some (no-speckle).")
+        str,
+        typer.Option(
+            help="Noise sources: all, none, a list (shot,read), or all but some (no-speckle). Without quantisation "
+            "images have 16 bits."
+        ),
     ] = "all",
     deviation: Annotated[
         str,

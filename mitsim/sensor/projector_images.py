@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -22,6 +23,7 @@ from pydantic import Field
 from characterisation.files.checked_files import read_bounded
 from characterisation.files.documents import Document
 from characterisation.files.errors import InputError
+from mitsim.running.progress import say
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.png import decode_png
 
@@ -182,6 +184,8 @@ def read_images(folder: Path, width: int, height: int) -> ProjectorImages:
     if len(paths) > MOST_IMAGES or len(paths) * width * height > MOST_VALUES:
         found = f"{len(paths)} images of {width} x {height} px"
         raise InputError(folder, "", found, f"up to {MOST_IMAGES} images and {MOST_VALUES:,} pixels in all")
+    if gap := gap_in(paths):
+        say(f"{folder}: {gap} among {len(paths)} images")
     images = [decode_png(read_bounded(path), path) for path in paths]
     for path, image in zip(paths, images, strict=True):
         if image.shape != (height, width):
@@ -197,6 +201,19 @@ def counted(path: Path) -> tuple[Any, ...]:
     """Return a key that sorts names with numbers by value: ``image_2.png`` before ``image_10.png``."""
     parts = re.split(r"(\d+)", path.as_posix().lower())
     return tuple((int(part), "") if part.isascii() and part.isdigit() else (-1, part) for part in parts)
+
+
+def gap_in(files: Sequence[Path]) -> str:
+    """Return which numbers are missing in a series of files whose names differ in their last number; empty if none.
+
+    If at least as many numbers are missing as there are files, they are no count.
+    """
+    matches = [re.fullmatch(r"(.*?)(\d+)(\D*)", path.name) for path in files]
+    numbers = sorted({int(match.group(2)) for match in matches if match})
+    if len(numbers) < len(files) or not numbers or not 0 < numbers[-1] - numbers[0] + 1 - len(numbers) < len(numbers):
+        return ""
+    gaps = sorted(set(range(numbers[0], numbers[-1] + 1)) - set(numbers))
+    return f"number {', '.join(map(str, gaps[:5]))} is missing"
 
 
 def _relative(values: NDArray[Any]) -> NDArray[np.float32]:

@@ -36,7 +36,7 @@ from mitsim.capture.grey_image import (
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.light_code import LightCode, roles
-from mitsim.sensor.projector_images import ProjectorImages, counted, described
+from mitsim.sensor.projector_images import ProjectorImages, counted, described, gap_in
 from mitsim.sensor.sensor import Sensor
 
 Read = TypeVar("Read")
@@ -69,7 +69,7 @@ def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNEL
     used = list(rig.cameras) if both else list(rig.cameras)[:1]
     images: dict[str, Image] = {}
     files: dict[str, list[str]] = {}
-    names, colour = {}, False
+    names, colour, gaps = {}, False, []
     for name in used:
         paths = _files(folder, sensor, name, len(used))
         counts = [page_count(path) for path in paths]
@@ -81,6 +81,8 @@ def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNEL
                 f"{count}, as the pattern of {sensor.name}",
                 advice(paths, name, count, sensor.ambient_image) if paths else _content(folder, used),
             )
+        if (gap := gap_in(paths)) and not isinstance((sensor.images or {}).get(name), list):
+            gaps.append(f"images of {name}: {gap}")
         files[name] = _labels(paths, counts)
         images[name] = _stack(paths, counts, rig.cameras[name], channel)
         colour |= is_colour(paths[0])
@@ -104,6 +106,8 @@ def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNEL
         far_mm=decoder.far_mm,
     )
     settings: dict[str, Any] = {"imported_from": folder.resolve().name, "files": names}
+    if gaps:
+        settings["warnings"] = gaps
     if colour:
         settings["channel"] = channel_name(channel)
     bits = sensor.bits
@@ -238,11 +242,8 @@ def advice(files: list[Path], camera: str, count: int, ambient_image: bool) -> s
     ambient_image
         Whether the last of these is without the projector.
     """
-    matches = [re.search(r"(\d+)(?=\D*$)", path.name) for path in files]
-    numbers = sorted({int(match.group(1)) for match in matches if match})
-    gaps = sorted(set(range(numbers[0], numbers[-1] + 1)) - set(numbers)) if numbers else []
-    if gaps and len(numbers) == len(files):
-        return f"number {', '.join(map(str, gaps[:5]))} is missing"
+    if gap := gap_in(files):
+        return gap
     shapes = Counter(re.sub(r"\d+", "*", path.name) for path in files)
     for shape, number in shapes.items():
         if number == count < len(files) and "*" in shape:

@@ -216,7 +216,7 @@ def capture_of(
     whole = {name: Roi.whole(camera.width, camera.height) for name, camera in sensor.rig.cameras.items()}
     decoding = Decoding(
         decoder=sensor.settings,
-        imager=sensor.imager,
+        imager=adc,
         pattern=described(sensor.pattern),
         exposure_s=exposures[0] if len(exposures) == 1 else tuple(exposures),
         black_level_dn=adc.black_level,

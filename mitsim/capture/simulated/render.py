@@ -148,6 +148,7 @@ def render(  # noqa: PLR0913 - options of programs, all by name
         1.5. It takes away their render noise, and blurs what polished metal mirrors.
     noise
         ``"all"``, ``"none"``, some sources by name (``"shot,read"``), or all but some (``"no-speckle"``).
+        Without quantisation images have 16 bits.
     truth
         Return what every pixel truly sees, too.
     check

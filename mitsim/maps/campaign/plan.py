@@ -105,6 +105,16 @@ class CampaignFile(Document):
         """Return the largest incidence of the map [deg]."""
         return self.orientations[-1].up_to_deg
 
+    def edge_in_words(self) -> list[str]:
+        """Return where the map ends, if its outermost normals lie over 1 deg inside the campaign's limit."""
+        outermost = math.degrees(math.acos(min(1.0, float(self.normals()[:, 2].min()))))
+        if outermost > self.largest_deg - 1:
+            return []
+        return [
+            f"the map ends at its outermost normals, {outermost:.1f} deg off the view direction, before up_to_deg = "
+            f"{self.largest_deg:g}: to have values there, raise up_to_deg or subdivisions of the last band"
+        ]
+
     def normals(self) -> NDArray[np.float64]:
         """Return unit normals (n, 3) in the view frame (z toward the sensor), band by band from the axis outward."""
         parts, inner = [], -1.0

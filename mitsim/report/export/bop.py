@@ -5,8 +5,9 @@ depth on the pixels of one pinhole camera -> files of BOP (bop_toolkit, docs/bop
 folders for data without a place in BOP.
 
 The camera is the cloud's grid: for a stereo sensor its rectified left image, else its camera without distortion. Each
-pixel takes depth and status from the nearest pixel of the cloud, and grey values by linear interpolation. Nothing is
-filled in: depth is 0 without a point, and ``status`` gives the reason.
+pixel takes depth and status from the nearest pixel of the cloud, carried along the surface's slope to the pixel's own
+ray, and grey values by linear interpolation. Nothing is filled in: depth is 0 without a point, and ``status`` gives the
+reason.
 
 An object is a group of the scene's shapes; the other shapes are its surroundings. Without groups it is the whole scene.
 All objects are in the part frame, so all have the same pose: that of the part frame in the camera's.
@@ -48,6 +49,9 @@ from mitsim.sensor.transforms import Transform
 
 #: wavelength for loading scenes; only their geometry is used
 _ANY_NM = 550.0
+
+#: largest thickness of a flat object, relative to its length: rounding of coordinates in single precision
+_FLAT = 1e-6
 
 
 @dataclass(frozen=True)
@@ -164,22 +168,21 @@ def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train
     scenes: dict[tuple[Any, ...], tuple[Scene, list[Scene]]] = {}  # by file and parameters
     camera: dict[str, Any] = {}
     with atomic_folder(output) as partial:
-        for source in track(sources, "export"):
-            capture = read_capture(source.folder)
-            key = source.scene, *sorted(source.parameters.items())
-            if key not in scenes:
+        for source in sources:
+            if _key(source) not in scenes:
                 scene = load_scene(source.scene, _ANY_NM, dict(source.parameters))
-                scenes[key] = scene, [scene.only(*names) for names in objects_of(scene.names, patterns)]
-                _check_same_objects(scenes[key], next(iter(scenes.values())), source)
-            frame, scale = bop_frame(capture, *scenes[key], source.folder)
+                scenes[_key(source)] = scene, [scene.only(*names) for names in objects_of(scene.names, patterns)]
+                _check_same_objects(scenes[_key(source)], next(iter(scenes.values())), source)
+        first, objects = next(iter(scenes.values()))
+        _write_models(partial / "models", objects)
+        for source in track(sources, "export"):
+            frame, scale = bop_frame(read_capture(source.folder), *scenes[_key(source)], source.folder)
             folder = partial / split / f"{finishes.index(source.finish) + 1:06d}"
             _write_frame(frame, folder, len(tables[source.finish]["camera"]), scale, tables[source.finish])
             camera = camera or _camera_file(frame.grid, scale)
         for number, finish in enumerate(finishes, 1):
             for name, table in tables[finish].items():
                 _write_json(partial / split / f"{number:06d}" / f"scene_{name}.json", table)
-        first, objects = next(iter(scenes.values()))
-        _write_models(partial / "models", objects)
         _write_json(partial / "camera.json", camera)
         _write_json(partial / "statuses.json", {str(status.value): status.name.lower() for status in Status})
         _write_json(partial / "features.json", {str(k): name for k, name in enumerate(first.names, 1)})
@@ -187,6 +190,10 @@ def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train
         described = _about(sources, finishes, split, [part.names for part in objects])
         (partial / "dataset_info.md").write_text(described, encoding="utf-8")
     return len(sources)
+
+
+def _key(source: Source) -> tuple[Any, ...]:
+    return source.scene, *sorted(source.parameters.items())
 
 
 def _check_same_objects(found: tuple[Scene, list[Scene]], first: tuple[Scene, list[Scene]], source: Source) -> None:
@@ -235,17 +242,37 @@ def bop_frame(capture: Capture, scene: Scene, objects: Sequence[Scene], where: s
 
 
 def on_pinhole(cloud: PointCloud, grid: ViewGrid) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Return depth [mm] and status (H, W) of a cloud on a pinhole's pixels, from the nearest pixels of its grid."""
+    """Return depth [mm] and status (H, W) of a cloud on a pinhole's pixels.
+
+    Both are those of the nearest pixel of the grid. Its depth is carried to the pinhole's ray along a plane, on which
+    1/depth is linear, with the slope toward the neighbours on either side.
+    """
     depth = (cloud.points.astype(np.float64) - cloud.grid.origin) @ cloud.grid.rotation[:, 2]
     if cloud.grid.normalised is None:
         return depth, cloud.status
-    pixel = np.rint(cloud.grid.project(grid.origin + 1000.0 * grid.rays()))
+    exact = cloud.grid.project(grid.origin + 1000.0 * grid.rays())
+    pixel = np.rint(exact)
     last = np.array([grid.width, grid.height]) - 1
     inside = np.asarray(np.isfinite(pixel).all(-1) & (pixel >= 0).all(-1) & (pixel <= last).all(-1))
     column, row = np.moveaxis(np.where(inside[..., None], pixel, 0).astype(np.intp), -1, 0)
-    return np.where(inside, depth[row, column], np.nan), np.where(
+    inverse = 1 / depth
+    carried = inverse[row, column]
+    for k, axis in enumerate((1, 0)):
+        carried = carried + (exact - pixel)[..., k] * _slope(inverse, axis)[row, column]
+    return np.where(inside, 1 / carried, np.nan), np.where(
         inside, cloud.status[row, column], np.uint8(Status.NO_SURFACE)
     )
+
+
+def _slope(inverse: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+    """Return the change of 1/depth per pixel along an axis.
+
+    It is the smaller one of both sides, because the other may lead over an edge, and 0 without neighbours.
+    """
+    steps = np.diff(inverse, axis=axis, prepend=np.nan, append=np.nan)
+    before, after = (np.take(steps, range(k, k + inverse.shape[axis]), axis) for k in (0, 1))
+    least = np.fmin(np.abs(before), np.abs(after))
+    return np.nan_to_num(np.where(np.abs(before) == least, before, after))
 
 
 def depth_scale(far: float) -> float:
@@ -327,6 +354,10 @@ def _write_models(folder: Path, objects: Sequence[Scene]) -> None:
     table: dict[str, Any] = {}
     for number, scene in enumerate(objects, 1):
         corners = triangles(scene)
+        if not len(corners):
+            raise InputError(
+                "--object", "", f"{', '.join(scene.names)}, which light passes", "at least one solid shape"
+            )
         mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
         written = trimesh.exchange.ply.export_ply(mesh, encoding="ascii", vertex_normal=True)
         (folder / f"obj_{number:06d}.ply").write_bytes(written)
@@ -338,10 +369,12 @@ def _write_models(folder: Path, objects: Sequence[Scene]) -> None:
 
 
 def _diameter(vertices: NDArray[np.float64]) -> float:
-    """Return the largest distance between any two vertices; they lie on the convex hull, or all in a plane."""
-    flat = np.ptp(vertices, axis=0).min() < 1e-9
-    corners = np.unique(vertices, axis=0) if flat else vertices[ConvexHull(vertices).vertices]
-    return float(pdist(corners).max())
+    """Return the largest distance between any two vertices: corners of the convex hull, or of a flat outline."""
+    centred = vertices - vertices.mean(axis=0)
+    along = centred @ np.linalg.svd(centred, full_matrices=False)[2].T
+    sides = np.ptp(along, axis=0)
+    spanned = along[:, sides > _FLAT * sides.max()]
+    return float(pdist(vertices[ConvexHull(spanned).vertices]).max()) if spanned.shape[1] > 1 else float(sides.max())
 
 
 def _write_json(path: Path, table: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -18,7 +19,7 @@ from mitsim.cli.program import app
 from mitsim.decoding.cloud import capture_cloud, decoder_settings
 from mitsim.sensor.light_code import patterns, value
 from mitsim.sensor.preset import load_sensor
-from mitsim.sensor.projector_images import counted
+from mitsim.sensor.projector_images import counted, gap_in, read_images
 
 HEAD = """
 name = "rig"
@@ -323,6 +324,37 @@ def test_another_number_of_images_is_explained(names, told):
     shape, number = plain.split("*")
     found = [Path(shape.format(index)) for index in range(int(number))] + [Path(name) for name in others]
     assert advice(found, "camera", 18, ambient_image=False).startswith(told)
+
+
+def test_a_gap_in_the_numbers_of_a_full_series_is_told(whole):
+    sensor, folder = whole
+    assert "warnings" not in read_image_folder(folder, sensor).settings
+    (folder / "image_29.png").rename(folder / "image_30.png")
+    (told,) = read_image_folder(folder, sensor).settings["warnings"]
+    assert told == "images of camera: number 29 is missing"
+    listed = replace(sensor, images={"camera": [*(f"image_{k}.png" for k in range(29)), "image_30.png"]})
+    assert "warnings" not in read_image_folder(folder, listed).settings
+
+
+def test_a_gap_in_the_images_of_a_projector_is_told(tmp_path, capsys):
+    for number in (1, 2, 4):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.zeros((48, 64), np.uint8))
+    assert read_images(tmp_path, 64, 48).count == 3
+    assert "number 3 is missing among 3 images" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("names", "gap"),
+    [
+        ("a 1.png, a 3.png", "number 2 is missing"),
+        ("a 1.png, a 2.png", ""),
+        ("a 1.png, b 1.png, a 3.png", ""),  # two series
+        ("black.png, a 1.png, a 3.png", ""),
+        ("20261128235100.png, 20261129000200.png, 99999999999999999999.png", ""),  # times, not counts
+    ],
+)
+def test_a_gap_is_that_of_a_count(names, gap):
+    assert gap_in([Path(name) for name in names.split(", ")]) == gap
 
 
 def test_a_folder_of_other_cameras_says_what_is_in_it(tmp_path):

@@ -168,6 +168,14 @@ def test_grey_levels_between_black_and_white_are_shares_of_the_light(gray):
     np.testing.assert_allclose((fifth - black)[lit], (white - black)[lit] / 5, atol=2)  # roundings
 
 
+@pytest.mark.parametrize("noise", ["all", "none", "no-quantisation"])
+def test_the_stored_imager_has_the_levels_of_the_images(n10, noise):
+    capture = shot(n10, noise=noise)
+    imager = capture.decoding.imager
+    assert (imager.bits, imager.black_level) == (capture.bits, capture.decoding.black_level_dn)
+    assert decoder_settings(capture)[1] == imager
+
+
 def test_an_unknown_code_is_refused_with_what_to_do(gray, tmp_path):
     own = gray.with_patterns(gray.patterns())
     capture = shot(own)

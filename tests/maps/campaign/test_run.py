@@ -157,6 +157,13 @@ def test_what_a_stage_cannot_reach_is_left_out_and_listed(tmp_path, planned, cap
         run_campaign(fixed, known_source(smooth), tmp_path / "none")
 
 
+def test_where_the_map_ends_is_told(planned):
+    for limit, subdivisions, told in ((40, 2, "31.7 deg off"), (65, 2, "63.4 deg off"), (64, 2, ""), (60, 3, "")):
+        bands = [{"up_to_deg": 10, "subdivisions": 2}, {"up_to_deg": limit, "subdivisions": subdivisions}]
+        words = planned(orientations=bands).file.edge_in_words()
+        assert len(words) == bool(told) and all(told in word and f"up_to_deg = {limit}:" in word for word in words)
+
+
 def test_every_file_that_is_truncated_or_edited_is_named(tmp_path, planned):
     plan = planned(distances_mm=[500], orientations=[{"up_to_deg": 30, "subdivisions": 0}])
     run_campaign(plan, known_source(smooth), tmp_path)
