@@ -4,9 +4,8 @@ Signal chain: pattern value 0..1 -> response curve -> black level -> irradiance 
 toward the corners -> a point of the lens's aperture -> radiant intensity toward a surface -> irradiance there.
 
 With flux Phi [W] of an all-white frame of W x H pixels and focal lengths fx, fy [px], the plane z = 1 receives
-E_1 = Phi fx fy / (W H) per unit of its (dimensionless) area. Every pixel has the same flux, so a lens with distortion
-multiplies E_1 by the area of the distorted image of a small area of the plane. A direction at angle theta to the axis
-then has the radiant intensity I = E_1 / cos^3(theta) [W/sr], and a surface at distance r and incidence beta receives
+E_1 = Phi fx fy / (W H) per unit of its (dimensionless) area. A direction at angle theta to the axis then has the
+radiant intensity I = E_1 / cos^3(theta) [W/sr], and a surface at distance r and incidence beta receives
 I cos(beta) / r^2 [W/mm^2]. (Mitsuba's own ``projector`` plugin emits pi times that for the same numbers.)
 """
 
@@ -32,7 +31,6 @@ class Projector:
     - ``focus_mm``: distance of the plane of sharp focus along the axis. A point at depth z receives light from the
       projector pixels in a disc of diameter aperture f |1/z - 1/focus| px.
     - ``corner_illumination`` of the image's corner relative to the centre [1], in the form of the cos^4 law.
-    - ``stretched``: whether distortion changes the irradiance; None if it does wherever there is one.
     - ``pixel_gap``: dark share of the pitch between two pixels [1], as between the mirrors of a DMD; 0 is a continuous
       image.
     """
@@ -45,13 +43,6 @@ class Projector:
     focus_mm: float = np.inf
     corner_illumination: float = 1.0
     pixel_gap: float = 0.0
-    stretched: bool | None = None
-
-    @property
-    def is_stretched(self) -> bool:
-        """Whether distortion changes the irradiance."""
-        distorted = self.optics.model == "fisheye" or bool(self.optics.distortion.any())
-        return distorted if self.stretched is None else self.stretched
 
     @property
     def plane_irradiance(self) -> float:
