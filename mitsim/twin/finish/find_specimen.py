@@ -25,7 +25,8 @@ from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.twin.finish.specimen import Bend, Specimen, fit_bend, known_specimen, plane_points, specimen_in_cloud
 
-#: margin inside the specimen's outline that is not used [px]: its edge is blurred, and matched with the background
+#: margin inside the specimen's outline that is not used [px]: its edge is blurred, and matched with the background;
+#: chosen
 MARGIN_PX = 15.0
 
 #: least number of points of a plane in the user's region; chosen

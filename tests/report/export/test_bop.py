@@ -21,7 +21,8 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.cli.program import app
 from mitsim.report.export import bop
-from mitsim.report.export.bop import depth_scale, find_sources, on_pinhole, write_bop
+from mitsim.report.export.bop import find_sources, write_bop
+from mitsim.report.export.bop_frame import depth_scale, on_pinhole
 from tests.report.export.test_export_command import export
 
 ROOT = Path(__file__).resolve().parents[3]
