@@ -269,10 +269,17 @@ def _wrap(scene: Any, finishes: dict[str, Finish], where: str) -> Scene:
     names = tuple(shape.id() or f"shape_{i}" for i, shape in enumerate(shapes))
     for name, shape in zip(names, shapes, strict=True):
         _check_round(where, name, shape)
-    changeable = all(shape.class_name() != "Instance" for shape in shapes)
     on_shapes = [shape.bsdf().id() for shape in shapes]
-    changeable = changeable and set(finishes) <= set(on_shapes)
+    nested = {name for shape in shapes for name in _ids_inside(shape.bsdf())}
+    changeable = all(shape.class_name() != "Instance" for shape in shapes) and not nested & set(finishes)
     return Scene(scene, names, tuple(finishes.get(name) for name in on_shapes), bounds, where, changeable)
+
+
+def _ids_inside(bsdf: Any) -> list[str]:
+    """Return the ids of the BSDFs inside a BSDF."""
+    first, *inside = backend.mi.traverse(bsdf).hierarchy
+    assert first is bsdf
+    return [node.id() for node in inside if isinstance(node, backend.mi.BSDF)]
 
 
 def _check_round(where: str, name: str, shape: Any) -> None:

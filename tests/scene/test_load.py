@@ -99,3 +99,13 @@ def test_missing_files_parameters_and_roots(tmp_path, scenes):
     (tmp_path / "empty.xml").write_text('<scene version="3.0.0"/>')
     with pytest.raises(InputError, match="no shape"):
         load_scene(tmp_path / "empty.xml", 850)
+
+
+@pytest.mark.parametrize(("used", "changeable"), [("plain", True), ("around", False)])
+def test_only_finishes_inside_other_bsdfs_keep_a_scene_from_being_changed(tmp_path, used, changeable):
+    metal = '<bsdf type="machined_metal" id="{}"><float name="Ra" value="0.4"/></bsdf>'
+    bsdfs = metal.format("plain") + f'<bsdf type="twosided" id="around">{metal.format("nested")}</bsdf>'
+    shape = f'<shape type="sphere"><float name="radius" value="20"/><ref id="{used}"/></shape>'
+    file = tmp_path / "scene.xml"
+    file.write_text(f'<scene version="3.0.0">{bsdfs}{shape}</scene>')
+    assert load_scene(file, 850).changeable == changeable
