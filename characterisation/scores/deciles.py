@@ -55,7 +55,7 @@ def bins_of(score: ArrayLike) -> NDArray[np.int64]:
     return out
 
 
-def deciles(score: ArrayLike, error: ArrayLike) -> xr.Dataset:
+def deciles(score: ArrayLike, error: ArrayLike, tried: ArrayLike | None = None) -> xr.Dataset:
     """Return the mean true error and standard deviation of the views in each decile of a score.
 
     Parameters
@@ -66,6 +66,8 @@ def deciles(score: ArrayLike, error: ArrayLike) -> xr.Dataset:
     error
         (view,) or (view, trial) true errors, in any unit; NaN for a trial without a value. A view has a mean absolute
         error with one value or more, and a standard deviation with two or more.
+    tried
+        (view,) number of trials made of each view, those first in its row; by default all.
 
     Returns
     -------
@@ -103,6 +105,7 @@ def deciles(score: ArrayLike, error: ArrayLike) -> xr.Dataset:
         allowed = f"({bins.size},) or ({bins.size}, trials), one row for each view"
         raise InputError("deciles", "error", f"the shape {errors.shape} for scores of {bins.shape}", allowed)
     errors = errors.reshape(len(bins), -1)
+    made = np.full(len(bins), errors.shape[1]) if tried is None else np.asarray(tried)
     finite = np.isfinite(errors)
     count = finite.sum(axis=1)
     filled = np.where(finite, errors, 0.0)
@@ -118,7 +121,7 @@ def deciles(score: ArrayLike, error: ArrayLike) -> xr.Dataset:
         row: dict[str, float] = {
             "views": here.sum(),
             "measured": (count[here] > 0).sum(),
-            "share": float(finite[here].mean()) if here.any() else math.nan,
+            "share": float(finite[here].sum() / made[here].sum()) if made[here].any() else math.nan,
             "score_low": float(scores[here].min()) if here.any() and number else math.nan,
             "score_high": float(scores[here].max()) if here.any() and number else math.nan,
         }

@@ -111,7 +111,7 @@ def agreement(scores: xr.Dataset, checks: xr.Dataset, measurement: str) -> Agree
         error,
         np.where(measured, least, np.nan),
         np.where(measured, most, np.nan),
-        1 - valid.sum(axis=1) / max(valid.shape[1], 1),  # no view was measured: (0, 0)
+        1 - valid.sum(axis=1) / np.maximum(_tried(checks, measurement), 1),
         int(measured.sum()),
         spearman(predicted[measured], error[measured]),
         spearman(score[measured], -error[measured]),
@@ -119,6 +119,13 @@ def agreement(scores: xr.Dataset, checks: xr.Dataset, measurement: str) -> Agree
         *coverage_interval(z),
         float(np.median(trials)) if len(trials) else math.nan,
     )
+
+
+def _tried(checks: xr.Dataset, measurement: str) -> NDArray[np.int64]:
+    """Return the number of trials made of every checked view; all of the table if it does not tell."""
+    if "tried" not in checks:
+        return np.full(checks.sizes["view"], checks.sizes["repeat"])
+    return np.asarray(checks["tried"].sel(measurement=measurement).sum("repeat").values, np.int64)
 
 
 def chance_level(count: int) -> float:

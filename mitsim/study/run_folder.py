@@ -81,7 +81,12 @@ _SCORES = Schema(
 _ERRORS = Variable(("measurement", "view", "repeat"), gaps=True)
 _CHECKS = Schema(
     "checks of a run",
-    {"value": _ERRORS, "error": _ERRORS, **_ALL},
+    {
+        "value": _ERRORS,
+        "error": _ERRORS,
+        "tried": Variable(("measurement", "view", "repeat"), "whole", 0, 1, needed=False),
+        **_ALL,
+    },
     {"repeat": (0, 1_000_000)},
     ("measurement", "view"),
     AGAIN,

@@ -171,8 +171,9 @@ def _example(judged: JudgedViews, example: ExampleEntry) -> Claim:
     values, views, share = cell["error"].values, cell["views"].values, cell["share"].values
     unit = unit_symbol(str(judged.scores[example.sample]["unit"].sel(measurement=example.measurement).item()))
     possible = int(views[1:].sum())
-    trials = errors["error"].sel(measurement=example.measurement).values[errors["tried"].values > 0]
-    measurable = int((np.isfinite(trials).mean(axis=1) >= 0.5).sum())
+    count = np.isfinite(errors["error"].sel(measurement=example.measurement).values).sum(axis=1)
+    tried = errors["tried"].values
+    measurable = int((2 * count >= tried)[tried > 0].sum())
     if not possible:
         return _nothing_possible(judged, example, measurable, float(share[0]))
     bins = np.flatnonzero(np.isfinite(values[1:])) + 1
@@ -222,7 +223,7 @@ def _nothing_possible(judged: JudgedViews, example: ExampleEntry, measurable: in
 
 
 def _picture(example: ExampleEntry) -> str:
-    return f"example_{example.measurement}"
+    return f"example_{example.measurement}_{example.sample.replace(' ', '_')}"
 
 
 def _mean_share(cell: xr.Dataset) -> float:
@@ -300,7 +301,7 @@ def _by_sample(judged: JudgedViews) -> list[str]:
     for sample, errors in judged.errors.items():
         cells = [judged.cell(sample, name, "V_m") for name in judged.task.measurements]
         middle = mean_of([cell.attrs["error_correlation"] for cell in cells])
-        tried = errors["error"].values[:, errors["tried"].values > 0]
-        share = float(np.isfinite(tried).mean()) if tried.size else math.nan
+        tried = len(errors["measurement"]) * int(errors["tried"].sum())
+        share = float(np.isfinite(errors["error"].values).sum() / tried) if tried else math.nan
         out.append(f"{sample} {_signed(middle)} ({_percent(share)})")
     return out

@@ -41,8 +41,9 @@ class JudgedViews:
     def cell(self, sample: str, measurement: str, kind: str) -> xr.Dataset:
         """Return the deciles of one measurement of one sample."""
         score, errors = self.score(sample, measurement, kind), self.errors[sample]
-        tried = errors["tried"].values > 0
-        return deciles(score[tried], errors["error"].sel(measurement=measurement).values[tried])
+        count = errors["tried"].values
+        tried = count > 0
+        return deciles(score[tried], errors["error"].sel(measurement=measurement).values[tried], count[tried])
 
     def ranks(self, kind: str) -> dict[str, xr.Dataset]:
         """Return the mean ranks of the bins over all measurements and samples with errors, by :data:`QUANTITIES`."""

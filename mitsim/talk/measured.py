@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 from mitsim.capture.folder import read_capture, read_settings_and_pose
@@ -79,15 +80,20 @@ def _nearest(talk: Talk, pose: Transform, capture_folder: Path) -> View:
         between = view.world_from_sensor.rotation.T @ pose.rotation
         return math.degrees(math.acos(min(max((float(np.trace(between)) - 1) / 2, -1.0), 1.0)))
 
-    def apart(view: View) -> float:
-        return float(np.linalg.norm(pose.translation - view.world_from_sensor.translation))
+    def moved(view: View) -> NDArray[np.float64]:
+        """Across, across and along the view's axis [mm]."""
+        apart = pose.translation - view.world_from_sensor.translation
+        return np.asarray(view.world_from_sensor.rotation.T @ apart)
 
     def over_limits(view: View) -> float:
-        return max(turned(view) / NEAR_DEG, apart(view) / view.standoff / (NEAR_SHARE + math.radians(NEAR_DEG)))
+        *across, along = (moved(view) / view.standoff).tolist()
+        direction = math.degrees(math.hypot(*across))
+        return float(max(turned(view) / NEAR_DEG, direction / NEAR_DEG, abs(along) / NEAR_SHARE))
 
     view = min(talk.views, key=over_limits)
     if over_limits(view) > 1:
-        offset = f"{turned(view):.1f} deg and {apart(view):.0f} mm from the nearest view, number {view.number}"
+        apart = float(np.linalg.norm(moved(view)))
+        offset = f"{turned(view):.1f} deg and {apart:.0f} mm from the nearest view, number {view.number}"
         allowed = f"a pose within {NEAR_DEG:g} deg of a candidate view, at its standoff within {100 * NEAR_SHARE:g} %"
         raise InputError(
             capture_folder / "pose.json", "world_from_sensor", offset, allowed, "poses.json of mitsim study score"

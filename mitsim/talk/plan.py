@@ -108,7 +108,14 @@ def pieces_of(talk: Talk) -> list[Piece]:
         for artefact_entry in (file.finishes or file.samples)[:1]
     ]
     pieces += [
-        Piece(f"finish_{finish.key}", "finish", (talk.study_file(finish), number), sensor, (_scene(finish),))
+        Piece(
+            f"finish_{finish.key}",
+            "finish",
+            (talk.study_file(finish), number),
+            sensor,
+            (_scene(finish),),
+            files=(file.task,),
+        )
         for finish in file.finishes
     ]
     coupon_place = CouponPlace(coupons.campaign, file.sensor, coupons.distance_mm, coupons.roughness_um)
@@ -116,24 +123,22 @@ def pieces_of(talk: Talk) -> list[Piece]:
     of_coupons = tuple(
         (str(Path(coupons.campaign).parent / sample_entry.scene), ()) for sample_entry in campaign.samples
     )
+    captured = (sensor, of_coupons, "", (coupons.campaign,))
     refined = (coupons.subdivisions, coupons.refined, file.seed)
-    pieces.append(Piece("characterised", "characterised", (coupon_place, *refined), sensor, of_coupons))
-    pieces.append(Piece("tilts", "tilts", (coupon_place, tuple(coupons.tilts_deg)), sensor, of_coupons))
-    pieces.append(Piece("sub_clouds", "sub_clouds", (coupon_place, _SUB_CLOUDS_TILT_DEG), sensor, of_coupons))
+    pieces.append(Piece("characterised", "characterised", (coupon_place, *refined), *captured))
+    pieces.append(Piece("tilts", "tilts", (coupon_place, tuple(coupons.tilts_deg)), *captured))
+    pieces.append(Piece("sub_clouds", "sub_clouds", (coupon_place, _SUB_CLOUDS_TILT_DEG), *captured))
     pieces += [Piece(f"noise_{sensor_key(name)}", "noise", (name, file.seed), (name,)) for name in file.noise_sensors]
     shown = CouponPlace(coupons.campaign, file.sensor, coupons.shown_distance_mm, coupons.shown_roughness_um)
-    pieces.append(
-        Piece("clouds", "clouds", (shown, map_name, _CLOUDS_TILT_DEG, file.seed), sensor, of_coupons, map_name)
-    )
+    predicted = (sensor, of_coupons, map_name, (coupons.campaign,))
+    pieces.append(Piece("clouds", "clouds", (shown, map_name, _CLOUDS_TILT_DEG, file.seed), *predicted))
     for sample in campaign.samples:
         rough = coupon_pieces.roughness_of(sample)
         for distance in coupons.validated_distances_mm:
             there = CouponPlace(coupons.campaign, file.sensor, distance, rough)
             poses = coupons.poses * (_SHOWN_POSES if rough == coupons.shown_roughness_um else 1)
             arguments = (there, map_name, poses, file.seed)
-            pieces.append(
-                Piece(validation_name(rough, distance), "validation", arguments, sensor, of_coupons, map_name)
-            )
+            pieces.append(Piece(validation_name(rough, distance), "validation", arguments, *predicted))
     for artefact_entry in file.samples:
         study = (talk.study_file(artefact_entry),)
         pieces.append(
@@ -151,9 +156,8 @@ def pieces_of(talk: Talk) -> list[Piece]:
     for artefact_entry in file.samples:
         for name, depth in (("direct", 1), ("all", file.light_path_depth)):
             seen = (talk.study_file(artefact_entry, depth), numbers)
-            pieces.append(
-                Piece(f"light_{name}_{artefact_entry.key}", "light", seen, sensor, (_scene(artefact_entry),), map_name)
-            )
+            of_study = (sensor, (_scene(artefact_entry),), map_name, (file.task,))
+            pieces.append(Piece(f"light_{name}_{artefact_entry.key}", "light", seen, *of_study))
     return pieces
 
 

@@ -143,3 +143,10 @@ def test_chance_level_is_where_students_test_gives_five_percent():
     # 1500 draws: the share scatters by 0.0056, and the approximation is off by 0.002
     assert np.mean(np.array(sizes) > level) == pytest.approx(0.05, abs=0.02)
     assert math.isnan(chance_level(3))
+
+
+def test_trials_that_were_not_made_have_not_failed():
+    checks = checks_of([0, 1], [[0.1, 0.2, 0.3, np.nan], [0.1, np.nan, np.nan, np.nan]])
+    tried = np.array([[[1, 1, 1, 1], [1, 0, 0, 0]]], np.int8)
+    checks = checks.assign(tried=(("measurement", "view", "repeat"), tried))
+    np.testing.assert_array_equal(agreement(scores_of([0.1, 0.2], [2, 1]), checks, "m").failed, [0.25, 0.0])

@@ -15,6 +15,7 @@ from mitsim.sensor.transforms import Transform
 from mitsim.talk.make import make, missing_results
 from mitsim.talk.measured import _nearest, measured_errors
 from mitsim.talk.page import write_talk
+from mitsim.talk.plan import _file_digest, pieces_of
 from mitsim.talk.results import Results
 from mitsim.talk.talk_file import read_talk
 from tests.shell import ROOT, mitsim_here
@@ -138,6 +139,32 @@ def test_a_capture_belongs_to_the_view_of_its_standoff(tmp_path: Path) -> None:
     away = Transform(np.eye(3), np.array([0.0, 0.0, -250.0]))
     with pytest.raises(InputError, match=r"0\.0 deg and (170|250) mm from the nearest view"):
         _nearest(talk, talk.views[0].world_from_sensor @ away, tmp_path)
+
+
+def test_a_capture_that_is_a_tenth_too_far_belongs_to_no_view(tmp_path: Path) -> None:
+    talk = read_talk(small_talk(tmp_path))
+    view = max(talk.views, key=lambda one: one.standoff)
+    far = Transform(np.eye(3), np.array([0.0, 0.0, -0.1 * view.standoff]))
+    with pytest.raises(InputError, match="at its standoff within 5 %"):
+        _nearest(talk, view.world_from_sensor @ far, tmp_path)
+
+
+def test_what_a_campaign_or_task_says_enters_the_digests_of_the_pieces_that_read_it(tmp_path: Path) -> None:
+    path = small_talk(tmp_path)
+
+    def digests() -> dict[str, str]:
+        _file_digest.cache_clear()
+        return {piece.name: piece.digest(tmp_path) for piece in pieces_of(read_talk(path))}
+
+    def changed(name: str, old: str, new: str) -> set[str]:
+        before, text = digests(), (tmp_path / name).read_text(encoding="utf-8")
+        (tmp_path / name).write_text(text.replace(old, new), encoding="utf-8")
+        after = digests()
+        return {re.sub("_.*", "", piece) for piece in after if after[piece] != before[piece]}
+
+    of_coupons = {"characterised", "tilts", "sub", "clouds", "validation"}
+    assert changed("coupons.toml", "samples_per_pixel = 4", "samples_per_pixel = 8") == of_coupons
+    assert changed("task.toml", "[measurements", "# a remark\n[measurements") == {"finish", "scores", "light"}
 
 
 @pytest.fixture(scope="module")

@@ -172,10 +172,15 @@ def _check_same_objects(found: tuple[Scene, list[Scene]], first: tuple[Scene, li
     raise InputError(source.folder, "many.scene", told, "captures of the same objects", hint)
 
 
+def _levels(depth: NDArray[np.float64], scale: float) -> NDArray[np.uint16]:
+    """Return a depth image [mm] in steps of ``scale``, 0 where it is missing or beyond 16 bits."""
+    levels = np.rint(np.nan_to_num(depth) / scale)
+    return np.where((levels > 0) & (levels <= 65535), levels, 0).astype(np.uint16)
+
+
 def _write_frame(frame: Frame, folder: Path, number: int, scale: float, tables: dict[str, dict[str, Any]]) -> None:
     name = f"{number:06d}"
-    counts = np.rint(np.nan_to_num(frame.depth) / scale).clip(0, 65535).astype(np.uint16)
-    true = np.rint(np.nan_to_num(frame.true_depth) / scale).clip(0, 65535).astype(np.uint16)
+    counts, true = (_levels(depth, scale) for depth in (frame.depth, frame.true_depth))
     images: dict[str, NDArray[Any] | None] = {
         f"gray/{name}": frame.grey,
         f"depth/{name}": counts,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -170,10 +171,11 @@ def board_poses(
     near, far = working_range_mm
     reference = next(iter(eyes.values()))
     out = []
+    stride = next(step for step in range(7, 7 + count) if math.gcd(step, count) == 1)
     for index in range(count):
         # R2 sequence (Roberts 2018) for the position, a coprime stride for the distance
         position = (0.5 + index * np.array([0.7548776662466927, 0.5698402909980532])) % 1
-        share = (index * 7 % count + 0.5) / count
+        share = (index * stride % count + 0.5) / count
         distance = 1 / (share / near + (1 - share) / far)
         tilt, azimuth = np.radians(TILTS_DEG[index % len(TILTS_DEG)]), index * 2.399963
         pixel = (0.1 + 0.8 * position) * [reference.width - 1, reference.height - 1]

@@ -57,14 +57,14 @@ def rank_keys(demands: ArrayLike, has_tolerance: ArrayLike, references: ArrayLik
         Demands (sensor, measurement), infinite for an impossible measurement. Without a tolerance, they are in the unit
         of the measurement.
     has_tolerance
-        Whether a measurement (measurement,) has a tolerance. If one has, only those with a tolerance are compared: the
-        others have no limit. Impossible ones count with and without tolerance.
+        Whether a measurement (measurement,) has a tolerance. If a sensor can make one that has, only those with a
+        tolerance are compared: the others have no limit. Impossible ones count with and without tolerance.
     references
         Sensors (sensor,) whose least demand is 1 if there are no tolerances; by default all.
     """
     table, compared = np.asarray(demands, float), np.asarray(has_tolerance, bool)
     impossible = (~np.isfinite(table)).sum(axis=1)
-    table = table[:, compared] if compared.any() else relative_to_least(table, references)
+    table = table[:, compared] if np.isfinite(table[:, compared]).any() else relative_to_least(table, references)
     return [rank_key(row, int(count)) for row, count in zip(table.tolist(), impossible, strict=True)]
 
 

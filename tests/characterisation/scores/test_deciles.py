@@ -124,3 +124,9 @@ def test_a_score_without_information_has_ranks_near_the_middle() -> None:
 def test_errors_of_another_number_of_views_are_rejected() -> None:
     with pytest.raises(InputError, match=r"the shape \(1,\) for scores of \(2,\)"):
         deciles([1.0, 2.0], [1.0])
+
+
+def test_trials_that_were_not_made_are_not_trials_without_value() -> None:
+    errors = [[0.1, math.nan, math.nan], [0.1, 0.2, math.nan]]
+    assert deciles([1.0, 1.0], errors)["share"].sel(bin=6).item() == pytest.approx(3 / 6)
+    assert deciles([1.0, 1.0], errors, [1, 3])["share"].sel(bin=6).item() == pytest.approx(3 / 4)

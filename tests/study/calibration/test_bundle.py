@@ -29,6 +29,15 @@ def setting(name, poses=10, board=BOARD, camera_px=0.05, coordinate_px=0.02):
     return sensor.measuring_rig, eyes, board, views
 
 
+@pytest.mark.parametrize("poses", [7, 14, 20, 35])
+def test_every_pose_has_a_distance_of_its_own(poses):
+    sensor = load_sensor("ensenso-n10")
+    eyes = calibrated_eyes(sensor)
+    board = default_board(sensor.rig.reference, np.sqrt(np.prod(sensor.working_range_mm)))
+    shown = board_poses(board, eyes, sensor.working_range_mm, poses)
+    assert len({round(float(np.linalg.norm(place.translation))) for place, _ in shown}) > 0.8 * len(shown)
+
+
 def only_noise(found):
     return Linearised(found.names, found.normal, found.noise, found.board, 0 * found.board_sigma)
 

@@ -283,3 +283,7 @@ def test_a_sensor_of_few_trials_is_called_rough(tmp_path):
     rows = page_content(choice, tmp_path)["rows"]
     assert [row["rough"] for row in rows[:2]] == [few.roughness_in_words, ""]
     assert few.roughness_in_words in of_choice(choice, None).doubts
+
+
+def test_toleranced_measurements_that_no_sensor_can_make_do_not_hide_the_others():
+    assert rank_keys([[INF, 0.1], [INF, 0.2]], [True, False]) == [(1, (1.0,)), (1, (2.0,))]
