@@ -6,6 +6,7 @@ map and report. Maps of depth, disparity or points that a device computes itself
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -106,6 +107,17 @@ class Capture:
                 raise InputError(where, f"read_out.{name}", found, allowed)
         if self.pose_covariance is not None and self.world_from_sensor is None:
             raise ValueError("a pose covariance without a pose")
+
+    def brightness(self, camera: str) -> NDArray[np.float64]:
+        """Return the light that a camera sees, (H, W) [DN]: the mean of its images but that of ambient light.
+
+        An image of time of flight is a correlation about a zero level; its light is the range over the phase steps.
+        """
+        stack = self.images[camera]
+        if self.technology == "time_of_flight":
+            return np.asarray(2 * math.sqrt(2) * stack.std(axis=0, dtype=np.float64))
+        lit = stack[:-1] if self.decoding.ambient_image and len(stack) > 1 else stack
+        return np.asarray(lit.mean(axis=0, dtype=np.float64))
 
     def plot(self, ax: Any = None, *, camera: str | None = None, image: int = 0) -> NDArray[np.object_]:
         """Draw an image of every camera in grey, with saturated pixels marked.

@@ -88,14 +88,14 @@ class PlateDots:
 
 
 def image_on_grid(capture: Capture, grid: ViewGrid) -> NDArray[np.uint8]:
-    """Return the mean image of the reference camera, resampled to the pixels of a cloud's grid (H, W), 8 bits.
+    """Return the light that the reference camera sees, resampled to the pixels of a cloud's grid (H, W), 8 bits.
 
     The 99.9th percentile of its levels becomes 255.
     """
     name = next(iter(capture.rig.cameras))
-    mean = capture.images[name].mean(axis=0)
-    bright = float(np.percentile(mean, 99.9))
-    level = np.clip(mean * (255.0 / max(bright, 1.0)), 0, 255).astype(np.uint8)
+    light = capture.brightness(name)
+    bright = float(np.percentile(light, 99.9))
+    level = np.clip(light * (255.0 / max(bright, 1.0)), 0, 255).astype(np.uint8)
     return resample_to_grid(level, capture.rig.reference, grid)
 
 

@@ -232,13 +232,9 @@ def _window_around(cloud: PointCloud) -> tuple[slice, slice]:
 
 
 def _brightest(capture: Capture) -> NDArray[np.float64]:
-    """Return the reference camera's image of the largest mean; for time of flight, the spread of its images.
-
-    An image of time of flight is a correlation about a zero level, and vanishes at some distances. Its spread over the
-    phase steps is in proportion to the light.
-    """
-    stack = next(iter(capture.images.values()))
+    """Return the reference camera's image of the largest mean; for time of flight, the light that it sees."""
+    name, stack = next(iter(capture.images.items()))
     if capture.technology == "time_of_flight":
-        return np.asarray(stack.astype(float).std(axis=0))
+        return capture.brightness(name)
     step = max(1, len(stack) // 12)
     return np.asarray(max(stack[::step], key=lambda image: float(image.mean())), float)

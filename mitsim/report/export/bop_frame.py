@@ -130,11 +130,8 @@ def _grey(capture: Capture, grid: ViewGrid) -> NDArray[np.uint8] | None:
     name, camera = next(iter(capture.rig.cameras.items()))
     if name not in capture.images or not len(capture.images[name]):
         return None
-    lit = capture.images[name]
-    if capture.decoding.ambient_image and len(lit) > 1:
-        lit = lit[:-1]
     pixels = camera.project((camera.centre + 1000.0 * grid.rays()).reshape(-1, 3)).reshape(grid.height, grid.width, 2)
     pixels = np.nan_to_num(pixels, nan=-9.0)  # outside the image
-    mean = lit.mean(axis=0, dtype=np.float64) * 255 / (2**capture.bits - 1)
-    sampled = map_coordinates(mean, [pixels[..., 1], pixels[..., 0]], order=1, mode="constant", cval=0.0)
+    light = capture.brightness(name) * 255 / (2**capture.bits - 1)
+    sampled = map_coordinates(light, [pixels[..., 1], pixels[..., 0]], order=1, mode="constant", cval=0.0)
     return np.asarray(np.rint(np.nan_to_num(sampled)).clip(0, 255), np.uint8)

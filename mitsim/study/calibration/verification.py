@@ -142,9 +142,8 @@ def corners_of_board(capture: Capture, board: Board, cloud: PointCloud | None) -
         If a camera does not show the whole board, or the cloud has no plane there.
     """
     pixels = {}
-    for name, stack in capture.images.items():
-        image = stack.astype(float).mean(axis=0)
-        corners = found_corners(image, board)
+    for name in capture.images:
+        corners = found_corners(capture.brightness(name), board)
         if corners is None:
             raise InputError(
                 "--board", name, "no such board in its image", f"all {len(board.corners)} corners of {board}"

@@ -1,0 +1,31 @@
+"""What a capture says of its images."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import Decoding
+from mitsim.sensor.camera import Camera, Rig
+
+
+def capture_of(images: np.ndarray, technology: str, **decoding: bool) -> Capture:
+    count, height, width = images.shape
+    matrix = np.array([[100.0, 0, (width - 1) / 2], [0, 100.0, (height - 1) / 2], [0, 0, 1]])
+    camera = Camera(matrix, np.zeros(5), width, height)
+    return Capture("one", technology, "device", Rig({"left": camera}), {"left": images}, 16, Decoding(**decoding))
+
+
+def test_brightness_of_time_of_flight_is_the_range_of_the_correlation() -> None:
+    """The mean over the phase steps is the zero level, whatever the light."""
+    amplitude, phase = np.linspace(10, 900, 12).reshape(3, 4), np.arange(12.0).reshape(3, 4)
+    steps = np.arange(4)[:, None, None] * np.pi / 2
+    images = np.rint(16384 + amplitude * np.cos(phase + steps)).astype(np.uint16)
+    np.testing.assert_allclose(capture_of(images, "time_of_flight").brightness("left"), 2 * amplitude, atol=2)
+
+
+def test_brightness_leaves_out_the_image_of_ambient_light() -> None:
+    images = np.full((3, 2, 2), 100, np.uint16) * np.array([1, 3, 9], np.uint16)[:, None, None]
+    assert capture_of(images, "structured_light", ambient_image=True).brightness("left")[0, 0] == 200
+    assert capture_of(images, "structured_light").brightness("left")[0, 0] == pytest.approx(1300 / 3)
