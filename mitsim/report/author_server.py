@@ -45,7 +45,12 @@ class AuthorServer:
 
             def do_GET(self) -> None:
                 if self._allowed(""):
-                    self._answer(200, owner.page(owner.token), "text/html")
+                    try:
+                        page = owner.page(owner.token)
+                    except InputError as error:  # a file was changed by hand meanwhile
+                        self._answer(422, f"{error}\nMend the file, then load this page again.", "text/plain")
+                    else:
+                        self._answer(200, page, "text/html")
 
             def do_POST(self) -> None:
                 if self.path == f"/{owner.token}/done" and self._allowed("done"):

@@ -32,11 +32,12 @@ const can = (i) => (state.quantity === 'score' ? state.measurement.possible[i] :
 
 function rank() {
   const m = state.measurement, { of, good } = QUANTITIES[state.quantity], sign = good === 'small' ? 1 : -1;
-  state.order = views.number.map((_, i) => i).filter(can)
-    .sort((i, j) => sign * (of(m, i) - of(m, j)) || m.rank[i] - m.rank[j]);
+  const ahead = (i, j) => (state.quantity === 'uncertainty' ? 0 : sign * (of(m, i) - of(m, j))) || m.rank[i] - m.rank[j];
+  state.order = views.number.map((_, i) => i).filter(can).sort(ahead);
   const first = new Map(state.order.map((i, position) => [i, position]));
   state.shown = sites.map((those) => those.reduce((i, j) => ((first.get(j) ?? Infinity) < (first.get(i) ?? Infinity) ? j : i)));
-  Object.assign(state, ends(state.order.map((i) => of(m, i)).filter((value) => known(value) && value > 0)));
+  Object.assign(state, ends(state.order.map((i) => of(m, i)).filter((value) => known(value) && value > 0)
+    .sort((a, b) => sign * (a - b))));
 }
 
 // Return the ends of the colour scale for values from the best to the worst. On a logarithmic scale the worst tenth shares

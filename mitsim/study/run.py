@@ -140,7 +140,9 @@ def run_within(
     clock.lap("score")
     answers = Answers(session, performance_map, scores, limit, clock, report)
     minutes_of_race = study.file.race.minutes
-    race_limit = plan.race_limit(limit) if whole is not None else TimeLimit(minutes_of_race and 60 * minutes_of_race)
+    race_limit = TimeLimit(minutes_of_race and 60 * minutes_of_race)
+    if whole is not None:
+        race_limit = min(race_limit, plan.race_limit(limit), key=lambda each: each.left)
     raced = session.race(scores, None, race_limit, answers.improve)
     scores = write_raced(session, scores, raced)
     clock.lap("race")

@@ -342,5 +342,4 @@ def statement(study: Study, view: int, *, trials: int | None = None, folder: str
     chosen = study.view(view, "statement: view")
     with nullcontext(folder) if folder is not None else TemporaryDirectory() as kept:
         session = Session(study, kept)
-        session.claim(f"budget of view {view}")
         return Statements(session.state(chosen, StatementTable(trials=count)).statements)

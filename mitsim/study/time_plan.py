@@ -133,4 +133,5 @@ def time_plan(seconds: float, views: int, remedies: bool = False, sets: bool = F
 
 
 def _in_words(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.2g} min"
+    minutes = seconds / 60
+    return f"{seconds:.0f} s" if seconds < 100 else f"{round(minutes, 1 if minutes < 10 else 0):g} min"

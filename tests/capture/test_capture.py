@@ -11,7 +11,7 @@ from mitsim.sensor.camera import Camera, Rig
 
 
 def capture_of(images: np.ndarray, technology: str, **decoding: bool) -> Capture:
-    count, height, width = images.shape
+    height, width = images.shape[1:]
     matrix = np.array([[100.0, 0, (width - 1) / 2], [0, 100.0, (height - 1) / 2], [0, 0, 1]])
     camera = Camera(matrix, np.zeros(5), width, height)
     return Capture("one", technology, "device", Rig({"left": camera}), {"left": images}, 16, Decoding(**decoding))

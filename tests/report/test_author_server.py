@@ -9,6 +9,7 @@ import time
 
 import pytest
 
+from characterisation.files.errors import InputError
 from mitsim.report import author_server
 from mitsim.report.author_server import AuthorServer
 
@@ -89,6 +90,20 @@ def test_files_are_restored_whatever_ends_their_check(tmp_path, fault):
     with server._server, pytest.raises(fault):
         server.save(json.dumps({"files": {"scene": "new", "task": TASK}}).encode())
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"part.xml": "old"}
+
+
+def test_a_page_whose_files_were_broken_by_hand_says_so(tmp_path):
+    def page(token):
+        raise InputError("part.xml", "shape", "no shape at all", "at least one shape")
+
+    server = AuthorServer(tmp_path, {"task": "task.toml"}, page, list)
+    thread = threading.Thread(target=server._server.handle_request, daemon=True)
+    thread.start()
+    with server._server, socket.create_connection(("127.0.0.1", server.port), timeout=20) as connection:
+        connection.sendall(f"GET /{server.token}/ HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n\r\n".encode())
+        answer = connection.makefile("rb").read().decode()
+        thread.join(20)
+    assert answer.startswith("HTTP/1.0 422") and "no shape at all" in answer
 
 
 def test_a_silent_connection_does_not_hold_up_the_page(tmp_path, monkeypatch):

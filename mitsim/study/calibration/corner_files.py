@@ -214,10 +214,14 @@ def _named(files: Sequence[Path], path: Path) -> dict[Path, tuple[str, str]]:
     stated: dict[Path, set[str]] = {}
     for file, (camera, pose) in by_name.items():
         stated.setdefault(file.parent, set()).update({camera} if pose != file.stem else ())
-    return {
-        file: named if file.parent == path or len(stated[file.parent]) > 1 else (file.parent.name, file.stem)
-        for file, named in by_name.items()
-    }
+    out = {}
+    for file, (camera, pose) in by_name.items():
+        folder = file.parent.name
+        if file.parent == path or len(stated[file.parent]) > 1:
+            out[file] = camera, pose
+        else:
+            out[file] = folder, pose if camera == folder.lower() else file.stem
+    return out
 
 
 def _by_name(file: Path) -> tuple[str, str]:
@@ -280,7 +284,10 @@ def _of_arrays(path: Path, arrays: Mapping[str, Any], board: Board) -> tuple[See
     seen: Seen = {}
     for eye, values in by_eye.items():
         try:
-            pixels = np.asarray(values, float).reshape(-1, count, 2)
+            pixels = np.asarray(values, float).squeeze()
+            if pixels.ndim > 2 and pixels.size not in (2 * count, 2 * count * len(pixels)):
+                raise ValueError  # poses of another board
+            pixels = pixels.reshape(-1, count, 2)
         except (OverflowError, TypeError, ValueError):
             shape = f"{values.shape}" if isinstance(values, np.ndarray) else str(values)[:60]
             raise InputError(path, eye, shape, f"(poses, {count}, 2), for {board}", "check --board") from None

@@ -108,10 +108,13 @@ def open_candidate(path: Path, file: StudyFile, text: str, ask: Ask | None) -> C
     if not is_file and sensor not in presets():
         raise InputError("--sensors", "", sensor, f"{', '.join(presets())}, or a sensor TOML")
     mapped = is_file or map_name or sensor in shipped_maps()
-    if not mapped and (sensor != file.sensor or file.characterisation == CharacterisationTable()):
+    own = sensor == file.sensor
+    if is_file:  # relative to the folder of the study there, to the working folder here
+        own = Path(sensor).resolve() == (path.parent / file.sensor).resolve()
+    if not mapped and (not own or file.characterisation == CharacterisationTable()):
         return Excluded(sensor, text, f"no performance map of it comes with mitsim: make one, and give {sensor}=MAP")
     tables = [file]
-    if sensor != file.sensor or map_name:
+    if not own or map_name:
         name = str(Path(sensor).resolve()) if is_file else sensor
         changed = file.model_copy(update={"sensor": name, "characterisation": CharacterisationTable()})
         free = file.views.model_copy(update={"standoff_mm": None, "standoffs_mm": None})

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -84,7 +85,13 @@ def _opened(now: Shortfall, name: str) -> Study | None:
 def _with_sensor(now: Shortfall, name: str, study: Study, view: View, expected: dict[str, float]) -> Change:
     changed = ChangedStudy(now, f"sensor_{name}", lambda: study, lambda opened: opened.view(view.number))
     words = f"with {name}, from its view {view.number}"
-    return Change("sensor", words, {"sensor": name}, (view.number,), expected, changed.state, release=changed.release)
+    before, after = now.study.file, study.file
+    keys: dict[str, Any] = {"sensor": name}
+    for table, names in (("characterisation", ("campaign", "map")), ("views", ("standoff_mm", "standoffs_mm"))):
+        old, new = getattr(before, table), getattr(after, table)
+        if gone := [key for key in names if getattr(old, key) is not None and getattr(new, key) is None]:
+            keys[table] = dict.fromkeys(gone)
+    return Change("sensor", words, keys, (view.number,), expected, changed.state, release=changed.release)
 
 
 def _in_best_directions(now: Shortfall, study: Study) -> Study:

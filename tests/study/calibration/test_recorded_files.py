@@ -104,6 +104,14 @@ def test_a_pose_that_is_there_twice_counts_once(tmp_path):
     assert found.left_out == ["10: the same as 2", "11: the same as 3", "12: the same as 4"]
 
 
+def test_corners_of_a_board_with_twice_as_many_are_refused(tmp_path):
+    """Before, every pose became two."""
+    np.savez(tmp_path / "c.npz", imgpoints=pixels_of(1)["left"], image_size=SIZE)
+    assert len(read_corners(tmp_path / "c.npz", BOARD).boards) == 10
+    with pytest.raises(InputError, match=r"\(10, 48, 2\); allowed: \(poses, 24, 2\)"):
+        read_corners(tmp_path / "c.npz", Board(9, 4, 20.0, "glass"))
+
+
 def test_corners_in_the_order_of_another_board_are_said(tmp_path):
     mixed = {
         name: each.reshape(-1, 6, 8, 2).transpose(0, 2, 1, 3).reshape(-1, 48, 2) for name, each in pixels_of(1).items()
@@ -125,14 +133,15 @@ def write_images(folder, name="{camera}-{pose:04d}.png"):
             cv2.imwrite(str(file), image)
 
 
-def test_images_of_ros_give_the_corners_of_the_board(tmp_path):
-    write_images(tmp_path)
+@pytest.mark.parametrize("name", ["{camera}-{pose:04d}.png", "{camera}/{camera}{pose:02d}.png", "{camera}/{pose}.png"])
+def test_images_of_ros_give_the_corners_of_the_board(tmp_path, name):
+    write_images(tmp_path, name)
     found = read_corners(tmp_path, BOARD)
     assert found.sizes == {"left": (640, 480), "right": (640, 480)} and len(found.boards) == 2
     for board in found.boards:  # the right image is the left one, shifted by 30 px along both axes
         np.testing.assert_allclose(board.pixels["right"] - board.pixels["left"], 30.0, atol=0.05)
     # the same images as a capture are recognised, whichever program reads them
-    pair = [str(tmp_path / f"{name}-0001.png") for name in ("left", "right")]
+    pair = [str(tmp_path / name.format(camera=camera, pose=1)) for camera in ("left", "right")]
     images = {path: cv2.imread(path, cv2.IMREAD_GRAYSCALE)[None] for path in pair}
     assert [board.images.images_sha256 == images_digest(images) for board in found.boards] == [False, True]
 

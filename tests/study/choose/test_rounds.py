@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from characterisation.files.errors import InputError
 from characterisation.statements.statement import statement
 from characterisation.statements.tolerance import plus_minus
 from mitsim.study import StatementTable
@@ -17,6 +18,7 @@ from mitsim.study.choose.sensor_result import SensorResult
 from mitsim.study.virtual.race import ALL
 from mitsim.study.virtual.stated import StatedView
 from tests.small_study import MEASUREMENTS, few_measurements, small_study
+from tests.smaller_sensors import coarse_sensor
 
 MOST = 96
 
@@ -118,3 +120,15 @@ def test_a_sensor_whose_share_ends_early_gets_a_few_trials(candidates, tmp_path,
     one.stated, one.session = {}, _Session(candidates[0], tmp_path, {0: 0.1, 1: 0.1}, leader=1)
     state_by_screening(one, 24, short, LIMIT)
     assert one.session.asked == [(0, 24), (0, 4)] and one.trials == 4
+
+
+def test_the_sensor_file_of_the_study_keeps_the_map_of_the_study(tmp_path, monkeypatch):
+    """Before, a path was compared as text: the map was dropped, and a name was taken relative to another folder."""
+    sensor = coarse_sensor("ensenso-n10", 3, tmp_path)
+    study = small_study("{ }", sensor.name) + '[characterisation]\nmap = "ensenso-n10"\n'
+    (tmp_path / "study.toml").write_text(study)
+    (opened,), excluded = read_candidates(tmp_path / "study.toml", [str(sensor)])
+    assert not excluded and opened.study.performance_map is not None
+    monkeypatch.chdir(tmp_path.parent)
+    with pytest.raises(InputError, match="no such file"):
+        read_candidates(tmp_path / "study.toml", [sensor.name])

@@ -19,12 +19,15 @@ from characterisation.statements.statement import Statement, statement
 from characterisation.statements.tolerance import plus_minus
 from characterisation.tasks.decision_table import Decision
 from mitsim.running.time_limit import TimeLimit
+from mitsim.study import Study
 from mitsim.study.remedies.bounds import EXPOSURE, Effect, can_fit, least_shares, least_uncertainty
 from mitsim.study.remedies.change import Change, Shortfall, changed_file
 from mitsim.study.remedies.changes import changes
 from mitsim.study.remedies.confirm import Remedies, find_remedies, of_missed, remedies_document
 from mitsim.study.remedies.entries import MissedEntry, RemediesEntry, UntriedChange, remedies_in_words
+from mitsim.study.remedies.sensors import _with_sensor
 from mitsim.study.tables import StudyFile
+from mitsim.views import View
 from tests.two_balls import TASK
 
 #: equally likely errors of a standard normal distribution
@@ -304,3 +307,15 @@ def test_more_than_four_measurements_that_fit_are_counted() -> None:
     )
     one = "(u 0.020 mm, before 0.80 mm)"
     assert line == f"with spray: a {one}, b {one}, c {one} and 3 more fit (40 virtual measurements)"
+
+
+def test_another_sensor_states_every_key_that_it_needs() -> None:
+    """Before, the sensor alone: with the first one's map and standoff that is another study, or an error."""
+    table = {"scene": "a.xml", "task": "t.toml", "sensor": "ensenso-n10"}
+    before = StudyFile.model_validate(table | {"characterisation": {"map": "own.nc"}, "views": {"standoff_mm": 500}})
+    after = StudyFile.model_validate(table | {"sensor": "zivid-2-m70", "views": {}})
+    now = cast(Shortfall, SimpleNamespace(study=SimpleNamespace(file=before), folder=None))
+    study, view = cast(Study, SimpleNamespace(file=after)), cast(View, SimpleNamespace(number=3))
+    keys = dict(_with_sensor(now, "zivid-2-m70", study, view, {}).keys)
+    assert keys == {"sensor": "zivid-2-m70", "characterisation": {"map": None}, "views": {"standoff_mm": None}}
+    assert changed_file(before, keys) == after
