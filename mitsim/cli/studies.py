@@ -73,8 +73,8 @@ def run(
     from mitsim.study.run_folder import read_run
 
     options.check_folder(output)
-    chosen = with_plan(open_study(study, ask=options.asking(yes)), plan)
     options.keep_finished(output, overwrite, "run.json")
+    chosen = with_plan(open_study(study, ask=options.asking(yes)), plan)
     report_doubts(chosen)
     workers = options.requested_workers(scheduler, processes)
     with ending_in_order():
@@ -128,13 +128,14 @@ def choose(
     from mitsim.study.scene_geometry import write_scene_geometry
 
     options.check_folder(output)
+    done = read_choice(output)
+    if done is not None and done.finished:
+        options.keep_finished(output, overwrite, CHOICE)
     candidates, excluded = read_candidates(
         study, [sensors], options.asking(yes, " (and likewise for every other sensor)")
     )
     candidates = [replace(candidate, study=with_plan(candidate.study, plan)) for candidate in candidates]
-    done = read_choice(output)
     if done is not None and done.finished:
-        options.keep_finished(output, overwrite, CHOICE)
         (output / CHOICE).unlink()
     report_doubts(candidates[0].study)
     for exclusion in excluded:

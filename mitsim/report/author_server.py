@@ -38,6 +38,8 @@ class AuthorServer:
     def __init__(self, folder: Path, names: dict[str, str], page: Page, check: Check, port: int = 0) -> None:
         self.folder, self.names, self.page, self.check = folder, names, page, check
         self.token, self.done, self.saved = secrets.token_urlsafe(24), False, 0
+        #: whether the study was made by this page, which proposes one but does not edit it
+        self._own_study = False
         owner = self
 
         class Handler(BaseHTTPRequestHandler):
@@ -118,6 +120,9 @@ class AuthorServer:
             self._check_texts(texts)
         except InputError as error:
             return 422, {"fault": str(error)}
+        study = self.names.get("study", "")
+        if study in texts and (self.folder / study).exists() and not self._own_study:
+            del texts[study]  # it was written since the page was loaded
         paths = {name: self.folder / name for name in texts}
         before = {name: path.read_bytes() if path.exists() else None for name, path in paths.items()}
         try:
@@ -130,6 +135,7 @@ class AuthorServer:
             if not isinstance(error, InputError):
                 raise
             return 422, {"fault": str(error)}
+        self._own_study |= study in texts
         self.saved += 1
         self.done = request.get("done") is True
         return 200, {"findings": findings, "written": sorted(texts)}

@@ -142,7 +142,7 @@ def _expected(study: Study, limits: dict[str, float], chosen: ViewSet) -> str:
 def pose_columns(scores: xr.Dataset) -> dict[str, np.ndarray]:
     """Return the columns of ``scores.csv`` that are not part of the talk's score."""
     poses = scores["world_from_sensor"].values
-    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)  # w >= 0
     names = ["uncertainty_rank", "predicted_uncertainty", "chance", "limit", "limiting_feature"]
     names += [name for name in ("final_rank", "measured_risk", "trials") if name in scores]
     out = {name: scores[name].values for name in names}

@@ -79,6 +79,19 @@ def test_files_that_are_refused_do_not_finish(closed):
     assert not thread.is_alive()
 
 
+def test_a_study_that_was_written_meanwhile_is_kept(tmp_path):
+    names = {"task": "task.toml", "study": "study.toml"}
+    proposed = 'scene = "a.xml"\ntask = "task.toml"\nsensor = "ensenso-n10"\n[views]\n'
+    server, other = AuthorServer(tmp_path, names, lambda token: token, list), proposed + "subdivisions = 2\n"
+    sent = json.dumps({"files": {"task": TASK, "study": proposed}}).encode()
+    with server._server:
+        (tmp_path / "study.toml").write_text(other)
+        assert server.save(sent)[1]["written"] == ["task.toml"]
+        assert (tmp_path / "study.toml").read_text() == other
+        (tmp_path / "study.toml").unlink()
+        assert server.save(sent)[1]["written"] == server.save(sent)[1]["written"] == ["study.toml", "task.toml"]
+
+
 @pytest.mark.parametrize("fault", [RuntimeError, KeyboardInterrupt, MemoryError])
 def test_files_are_restored_whatever_ends_their_check(tmp_path, fault):
     def check():
