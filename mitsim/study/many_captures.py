@@ -28,7 +28,6 @@ from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.capture.simulated.truth import encode_exr, true_images
 from mitsim.maps.campaign.orders import prepared_sensor
-from mitsim.maps.campaign.plan import sensor_checksum
 from mitsim.running.progress import track
 from mitsim.running.version import __version__
 from mitsim.scene.load import Scene, load_scene
@@ -37,6 +36,7 @@ from mitsim.scene.surface.scatter import Deviation
 from mitsim.scene.xml_check import named_digests
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.sensor import Sensor
+from mitsim.sensor.sensor_text import sensor_checksum
 from mitsim.sensor.transforms import Transform
 from mitsim.views import ViewsTable, candidate_views
 from mitsim.views.standoffs import chosen_standoffs

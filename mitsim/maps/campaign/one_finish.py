@@ -34,7 +34,6 @@ from mitsim.maps.campaign.plan import (
     Series,
     Shot,
     half_size,
-    sensor_checksum,
     view_axes,
 )
 from mitsim.maps.campaign.run import run_campaign
@@ -42,6 +41,7 @@ from mitsim.running.version import __version__
 from mitsim.scene.load import flat_coupon
 from mitsim.scene.materials import Finish
 from mitsim.sensor.sensor import Sensor
+from mitsim.sensor.sensor_text import sensor_checksum
 from mitsim.sensor.transforms import Transform
 
 #: increased if the plan below changes, so that cached maps are made again

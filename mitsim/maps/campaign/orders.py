@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mitsim.capture.simulated.render import simulated_sensor
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.campaign.acquire import Source, measured, simulated_source
@@ -23,6 +24,7 @@ from mitsim.maps.prediction import Predictor
 from mitsim.running.executor import Executor
 from mitsim.scene import backend
 from mitsim.sensor.sensor import Sensor
+from mitsim.sensor.sensor_text import once_for_sensor
 from mitsim.sensor.transforms import Transform
 
 _sample = lru_cache(maxsize=32)(load_sample)
@@ -91,7 +93,7 @@ class PreparedSensor:
     def simulated(self) -> SimulatedSensor:
         """Return the sensor on the device."""
         backend.activate(None)
-        return SimulatedSensor(self.sensor)
+        return simulated_sensor(self.sensor)
 
     @cached_property
     def predictor(self) -> Predictor:
@@ -99,13 +101,5 @@ class PreparedSensor:
         return Predictor.of_sensor(self.sensor, self.geometry)
 
 
-_prepared: dict[str, PreparedSensor] = {}
-
-
-def prepared_sensor(sensor: Sensor) -> PreparedSensor:
-    """Return the sensor of this process, prepared once."""
-    key = repr(sensor)
-    if key not in _prepared:
-        _prepared.clear()
-        _prepared[key] = PreparedSensor(sensor)
-    return _prepared[key]
+#: the sensor of this process, prepared once
+prepared_sensor = once_for_sensor(PreparedSensor)
