@@ -9,6 +9,7 @@ While one shot is decoded and measured, the next is rendered.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
@@ -20,6 +21,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from characterisation.coupon.patches import Coupon, measure_patches
+from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 from characterisation.region_of_interest import Roi
@@ -328,4 +330,5 @@ def _found_shot(folder: Path, campaign: Campaign) -> Shot:
         s for s in campaign.series if s.variant is None and s.distance == nominal and s.sample.label() == label
     )
     axis = campaign.sensor.rig.reference.sensor_from_camera.rotation[:, 2]
-    return Shot(series, view_axes(axis).T @ pose.rotation[:, 2], pose)
+    index = read_bounded(folder / "capture.json", "a complete capture folder")  # it has the digest of every other file
+    return Shot(series, view_axes(axis).T @ pose.rotation[:, 2], pose, hashlib.sha256(index).hexdigest())

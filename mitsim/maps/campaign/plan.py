@@ -138,11 +138,15 @@ class Series:
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One capture of a campaign: the coupon of a series with its ``normal`` (3,) in the view frame."""
+    """One capture of a campaign: the coupon of a series with its ``normal`` (3,) in the view frame.
+
+    ``found`` is the digest of a capture that exists already.
+    """
 
     series: Series
     normal: NDArray[np.float64]
     sensor_from_coupon: Transform
+    found: str | None = None
 
     @property
     def name(self) -> str:

@@ -17,6 +17,7 @@ from mitsim.maps.campaign.acquire import simulated_source
 from mitsim.maps.campaign.hold_out import (
     LARGEST_SIGMA_ERROR,
     MOST_REPEATS,
+    _map,
     compare,
     held_out_campaign,
     held_out_orders,
@@ -91,8 +92,21 @@ def test_an_order_gives_what_this_process_gives(n10, shipped):
     assert there.measured == here.measured and there.predicted == here.predicted
     assert there.measured_residuals.tobytes() == here.measured_residuals.tobytes()
     assert there.predicted_residuals.tobytes() == here.predicted_residuals.tobytes()
-    with pytest.raises(InputError, match="another map"):
+    with pytest.raises(InputError, match="another content"):
         hold_out_order(replace(order, digest="0"))
+
+
+def test_a_worker_reads_a_map_again_that_was_made_again(tmp_path, n10, shipped):
+    """The map of a campaign lies where the former one did; a worker of a cluster has read that."""
+    plan = held_out_campaign(MAPS, n10, shipped)
+    shots = held_out_shots(plan, 1, seed=3)[:1]
+    path = tmp_path / "map.nc"
+    shipped.save(path)
+    (before,) = held_out_orders(plan, shots, path, 1)
+    assert "again" not in _map(before.map_path, before.digest).data.attrs
+    PerformanceMap(shipped.data.assign_attrs(again="yes")).save(path)
+    (after,) = held_out_orders(plan, shots, path, 1)
+    assert _map(after.map_path, after.digest).data.attrs["again"] == "yes"
 
 
 def test_random_normals_reach_every_part_of_the_cap():
