@@ -20,7 +20,7 @@ from typing import TypeVar
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from characterisation.coupon.patches import Coupon, measure_patches
+from characterisation.coupon.patches import Coupon, measure_patches, outline
 from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
@@ -214,7 +214,8 @@ def coupon_cloud(capture: Capture, coupon: Coupon, geometry: Geometry, sensor: S
     measured : decodes and measures the patches
     """
     grid = geometry.grid
-    corners = np.nan_to_num(grid.project(coupon.corners()))  # NaN is behind the sensor
+    seen = outline(grid, coupon)
+    corners = np.nan_to_num(seen) if len(seen) else np.zeros((1, 2))
     low = np.clip(np.floor(corners.min(axis=0)).astype(int) - 2, 0, [grid.width - 1, grid.height - 1])
     high = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 3, low + 1, [grid.width, grid.height])
     return capture_cloud(capture, sensor.settings, geometry, Roi.between(*low, *high), sensor.imager)
