@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from characterisation.coupon.discs import disc_offsets
 from characterisation.coupon.metrics import density_fraction
+from characterisation.coupon.patch_table import overall
 from characterisation.coupon.patches import Coupon, measure_patches, patch_centres
 from characterisation.coupon.view_frame import in_view_frame, view_frame
 from characterisation.files.errors import InputError
@@ -260,6 +261,19 @@ def test_a_coupon_that_is_no_rectangle_is_refused(change):
     coupon = coupon_at([0, 0, 600], tilted(0, 0))
     with pytest.raises(InputError, match=r"measure_patches.*coupon"):
         measure_patches(ideal_cloud(coupon), replace(coupon, **change))
+
+
+def test_a_pooled_fraction_is_at_most_one():
+    """By a pitch that is too large every point is more than one, and where a reference has none there is no F."""
+    coupon = coupon_at([0, 0, 600], tilted(10, 0))
+    cloud = ideal_cloud(coupon)
+    wrong = measure_patches(cloud, coupon, angular_pitch=1.07 * GRID.angular_pitch)
+    assert (wrong["points"] / wrong["points_possible"]).mean() > 1.13
+    assert overall(wrong).fraction == 1.0
+    half = ideal_cloud(coupon)
+    half.points[:, : GRID.width // 2] = np.nan
+    pooled = overall(measure_patches(half, coupon, reference=half))
+    assert pooled.fraction == 1.0 and pooled.fraction_error < 0.01
 
 
 def test_overlapping_patches_say_how_much_each_is_worth(rng):
