@@ -102,10 +102,12 @@ def patch_centres(
     corners, middle = outline(grid, coupon), grid.project(coupon.centre)
     if not len(corners) or not (np.isfinite(corners).all() and np.isfinite(middle).all()):
         return np.empty((0, 2), np.int64)
-    image = np.array([[0, 0], [grid.width, grid.height]])
-    reach = min(np.abs(corners - middle).max(), np.abs(image - middle).max())
-    count = int(np.ceil(reach / step_px)) + 1
-    j, i = np.mgrid[-count * 2 : count * 2 + 1, -count : count + 1]
+    low, high = np.maximum(corners.min(axis=0), 0.0), np.minimum(corners.max(axis=0), [grid.width, grid.height])
+    if (low > high).any():
+        return np.empty((0, 2), np.int64)
+    spacing = step_px * np.array([1.0, np.sqrt(3) / 2])
+    first, last = np.floor((low - middle) / spacing) - 1, np.ceil((high - middle) / spacing) + 1
+    i, j = np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(first, last, strict=True)))
     lattice = np.stack([(i + 0.5 * (j % 2)) * step_px, j * step_px * np.sqrt(3) / 2], axis=-1).reshape(-1, 2)
     centres = np.rint(middle + lattice).astype(np.int64)
 
