@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
+from scipy.stats import binom
 
 from characterisation.features.fits import fit_surface
 from characterisation.features.pose_fit import fit_pose
 from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import Surface
-from characterisation.tasks.covariance import ExpectedPoints
+from characterisation.tasks.covariance import ExpectedPoints, expected_fit
 from characterisation.tasks.measurement_model import evaluate, measurement_model
 from characterisation.tasks.prediction import (
     ExpectedInput,
@@ -179,6 +180,15 @@ def test_a_hole_is_possible_where_its_edge_can_be_fitted(clouds, radius, fractio
     else:
         assert hole_fit.fit.chance == pytest.approx(chance, abs=1e-4)
     assert expected_measurement(task, "size", known).chance <= chance + 1e-4
+
+
+@pytest.mark.parametrize(("fraction", "minimum"), [(0.1, 75), (0.1, 65), (0.5, 340), (0.9, 640)])
+def test_the_chance_of_enough_points_is_that_of_random_losses(clouds, fraction, minimum) -> None:
+    """Of independent pixels, whose noise area is 1 / F, the number of points is binomial."""
+    face = seen("plane", clouds["plane"])
+    face = replace(face, fraction=fraction * face.fraction, area=face.area / fraction)
+    fit = expected_fit(TASK.features["plane"].nominal(), face, minimum)
+    assert fit.chance == pytest.approx(binom.sf(minimum - 1, 700, fraction), abs=0.03)
 
 
 def test_what_is_not_seen_makes_a_measurement_impossible(clouds) -> None:
