@@ -246,9 +246,9 @@ def measure_patches(
 
 
 def patch_residuals(cloud: PointCloud, coupon: Coupon, radius_px: float = 6.0, margin_px: float = 5.0) -> Floats:
-    """Return the residuals [mm] along V of the points of all patches from the planes of their patches.
+    """Return the residuals [mm] along V of the points of each patch from its plane: (patches, pixels of a disc).
 
-    The array is flat and excludes outliers.
+    They are NaN for outliers and pixels without a point.
 
     Parameters
     ----------
@@ -262,8 +262,7 @@ def patch_residuals(cloud: PointCloud, coupon: Coupon, radius_px: float = 6.0, m
     _check_sizes(coupon, radius_px, margin_px, None)
     pixels = _pixels(cloud, patch_centres(cloud.grid, coupon, radius_px, margin_px, 2 * radius_px), radius_px)
     points, true = _points_of(cloud, coupon, pixels)
-    residual = ray_noise_std(np.where(true[..., None], points, np.nan)).inlier_residual
-    return np.asarray(residual[np.isfinite(residual)])
+    return ray_noise_std(np.where(true[..., None], points, np.nan)).inlier_residual
 
 
 #: largest radius, margin and step [px]

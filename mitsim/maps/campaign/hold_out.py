@@ -260,8 +260,8 @@ def compared(
         math.acos(min(1.0, float(shot.normal[2]))),
         _pooled(measured, mapped_patches),
         _pooled(predicted, mapped_patches),
-        np.concatenate([residuals for _, residuals in measured]),
-        np.concatenate([residuals for _, residuals in predicted]),
+        _residuals(measured, mapped_patches),
+        _residuals(predicted, mapped_patches),
     )
 
 
@@ -321,7 +321,7 @@ def _digest(path: Path) -> str:
     return hashlib.sha256(read_bounded(path, "a map")).hexdigest()
 
 
-#: the patches of a cloud, and the residuals of its points [mm]
+#: the patches of a cloud, and the residuals of the points of each [mm]
 _Measured = tuple[xr.Dataset, NDArray[np.float64]]
 
 
@@ -331,6 +331,12 @@ def _measure(cloud: PointCloud, coupon: Coupon) -> _Measured:
 
 def _pooled(measurements: list[_Measured], patch_indices: NDArray[np.int64]) -> Overall:
     return overall(xr.concat([patches.isel(patch=patch_indices) for patches, _ in measurements], "patch"))
+
+
+def _residuals(measurements: list[_Measured], patch_indices: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the residuals of all points of the patches that are compared, one after another."""
+    chosen = np.concatenate([residuals[patch_indices].ravel() for _, residuals in measurements])
+    return np.asarray(chosen[np.isfinite(chosen)])
 
 
 def _known(patches: xr.Dataset, sample: Sample, performance_map: PerformanceMap) -> NDArray[np.bool_]:
