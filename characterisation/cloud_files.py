@@ -31,6 +31,9 @@ _BENT_PIXEL = np.dtype([("status", "u1"), ("ray_x", "<f4"), ("ray_y", "<f4")])
 _NAMES = {"<f4": "float", "<u2": "ushort", "<i2": "short", "|u1": "uchar"}
 _KEY = "mitsim"
 
+#: rows or columns that ``row`` and ``col`` can tell apart
+_MOST_LINES = 1 << 16
+
 #: largest file that is read [bytes]: 35 million points
 _LARGEST_CLOUD = 1 << 30
 
@@ -63,6 +66,8 @@ def write_cloud(cloud: PointCloud, path: str | Path, frame: WrittenFrame | None 
 
     Raises
     ------
+    InputError
+        If the grid has over 65536 rows or columns, or a status does not fit its point.
     OSError
         If the file cannot be written.
 
@@ -72,6 +77,10 @@ def write_cloud(cloud: PointCloud, path: str | Path, frame: WrittenFrame | None 
     >>> cloud = characterisation.read_cloud("cloud.ply")
     >>> characterisation.write_cloud(cloud, "copy.ply")
     """
+    if max(cloud.status.shape) > _MOST_LINES:
+        found = f"{cloud.grid.width} x {cloud.grid.height} px"
+        raise InputError(path, "grid", found, f"up to {_MOST_LINES} px each way, as cameras have")
+    _check_status(path, cloud)
     rows, columns = np.nonzero(cloud.valid)
     vertices = np.zeros(len(rows), _VERTEX)
     points = cloud.points[rows, columns].astype(np.float64)
@@ -194,4 +203,17 @@ def read_cloud(path: str | Path) -> PointCloud:
     points[rows, columns] = read
     feature[rows, columns], sigma[rows, columns] = vertices["feature"], vertices["sigma"]
     known_sigma = sigma if np.isfinite(sigma).any() else None
-    return PointCloud(points, status, grid, sensor, source, baseline, feature if labelled else None, names, known_sigma)
+    labels = feature if labelled else None
+    cloud = PointCloud(points, status, grid, sensor, source, baseline, labels, names, known_sigma)
+    _check_status(path, cloud)
+    return cloud
+
+
+def _check_status(path: str | Path, cloud: PointCloud) -> None:
+    """Check that pixels are valid exactly where they have a point."""
+    wrong = (cloud.status == Status.VALID) != cloud.valid
+    if wrong.any():
+        row, column = np.argwhere(wrong)[0]
+        status, word = Status(cloud.status[row, column]).name, "a" if cloud.valid[row, column] else "no"
+        where = f"status {status} and {word} point at row {row}, column {column}, {wrong.sum()} pixels in all"
+        raise InputError(path, "status", where, "VALID exactly where a pixel has a point")

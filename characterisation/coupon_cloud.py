@@ -147,7 +147,7 @@ def measure_coupon(
     >>> bool(pooled.fraction > 0.9), pooled.sigma < 2
     (True, True)
     """
-    cloud = points if isinstance(points, PointCloud) else _cloud_of(points, viewpoint, grid)
+    cloud = _given(points, viewpoint, grid) if isinstance(points, PointCloud) else _cloud_of(points, viewpoint, grid)
     roi = _checked_window(window, cloud.grid)
     part = _cropped(cloud, roi)
     if margin_px is None:
@@ -160,10 +160,23 @@ def measure_coupon(
     return patches if coupon is not None else patches.drop_vars(_OF_A_KNOWN_POSE)
 
 
+def _given(cloud: PointCloud, viewpoint: ArrayLike, grid: ViewGrid | None) -> PointCloud:
+    """Return a cloud, which has a viewpoint and a grid of its own."""
+    if grid is not None or np.any(np.asarray(viewpoint) != 0):
+        found = "a PointCloud, and a viewpoint or a grid"
+        raise InputError(
+            "patch_metrics", "viewpoint, grid", found, "a PointCloud alone: it has both", "or give its points"
+        )
+    return cloud
+
+
 def _cloud_of(points: ArrayLike, viewpoint: ArrayLike, grid: ViewGrid | None) -> PointCloud:
     """Make a cloud of an array of points, on a given grid or on a fitted pinhole."""
-    array, eye = np.asarray(points, float), np.asarray(viewpoint, float)
     where = "patch_metrics"
+    try:
+        array, eye = np.asarray(points, float), np.asarray(viewpoint, float)
+    except (TypeError, ValueError) as error:
+        raise InputError(where, "points, viewpoint", str(error), "arrays of numbers") from None
     if array.ndim != 3 or array.shape[2] != 3:
         hint = "F is the share of pixels that have a point"
         raise InputError(where, "points", f"an array {array.shape}", "(H, W, 3): one point per sensor pixel", hint)
@@ -171,6 +184,9 @@ def _cloud_of(points: ArrayLike, viewpoint: ArrayLike, grid: ViewGrid | None) ->
         raise InputError(where, "viewpoint", eye.tolist(), "three numbers [mm]")
     finite = np.isfinite(array).all(axis=-1)
     array = np.where(finite[..., None], array, np.nan)
+    if grid is not None and np.any(eye != 0) and not np.allclose(eye, grid.origin, rtol=0, atol=1e-3):
+        allowed = f"{grid.origin.tolist()}, the origin of the grid, or none"
+        raise InputError(where, "viewpoint", eye.tolist(), allowed)
     if grid is None:
         fitted = pinhole_of(array - eye)
         if fitted is None or fitted.rms > PINHOLE_RMS_PX:
@@ -198,11 +214,13 @@ def _checked_window(window: tuple[int, int, int, int] | None, grid: ViewGrid) ->
     """Return the checked window, or the whole grid without one."""
     if window is None:
         return Roi.whole(grid.width, grid.height)
-    roi = Roi(*(int(number) for number in window))
-    if not roi.fits(grid.width, grid.height):
-        allowed = f"(column, row, width, height) within {grid.width} x {grid.height} px"
-        raise InputError("patch_metrics", "window", tuple(window), allowed)
-    return roi
+    numbers = np.asarray(window)
+    if numbers.shape == (4,) and numbers.dtype.kind in "iu":
+        roi = Roi(*numbers.tolist())
+        if roi.fits(grid.width, grid.height):
+            return roi
+    allowed = f"(column, row, width, height), whole numbers, within {grid.width} x {grid.height} px"
+    raise InputError("patch_metrics", "window", numbers.tolist(), allowed)
 
 
 def _cropped(cloud: PointCloud, window: Roi) -> PointCloud:

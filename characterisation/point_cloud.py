@@ -81,6 +81,20 @@ class ViewGrid:
         """Angle [rad] between neighbouring pixels on the axis, lambda in the talk."""
         return float(1.0 / np.sqrt(self.fx * self.fy))
 
+    def same_rays(self, other: ViewGrid) -> bool:
+        """Return whether every pixel has the ray of the other grid, to a hundredth of a pixel and a micrometre."""
+        if (self.width, self.height) != (other.width, other.height):
+            return False
+        if np.abs(self.origin - other.origin).max() > 1e-3:
+            return False
+        rows, columns = np.arange(self.height), np.arange(self.width)
+        if self.normalised is None and other.normalised is None:  # the rays of pinholes differ most in the corners
+            rows, columns = rows[[0, -1]], columns[[0, -1]]
+        pixels = np.meshgrid(columns, rows)
+        rays, others = self.rays_at(*pixels), other.rays_at(*pixels)
+        near = np.linalg.norm(rays - others, axis=-1) < 0.01 * self.angular_pitch
+        return bool((near | (np.isnan(rays) & np.isnan(others)).all(axis=-1)).all())
+
     def thinned(self, step: int) -> ViewGrid:
         """Return the grid of every ``step``-th pixel and row, starting at ``step // 2``."""
         first = step // 2

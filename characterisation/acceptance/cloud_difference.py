@@ -67,7 +67,7 @@ def difference_along_rays(cloud: PointCloud, reference: PointCloud, window: Wind
     InputError
         If the grids are not the same.
     """
-    if not same_grid(cloud.grid, reference.grid):
+    if not cloud.grid.same_rays(reference.grid):
         allowed = f"the grid of the reference: {_described(reference.grid)}"
         hint = "or use the difference to the surface"
         raise InputError("difference along rays", "grid", _described(cloud.grid), allowed, hint)
@@ -143,17 +143,6 @@ def distribution(difference: Floats, points_given: int) -> Difference:
         float(low),
         float(high),
     )
-
-
-def same_grid(grid: ViewGrid, other: ViewGrid) -> bool:
-    """Return whether two grids have the same rays, to a hundredth of a pixel and a micrometre."""
-    if (grid.width, grid.height) != (other.width, other.height):
-        return False
-    if not np.allclose(grid.origin, other.origin, atol=1e-3):
-        return False
-    corners = np.array([0, grid.width - 1, 0, grid.width - 1]), np.array([0, 0, grid.height - 1, grid.height - 1])
-    apart = np.linalg.norm(grid.rays_at(*corners) - other.rays_at(*corners), axis=-1)
-    return bool((apart < 0.01 * grid.angular_pitch).all())
 
 
 class _Searched:

@@ -13,6 +13,8 @@ rejection makes the range one of quantiles, for which drawing with replacement i
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.polynomial.legendre import legvander
 from numpy.typing import ArrayLike
@@ -37,6 +39,8 @@ def flatness_uncertainty(points: ArrayLike, rejected_share: float = REJECTED_SHA
     It is NaN if fewer than :data:`LEAST_REJECTED` points are rejected.
     """
     finite = _finite(points)
+    if _rejected(finite, rejected_share) < LEAST_REJECTED:
+        return math.nan
     centred = finite - finite.mean(axis=0)
     axes = np.linalg.svd(centred, full_matrices=False)[2]
     return _range_uncertainty(centred @ axes[:2].T, plane_distances(finite), rejected_share)
@@ -48,6 +52,8 @@ def form_error_uncertainty(points: ArrayLike, centre: ArrayLike, rejected_share:
     It is conditional on the form that was read, and NaN if fewer than :data:`LEAST_REJECTED` points are rejected.
     """
     away = _finite(points) - np.asarray(centre, float)
+    if _rejected(away, rejected_share) < LEAST_REJECTED:
+        return math.nan
     radii = np.linalg.norm(away, axis=1)
     directions = away / radii[:, None]
     axes = np.linalg.svd(directions - directions.mean(axis=0), full_matrices=False)[2]
@@ -59,11 +65,13 @@ def _finite(points: ArrayLike) -> Floats:
     return np.asarray(array[np.isfinite(array).all(axis=1)])
 
 
+def _rejected(points: Floats, share: float) -> int:
+    return int(share * len(points))
+
+
 def _range_uncertainty(positions: Floats, deviations: Floats, rejected_share: float) -> float:
     """Return the standard deviation of the range of deviations (n,) at positions (n, 2) whose noise is drawn again."""
-    stay = len(deviations) - int(rejected_share * len(deviations))
-    if len(deviations) - stay < LEAST_REJECTED:
-        return float("nan")
+    stay = len(deviations) - _rejected(deviations, rejected_share)
     low, high = positions.min(axis=0), positions.max(axis=0)
     u, v = (2 * (positions - low) / np.maximum(high - low, 1e-12) - 1).T
     pairs = [(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]

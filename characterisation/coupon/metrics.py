@@ -47,7 +47,7 @@ class RayNoise:
     - ``sigma`` [mm]: standard deviation, NaN with fewer than 4 points.
     - ``standard_error`` [mm] of sigma, sigma / sqrt(2 (n - 3)), for independent noise.
     - ``robust`` [mm]: standard deviation from the median absolute deviation.
-    - ``outlier_share`` [1]: share of points beyond 5 robust standard deviations.
+    - ``outlier_share`` [1]: share of points beyond 5 robust standard deviations, and 5 steps of depths in steps.
     - ``inlier_sigma`` [mm]: standard deviation of a second fit without outliers.
     - ``count``: number of points.
     - ``normal`` (..., 3): normal of the fitted plane, toward the sensor.
@@ -94,7 +94,8 @@ def ray_noise_std(points: NDArray[np.floating]) -> RayNoise:
     enough = count > PLANE_PARAMETERS
     with np.errstate(divide="ignore", invalid="ignore"):
         robust = np.where(enough, _robust_sigma(residual, present), np.nan)
-        far = present & (np.abs(residual) > OUTLIER_SIGMAS * robust[:, None])
+        scale = np.maximum(robust, _depth_step(coordinates[:, 2], present))
+        far = present & (np.abs(residual) > OUTLIER_SIGMAS * scale[:, None])
         inlier_sigma, inlier_residual = sigma.copy(), residual
         again = far.any(-1)
         if again.any():
@@ -158,6 +159,17 @@ def _frame(axis: Floats) -> Floats:
     b = x * y * a
     first = np.stack([1.0 + sign * x**2 * a, sign * b, -sign * x], axis=-1)
     return np.stack([first, np.stack([b, sign + y**2 * a, -y], axis=-1), axis], axis=1)
+
+
+def _depth_step(depth: Floats, present: NDArray[np.bool_]) -> Floats:
+    """Return the step (p,) of depths (p, n) of which most are equal to another, inf for a single depth, 0 for others.
+
+    A median deviation of such depths is 0, or says nothing.
+    """
+    gaps = np.diff(np.sort(np.where(present, depth, np.inf), axis=-1))
+    between = (gaps > 0) & np.isfinite(gaps)
+    in_steps = 2 * (between.sum(-1) + 1) <= present.sum(-1)
+    return np.where(in_steps, np.min(gaps, axis=-1, where=between, initial=np.inf), 0.0)
 
 
 def _robust_sigma(residual: Floats, present: NDArray[np.bool_]) -> Floats:

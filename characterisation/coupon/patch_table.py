@@ -52,9 +52,10 @@ def overall(patches: xr.Dataset) -> Overall:
     count, possible = patches["points"].values.astype(float), patches["points_possible"].values.astype(float)
     if not possible.sum():
         return Overall(math.nan, math.nan, math.nan, math.nan)
-    fraction = count.sum() / possible.sum()
-    scatter = float(np.std(count / possible)) / math.sqrt(len(count))
-    fraction_error = max(scatter, math.sqrt(max(fraction * (1 - fraction), 0.0) / possible.sum()))
+    fraction = min(count.sum() / possible.sum(), 1.0)
+    some = possible > 0
+    scatter = float(np.std(count[some] / possible[some])) / math.sqrt(some.sum())
+    fraction_error = max(scatter, math.sqrt(fraction * (1 - fraction) / possible.sum()))
     sigma = patches["ray_noise_inliers"].values
     degrees = np.where((count - 3 >= LEAST_DEGREES) & np.isfinite(sigma), count - 3, 0.0)
     if not degrees.sum():

@@ -60,6 +60,23 @@ class Coupon:
         return np.stack([self.centre + a * half_w + b * half_h for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
 
 
+def outline(grid: ViewGrid, coupon: Coupon) -> Floats:
+    """Return the corners (k, 2) [px], in order, of the part of a coupon in front of the sensor; none if all is behind.
+
+    The part nearer than a thousandth of the farthest corner's depth is left out: it is outside any image.
+    """
+    corners = coupon.corners()
+    depth = (corners - grid.origin) @ grid.rotation[:, 2]
+    if (depth > 0).all():
+        return grid.project(corners)
+    before = depth - 1e-3 * max(float(depth.max()), 0.0)
+    kept = []
+    for here, there, a, b in zip(corners, np.roll(corners, -1, axis=0), before, np.roll(before, -1), strict=True):
+        kept += [here] if a > 0 else []
+        kept += [here + a / (a - b) * (there - here)] if a * b < 0 else []
+    return grid.project(np.array(kept)) if kept else np.empty((0, 2))
+
+
 def patch_centres(
     grid: ViewGrid, coupon: Coupon, radius_px: float, margin_px: float, step_px: float
 ) -> NDArray[np.int64]:
@@ -82,13 +99,15 @@ def patch_centres(
     --------
     measure_patches : measures the patches about these pixels
     """
-    corners = grid.project(coupon.corners())
-    middle = grid.project(coupon.centre)
-    if not np.isfinite(corners).all():
+    corners, middle = outline(grid, coupon), grid.project(coupon.centre)
+    if not len(corners) or not (np.isfinite(corners).all() and np.isfinite(middle).all()):
         return np.empty((0, 2), np.int64)
-    reach = np.abs(corners - middle).max()
-    count = int(np.ceil(reach / step_px)) + 1
-    j, i = np.mgrid[-count * 2 : count * 2 + 1, -count : count + 1]
+    low, high = np.maximum(corners.min(axis=0), 0.0), np.minimum(corners.max(axis=0), [grid.width, grid.height])
+    if (low > high).any():
+        return np.empty((0, 2), np.int64)
+    spacing = step_px * np.array([1.0, np.sqrt(3) / 2])
+    first, last = np.floor((low - middle) / spacing) - 1, np.ceil((high - middle) / spacing) + 1
+    i, j = np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(first, last, strict=True)))
     lattice = np.stack([(i + 0.5 * (j % 2)) * step_px, j * step_px * np.sqrt(3) / 2], axis=-1).reshape(-1, 2)
     centres = np.rint(middle + lattice).astype(np.int64)
 
@@ -156,14 +175,15 @@ def measure_patches(
     Raises
     ------
     InputError
-        If both ``angular_pitch`` and ``reference`` are given, ``reference`` has another grid, the disc or the step is
-        smaller than 1 px, or the pitch is not positive.
+        If both ``angular_pitch`` and ``reference`` are given, ``reference`` has another grid, the coupon is no
+        rectangle, or a size in pixels or the pitch is none.
 
     See Also
     --------
     patch_residuals : the residuals of the patches
     """
-    _check(cloud, radius_px, step_px, angular_pitch, reference)
+    _check_sizes(coupon, radius_px, margin_px, step_px)
+    _check_possible(cloud, angular_pitch, reference)
     centres = patch_centres(cloud.grid, coupon, radius_px, margin_px, step_px or 2 * radius_px)
     offsets = disc_offsets(radius_px)
     pixels = _pixels(cloud, centres, radius_px)
@@ -226,9 +246,9 @@ def measure_patches(
 
 
 def patch_residuals(cloud: PointCloud, coupon: Coupon, radius_px: float = 6.0, margin_px: float = 5.0) -> Floats:
-    """Return the residuals [mm] along V of the points of all patches from the planes of their patches.
+    """Return the residuals [mm] along V of the points of each patch from its plane: (patches, pixels of a disc).
 
-    The array is flat and excludes outliers.
+    They are NaN for outliers and pixels without a point.
 
     Parameters
     ----------
@@ -239,35 +259,48 @@ def patch_residuals(cloud: PointCloud, coupon: Coupon, radius_px: float = 6.0, m
     --------
     measure_patches : the metrics of the patches
     """
+    _check_sizes(coupon, radius_px, margin_px, None)
     pixels = _pixels(cloud, patch_centres(cloud.grid, coupon, radius_px, margin_px, 2 * radius_px), radius_px)
     points, true = _points_of(cloud, coupon, pixels)
-    residual = ray_noise_std(np.where(true[..., None], points, np.nan)).inlier_residual
-    return np.asarray(residual[np.isfinite(residual)])
+    return ray_noise_std(np.where(true[..., None], points, np.nan)).inlier_residual
 
 
-def _check(
-    cloud: PointCloud,
-    radius_px: float,
-    step_px: float | None,
-    angular_pitch: float | None,
-    reference: PointCloud | None,
-) -> None:
-    where = "measure_patches"
-    if not radius_px >= 1:
-        raise InputError(where, "radius_px", radius_px, "1 px or more", "6 px hold 113 points")
-    if step_px is not None and not step_px >= 1:
-        raise InputError(where, "step_px", step_px, "1 px or more", "twice radius_px keeps patches apart")
-    if angular_pitch is not None and not angular_pitch > 0:
-        raise InputError(where, "angular_pitch", angular_pitch, "a positive angle in rad")
+#: largest radius, margin and step [px]
+_MOST_PX = 10_000
+
+#: what measures patches, in messages
+_WHERE = "measure_patches"
+
+
+def _check_sizes(coupon: Coupon, radius_px: float, margin_px: float, step_px: float | None) -> None:
+    if not 1 <= radius_px <= _MOST_PX:
+        raise InputError(_WHERE, "radius_px", radius_px, f"1 to {_MOST_PX} px", "6 px hold 113 points")
+    if not 0 <= margin_px <= _MOST_PX:
+        raise InputError(_WHERE, "margin_px", margin_px, f"0 to {_MOST_PX} px", "5 px keep the background out")
+    if step_px is not None and not 1 <= step_px <= _MOST_PX:
+        raise InputError(_WHERE, "step_px", step_px, f"1 to {_MOST_PX} px", "twice radius_px keeps patches apart")
+    for name in ("width", "height"):
+        if not 0 < (size := getattr(coupon, name)) < np.inf:
+            raise InputError(_WHERE, f"coupon.{name}", size, "a length above 0 [mm]")
+    axes = np.stack([coupon.normal, coupon.across])
+    if not (np.abs(axes @ axes.T - np.eye(2)) < 1e-3).all():
+        raise InputError(_WHERE, "coupon", f"normal and across {axes.tolist()}", "perpendicular vectors of length 1")
+    if not np.isfinite(coupon.centre).all():
+        raise InputError(_WHERE, "coupon.centre", coupon.centre.tolist(), "three numbers [mm]")
+
+
+def _check_possible(cloud: PointCloud, angular_pitch: float | None, reference: PointCloud | None) -> None:
+    if angular_pitch is not None and not 0 < angular_pitch < np.inf:
+        raise InputError(_WHERE, "angular_pitch", angular_pitch, "a positive angle in rad")
     if reference is None:
         return
     if angular_pitch is not None:
         hint = "each gives the number of possible points"
-        raise InputError(where, "reference", "angular_pitch and reference", "only one of them", hint)
-    if reference.points.shape != cloud.points.shape:
-        found, allowed = (f"{s[1]} x {s[0]} px" for s in (reference.points.shape, cloud.points.shape))
+        raise InputError(_WHERE, "reference", "angular_pitch and reference", "only one of them", hint)
+    if not reference.grid.same_rays(cloud.grid):
+        found, allowed = (f"{grid.width} x {grid.height} px" for grid in (reference.grid, cloud.grid))
         hint = "capture the reference with the same settings of the sensor"
-        raise InputError(where, "reference", found, allowed, hint)
+        raise InputError(_WHERE, "reference", f"a grid of {found}", f"the grid of the cloud, {allowed}", hint)
 
 
 def _pixels(cloud: PointCloud, centres: NDArray[np.int64], radius_px: float) -> NDArray[np.int64]:

@@ -36,6 +36,7 @@ from characterisation.features.surfaces import (
     lengths,
     unit,
 )
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE
 
 Array = NDArray[np.float64]
@@ -132,7 +133,7 @@ def fit_cylinder(points: ArrayLike, initial: Cylinder, viewpoint: ArrayLike | No
     20.0
     """
     points = _usable(points, Cylinder)
-    initial = Cylinder(np.asarray(initial.point, float), unit(initial.axis), float(initial.radius))
+    initial = Cylinder(np.asarray(initial.point, float), _axis(initial), _radius(initial))
     cylinder, kept = _fit(initial.at_foot_of(points.mean(axis=0)), points, viewpoint)
     if not 1 / 3 < cylinder.radius / initial.radius < 3 or cylinder.axis @ initial.axis < np.cos(np.pi / 4):
         raise FitError(
@@ -159,9 +160,7 @@ def fit_cone(points: ArrayLike, initial: Cone, viewpoint: ArrayLike | None = Non
         the nominal one or above the middle between it and 90 deg, or with points about the apex.
     """
     points = _usable(points, Cone)
-    initial = Cone(
-        np.asarray(initial.point, float), unit(initial.axis), float(initial.radius), float(initial.half_angle)
-    )
+    initial = Cone(np.asarray(initial.point, float), _axis(initial), _radius(initial), float(initial.half_angle))
     cone, kept = _fit(initial.at_foot_of(points.mean(axis=0)), points, viewpoint)
     angles = (initial.half_angle / 3, (initial.half_angle + np.pi / 2) / 2)
     if not angles[0] < cone.half_angle < angles[1] or cone.axis @ initial.axis < np.cos(np.pi / 4):
@@ -289,6 +288,21 @@ def _not_false(points: Array, nominal: Surface, viewpoint: Array) -> NDArray[np.
     rays = np.divide(away, distance[:, None], out=np.zeros_like(away), where=distance[:, None] > 0)
     residual, _ = distances(nominal, points, rays)
     return np.asarray(np.abs(residual) <= FALSE_SHARE_OF_DISTANCE * (distance - residual))
+
+
+def _axis(initial: Cylinder | Cone) -> Array:
+    """Return the checked axis of a nominal surface, as a unit vector."""
+    axis = np.asarray(initial.axis, float)
+    if axis.shape != (3,) or not 0 < np.linalg.norm(axis) < np.inf:
+        raise InputError(f"fit_{initial.kind}", "initial.axis", axis.tolist(), "three numbers that are not all 0")
+    return unit(axis)
+
+
+def _radius(initial: Cylinder | Cone) -> float:
+    """Return the checked radius of a nominal surface."""
+    if not 0 < initial.radius < np.inf:
+        raise InputError(f"fit_{initial.kind}", "initial.radius", initial.radius, "a number above 0 [mm]")
+    return float(initial.radius)
 
 
 Shape = TypeVar("Shape", Plane, Cylinder, Sphere, Cone)

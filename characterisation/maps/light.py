@@ -29,8 +29,11 @@ if TYPE_CHECKING:
 #: renderer's laws for a well-known finish
 SAME = 0.01
 
-#: the same near 0, as a difference [1]
+#: the same of shares of light near 0, as a difference [1]. Widths and heights near 0 are of narrow lobes, which differ
 SAME_NEAR_ZERO = 0.002
+
+#: numbers that are shares of light
+_SHARES = ("reflectance", "wide_angle", "beckmann")
 
 
 @dataclass(frozen=True)
@@ -114,22 +117,21 @@ SCHEMA = {
 
 def same_light(light: Light, other: Light) -> bool:
     """Return whether two surfaces have equal optical properties, within :data:`SAME`."""
-    return light.kind == other.kind and all(
-        _near(a, b, b) for a, b in zip(light.numbers(), other.numbers(), strict=True)
-    )
+    return lies_between(light, other, other)
 
 
 def lies_between(light: Light, low: Light, high: Light) -> bool:
     """Return whether each number of a surface lies between those of two others, within :data:`SAME`."""
     return light.kind == low.kind == high.kind and all(
-        _near(number, *ends) for number, *ends in zip(light.numbers(), low.numbers(), high.numbers(), strict=True)
+        _near(name, *(getattr(one, name) for one in (light, low, high))) for name in NUMBERS
     )
 
 
-def _near(number: float, *ends: float) -> bool:
+def _near(name: str, number: float, *ends: float) -> bool:
     if math.isnan(number):
         return all(math.isnan(end) for end in ends)
-    slack = max(SAME * abs(number), SAME_NEAR_ZERO * (abs(number) < SAME_NEAR_ZERO / SAME))
+    near_zero = name in _SHARES and abs(number) < SAME_NEAR_ZERO / SAME
+    slack = SAME_NEAR_ZERO if near_zero else SAME * abs(number)
     return min(ends) - slack <= number <= max(ends) + slack
 
 

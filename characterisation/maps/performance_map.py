@@ -58,6 +58,9 @@ VALUE_BITS = 10
 #: bits of the mantissa of errors that a compact file keeps: relative errors of at most 2^-6
 ERROR_BITS = 5
 
+#: largest difference from 1 of the length of a normal
+UNIT_TOLERANCE = 1e-3
+
 _NODES = ("sample", "distance", "b", "a")
 
 _ROUNDED_FINELY = (*FIELDS[:2], *(LAY_FIELDS[name] for name in FIELDS[:2]))
@@ -156,9 +159,9 @@ class PerformanceMap:
         roughness
             Its Ra [um]; ignored for a finish without Ra.
         distance
-            |V| (n,) [mm], from the reference camera to the point.
+            |V| (n,) [mm], from the reference camera to the point; one for all normals, or one for each.
         normals
-            Unit N (n, 3) in the view frame: z from the point to the camera, x along the baseline.
+            Unit N (n, 3) in the view frame: z from the point to the camera, x along the baseline; or one (3,) for all.
         light
             Optical properties of the surface, see :meth:`~characterisation.maps.samples.Samples.representing`.
         tangents
@@ -168,14 +171,13 @@ class PerformanceMap:
         Raises
         ------
         InputError
-            If the surface was not characterised.
+            If the surface was not characterised, or normals are no unit vectors, or not as many as distances.
 
         See Also
         --------
         plot : a picture of F and sigma
         """
-        normals = np.asarray(normals)
-        distance = np.broadcast_to(np.asarray(distance, float), normals.shape[:-1])
+        distance, normals = _matched(np.asarray(distance, float), np.asarray(normals))
         surface, flat = self.surface(finish, roughness, light), normals.reshape(-1, 3)
         if tangents is None or not surface.directions:
             answer = surface.look_up(distance.ravel(), flat)
@@ -345,6 +347,22 @@ class PerformanceMap:
             raise InputError(path, "schema_version", repr(version), str(SCHEMA_VERSION), hint)
         _check_axes(path, data)
         return PerformanceMap(data)
+
+
+def _matched(distance: Floats, normals: NDArray[np.floating]) -> tuple[Floats, NDArray[np.floating]]:
+    """Return checked distances and normals of a query, one of each for every element."""
+    if normals.shape[-1:] != (3,):
+        raise InputError("query", "normals", f"an array {normals.shape}", "(n, 3), or one (3,)")
+    try:
+        shape = np.broadcast_shapes(distance.shape, normals.shape[:-1])
+    except ValueError:
+        found, allowed = f"{normals.shape[:-1]} normals and {distance.shape} distances", "one of each, or as many"
+        raise InputError("query", "distance", found, allowed) from None
+    off = np.abs(np.einsum("...k,...k->...", normals, normals) - 1) > 2 * UNIT_TOLERANCE
+    if off.any():
+        found, allowed = f"{normals[off][0].tolist()}, and {off.sum() - 1} more", "vectors of length 1"
+        raise InputError("query", "normals", found, allowed, "divide them by their length")
+    return np.broadcast_to(distance, shape), np.broadcast_to(normals, (*shape, 3))
 
 
 def _check_axes(path: Path, data: xr.Dataset) -> None:

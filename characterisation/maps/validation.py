@@ -22,6 +22,7 @@ from scipy.stats import wasserstein_distance
 
 from characterisation.coupon.patch_table import Overall
 from characterisation.files.arrays import Floats
+from characterisation.files.errors import InputError
 
 #: limit of the mean absolute residual of F [1], per sample and distance
 FRACTION_LIMIT = 0.05
@@ -72,6 +73,8 @@ def residual_table(pairs: Sequence[Pair]) -> xr.Dataset:
         ``wasserstein``, distance between the distributions of the residuals along V, in units of the measured sigma;
         ``unknown``, captures without a value in the map.
     """
+    if not pairs:
+        raise InputError("residual_table", "pairs", "none", "at least one")
     keys = list(dict.fromkeys((pair.finish, str(pair.roughness), pair.distance) for pair in pairs))
     rows = []
     for key in keys:
@@ -97,13 +100,13 @@ def _row(pairs: Sequence[Pair]) -> dict[str, float]:
     fraction_error = np.array(
         [math.hypot(pair.measured.fraction_error, pair.predicted.fraction_error) for pair in valued_pairs]
     )
-    both = [p for p in valued_pairs if math.isfinite(p.predicted.sigma) and math.isfinite(p.measured.sigma)]
+    both = [p for p in valued_pairs if _has_sigma(p.predicted) and _has_sigma(p.measured)]
     sigma = np.array([p.predicted.sigma / p.measured.sigma - 1 for p in both])
     sigma_error = np.array(
         [math.hypot(*(overall.sigma_error / overall.sigma for overall in (p.measured, p.predicted))) for p in both]
     )
     points = np.array([p.measured.fraction for p in both])
-    one_sided = [p for p in valued_pairs if math.isfinite(p.predicted.sigma) != math.isfinite(p.measured.sigma)]
+    one_sided = [p for p in valued_pairs if _has_sigma(p.predicted) != _has_sigma(p.measured)]
     return {
         "captures": len(valued_pairs),
         "fraction_residual": _mean(np.abs(fraction)),
@@ -118,6 +121,11 @@ def _row(pairs: Sequence[Pair]) -> dict[str, float]:
         "wasserstein": _wasserstein(both),
         "unknown": len(pairs) - len(valued_pairs),
     }
+
+
+def _has_sigma(overall: Overall) -> bool:
+    """Return whether sigma is known; 0, of points of one depth in steps, says nothing."""
+    return math.isfinite(overall.sigma) and overall.sigma > 0
 
 
 def _mean(values: Floats, weights: Floats | None = None) -> float:

@@ -19,7 +19,7 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from characterisation.features.surfaces import unit
 from characterisation.files.arrays import Floats
@@ -86,6 +86,13 @@ class Stage(Document):
 
     axes: Annotated[list[StageAxis], Field(min_length=1, max_length=3)]
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
+
+    @field_validator("normal")
+    @classmethod
+    def _not_zero(cls, normal: tuple[float, float, float]) -> tuple[float, float, float]:
+        if np.linalg.norm(normal) < 1e-9:
+            raise ValueError("a direction that is not zero")
+        return normal
 
     def normals(self, angles: ArrayLike) -> Floats:
         """Return the normals (n, 3) of the coupon at angles (n, axes) [rad]."""

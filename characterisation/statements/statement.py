@@ -83,7 +83,7 @@ class Statement:
     numerical_tolerance
         delta of JCGM 101, 7.9.2 for one significant digit of the standard uncertainty.
     settled
-        Whether twice every one of ``moved`` is below ``numerical_tolerance``.
+        Whether twice every one of ``moved`` is at most ``numerical_tolerance``.
     repeatability
         Standard deviation between captures of one day, from days with several; NaN without any.
     budget
@@ -307,7 +307,7 @@ def statement(
         interval_corrected=(low - bias, high - bias),
         moved=(float(moved[0]), float(moved[1]), float(moved[2]), float(moved[3])),
         numerical_tolerance=delta,
-        settled=bool((2 * moved < delta).all()),
+        settled=bool((2 * moved <= delta).all()),
         repeatability=repeatability,
         budget=budget,
         tolerance=None if tolerance is None else tolerance.size,

@@ -27,8 +27,8 @@ vectors, so that they add up or cancel in a measurement of several features.
 The prediction does not include the effects of edges and of blocks across them, which a map of flat coupons does not
 contain. Nor does it include the rejection of distant points by a robust fit.
 
-The number of points has the mean n = sum F and the variance A_n sum F (1 - F) + [sum u(F)]^2. Losses come in patches,
-with A_n assumed equal to the mean noise area, and an error of the map is common to all points.
+The number of points has the mean n = sum F and the variance sum A_n F (1 - F) + [sum u(F)]^2. Losses come in patches,
+with A_n assumed equal to A + 1 - 1 / F, at least 1: 1 for independent pixels. An error of the map is common to all.
 """
 
 from __future__ import annotations
@@ -323,7 +323,8 @@ def _chance(expected: ExpectedPoints, minimum: float) -> float:
     """Return the probability that at least ``minimum`` points are recovered, with a normal number of points."""
     fraction, thinning = expected.fraction, expected.thinning
     count = float(fraction.sum() * thinning)
-    losses = float((fraction * (1 - fraction) * np.maximum(expected.area, 1.0)).sum() * thinning)
+    clumps = np.maximum(expected.area + 1 - 1 / fraction, 1.0)  # random losses alone make the noise area 1 / F
+    losses = float((fraction * (1 - fraction) * clumps).sum() * thinning)
     spread = math.sqrt(losses + float(np.nan_to_num(expected.fraction_error).sum() * thinning) ** 2)
     if spread == 0:
         return float(count >= minimum)

@@ -17,7 +17,9 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
+from scipy.special import ndtr
 
+from characterisation.features.edges import LEAST_CROSSINGS, LEAST_FRACTION
 from characterisation.features.figures import Circle, EdgePoint, crossings, edge_covariance
 from characterisation.features.fitted import with_covariance
 from characterisation.features.form import Form, form_modes
@@ -114,7 +116,10 @@ def _pose(
 
 
 def _figure(name: str, task: Task, expected: Mapping[str, ExpectedPoints]) -> ExpectedInput:
-    """Predict a circle or the point of an edge in a face; the only error of the edge is that of sampling by pixels."""
+    """Predict a circle or the point of an edge in a face; the only error of the edge is that of sampling by pixels.
+
+    It is possible with enough crossings, and with the probability that enough of the face beside it is recovered.
+    """
     feature = task.features[name]
     (plane,) = feature.of or ("",)
     around = usable(task.features[plane].nominal(), expected[plane])
@@ -130,9 +135,13 @@ def _figure(name: str, task: Task, expected: Mapping[str, ExpectedPoints]) -> Ex
     reach = float(feature.reach_mm or math.nan)
     length = 2 * math.pi * figure.radius if isinstance(figure, Circle) else 2 * reach
     count, fraction = crossings(length, pitch), float(around.fraction[near])
+    if count < LEAST_CROSSINGS:
+        raise FitError(f"{count:.0f} crossings of the edge are expected, at least {LEAST_CROSSINGS} are required")
     covariance = edge_covariance(figure, pitch, count, fraction, reach)
     nothing = np.zeros((len(covariance), 1 + (0 if around.shared is None else around.shared.shape[1])))
-    fit = ExpectedFit(covariance, nothing, count * fraction, 1.0, position, pitch)
+    doubt = float(np.nan_to_num(around.fraction_error[near]))
+    chance = float(ndtr((fraction - LEAST_FRACTION) / doubt)) if doubt > 0 else float(fraction >= LEAST_FRACTION)
+    fit = ExpectedFit(covariance, nothing, count * fraction, chance, position, pitch)
     return ExpectedInput(fit, with_covariance(figure, covariance))
 
 

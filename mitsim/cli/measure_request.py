@@ -20,7 +20,6 @@ from characterisation.acceptance.cloud_difference import (
     difference_along_rays,
     difference_to_surface,
     distribution,
-    same_grid,
 )
 from characterisation.files.documents import checked_name
 from characterisation.files.errors import InputError
@@ -98,7 +97,7 @@ class Request:
     def _difference(self, input_cloud: InputCloud, reference: InputCloud) -> NDArray[np.float64]:
         """Return the difference (H, W) [mm] of a cloud from the reference, NaN outside the window."""
         cloud, other = input_cloud.cloud, reference.cloud
-        rays = self.by == "rays" or (self.by == "auto" and same_grid(cloud.grid, other.grid))
+        rays = self.by == "rays" or (self.by == "auto" and cloud.grid.same_rays(other.grid))
         inside = window_slices(self.window, cloud, "difference")
         out = np.full(cloud.status.shape, np.nan)
         if rays:

@@ -101,7 +101,7 @@ def render(
     assert position is not None
 
     from mitsim.capture.folder import check_free, read_capture, write_capture
-    from mitsim.capture.simulated.render import load_scene, prepared_sensor
+    from mitsim.capture.simulated.render import load_scene, simulated_sensor
     from mitsim.capture.simulated.render import render as render_capture
     from mitsim.capture.simulated.render_residual import advice, checked_rendering
     from mitsim.capture.simulated.rendering import Rendering
@@ -124,7 +124,7 @@ def render(
     capture = render_capture(
         loaded, chosen, pose, seed=seed, samples=samples, depth=depth, smoothing_px=smoothing, noise=noise, check=False
     )
-    simulated = prepared_sensor(chosen)
+    simulated = simulated_sensor(chosen)
     residual, unseen = checked_rendering(capture, simulated, loaded, pose, rendering, seed)
     capture.settings["deviation"] = asdict(moved)
     capture.settings["render"] = {"digest": digest}

@@ -22,11 +22,13 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 from scipy import stats
 
 from characterisation.coupon.patches import Coupon, measure_patches
 from characterisation.features.fits import fit_plane, fit_sphere
+from characterisation.features.robust_fit import FitError
 from characterisation.files.arrays import Floats
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, PointCloud
 from mitsim.capture.capture import Capture
@@ -68,6 +70,9 @@ AZIMUTH_DEG = 45.0
 
 #: largest angle between normal and view ray on a ball; points beyond it belong to the limb and bias the radius
 _EDGE_DEG = 60.0
+
+#: fewest points of a plate or ball that are measured, less one
+_LEAST_POINTS = 100
 
 #: excluded border of a plate, as a fraction of its size
 _BORDER = 0.1
@@ -217,12 +222,12 @@ class _SimulatedTargets:
         cloud, coupon = self._plate("matt white", distance, tilt_deg, Noise.none())
         points, view, _ = _on_plate(cloud, coupon)
         off = np.linalg.norm(points, axis=1) - _to_plane(coupon.centre - cloud.grid.origin, coupon.normal, view)
-        patches = measure_patches(cloud, coupon)
+        known = len(points) > _LEAST_POINTS
         return PlaneFloor(
             tilt_deg,
-            float(off.mean()),
+            float(off.mean()) if known else math.nan,
             float(_about_plane(points, view).std()),
-            float(patches.recovered_fraction.mean()),
+            _mean_fraction(measure_patches(cloud, coupon)),
         )
 
     def ball(self, distance: float, radius: float) -> float:
@@ -237,9 +242,12 @@ class _SimulatedTargets:
         near = np.abs(np.linalg.norm(out, axis=1) - radius) < 0.1 * radius
         facing = -(out * view).sum(axis=1) / np.maximum(np.linalg.norm(out, axis=1), 1e-9)
         kept = near & (facing > math.cos(math.radians(_EDGE_DEG)))
-        if kept.sum() < 100:
+        try:
+            return (
+                float(fit_sphere(points[kept], np.zeros(3)).radius - radius) if kept.sum() > _LEAST_POINTS else math.nan
+            )
+        except FitError:
             return math.nan
-        return float(fit_sphere(points[kept], np.zeros(3)).radius - radius)
 
     def recovery(self, finish: str, distance: float, tilt_deg: float) -> Recovery:
         cloud, coupon = self._plate(finish, float(distance), tilt_deg, Noise())
@@ -247,14 +255,13 @@ class _SimulatedTargets:
         sigma = patches.ray_noise_inliers.values
         finite = sigma[np.isfinite(sigma)]
         points, view, _ = _on_plate(cloud, coupon)
-        spread = float(_about_plane(points, view).std()) if len(points) > 100 else math.nan
         return Recovery(
             finish,
             float(distance),
             tilt_deg,
-            float(patches.recovered_fraction.mean()),
+            _mean_fraction(patches),
             float(np.median(finite)) if len(finite) else math.nan,
-            spread,
+            float(_about_plane(points, view).std()),
         )
 
     def residuals(self, distance: float) -> Residuals:
@@ -263,6 +270,8 @@ class _SimulatedTargets:
         values = _about_plane(points, view)
         image = np.full(cloud.status.shape, np.nan)
         image.flat[np.flatnonzero(cloud.valid)[inner]] = values
+        if not np.isfinite(values).any():
+            return Residuals(distance, values, math.nan, 0, math.nan, math.nan, math.nan, image)
         length = correlation_length(image)
         step = max(1, math.ceil(2 * length))
         apart = image[::step, ::step]
@@ -297,7 +306,7 @@ class _SimulatedTargets:
         )
 
     def decoded(self, capture: Capture) -> PointCloud:
-        return capture_cloud(capture, self.sensor.settings, self.geometry, imager=self.sensor.imager)
+        return capture_cloud(capture, self.sensor.settings, self.geometry, imager=capture.decoding.imager)
 
 
 def correlation_length(image: Floats) -> float:
@@ -314,6 +323,10 @@ def correlation_length(image: Floats) -> float:
             return lag - 1 + (before - math.exp(-1)) / (before - here)
         before = here
     return 64.0
+
+
+def _mean_fraction(patches: xr.Dataset) -> float:
+    return float(patches.recovered_fraction.mean()) if patches.sizes["patch"] else math.nan
 
 
 def _seen(cloud: PointCloud) -> tuple[Floats, Floats]:
@@ -340,6 +353,11 @@ def _to_plane(centre: Floats, normal: Floats, view: Floats) -> Floats:
 
 
 def _about_plane(points: Floats, view: Floats) -> Floats:
-    """Return the signed residuals along the rays about the best-fit plane [mm]."""
-    plane = fit_plane(points, np.zeros(3))
+    """Return the signed residuals along the rays about the best-fit plane [mm], one NaN where points determine none."""
+    try:
+        plane = fit_plane(points, np.zeros(3)) if len(points) > _LEAST_POINTS else None
+    except FitError:
+        plane = None
+    if plane is None:
+        return np.array([math.nan])
     return np.asarray(np.linalg.norm(points, axis=1) - _to_plane(plane.point, plane.normal, view))

@@ -68,7 +68,7 @@ def residual_figure(sheets: Sequence[DataSheet]) -> Figure:
         for sheet, axes in zip(sheets, panels, strict=False):
             residuals = sheet.residuals
             spread = float(residuals.values.std())
-            if not len(residuals.values) or spread == 0:
+            if not spread > 0:
                 continue
             reach = 4.5 * spread
             axes.hist(
@@ -199,7 +199,7 @@ def _ratios(sheet: DataSheet) -> str:
 
 
 def _fractions(points: Sequence[Recovery]) -> str:
-    return ", ".join(f"{p.fraction:.2f}" for p in points)
+    return ", ".join("-" if math.isnan(p.fraction) else f"{p.fraction:.2f}" for p in points)
 
 
 def _mm(value: float) -> str:

@@ -25,7 +25,7 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from characterisation.files.errors import MissingEnvironmentError
+from characterisation.files.errors import InputError, MissingEnvironmentError
 from characterisation.files.threads import keep_blas_to_one_thread, usable_cores
 from mitsim.running.progress import say, track
 
@@ -238,6 +238,19 @@ def _start_worker(threads: int, parent: int) -> None:
         raise SystemExit(0)
     os.environ["OMP_NUM_THREADS"] = str(threads)
     keep_blas_to_one_thread()
+
+
+def check_same_file(path: str | Path, digest: str, ordered: str) -> None:
+    """Check that a worker reads the file that the command did, by their digests.
+
+    Raises
+    ------
+    InputError
+        If the file is another one, or has changed since.
+    """
+    if digest != ordered:
+        found, allowed = "another content than when the command read it", "the same file on every machine, unchanged"
+        raise InputError(path, "", found, allowed)
 
 
 def results_of(

@@ -12,7 +12,6 @@ import json
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,7 +27,7 @@ from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.capture.simulated.truth import encode_exr, true_images
 from mitsim.maps.campaign.orders import prepared_sensor
-from mitsim.maps.campaign.plan import sensor_checksum
+from mitsim.running.executor import check_same_file
 from mitsim.running.progress import track
 from mitsim.running.version import __version__
 from mitsim.scene.load import Scene, load_scene
@@ -37,6 +36,7 @@ from mitsim.scene.surface.scatter import Deviation
 from mitsim.scene.xml_check import named_digests
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.sensor import Sensor
+from mitsim.sensor.sensor_text import sensor_checksum
 from mitsim.sensor.transforms import Transform
 from mitsim.views import ViewsTable, candidate_views
 from mitsim.views.standoffs import chosen_standoffs
@@ -216,7 +216,7 @@ def _taken(job: CaptureJob, simulated: SimulatedSensor) -> dict[str, bytes]:
     """Return the files of a capture's folder, on request with the truth of its cameras as OpenEXR."""
     settings, pose, parameters = job.settings, job.world_from_sensor, dict(sorted(job.settings.parameters.items()))
     seed, samples, deviation = settings.seed, settings.samples, Deviation.parse(settings.deviation)
-    scene = _scene(job.scene, job.sensor.wavelength_nm, tuple(parameters.items()), deviation)
+    scene = _scene(job, parameters, deviation)
     rendering = Rendering.smoothed(samples, settings.depth, settings.smoothing_px)
     capture = simulated.capture(scene, pose, seed=seed, rendering=rendering, noise=settings.noise)
     capture.settings["deviation"] = asdict(deviation)
@@ -229,9 +229,18 @@ def _taken(job: CaptureJob, simulated: SimulatedSensor) -> dict[str, bytes]:
     return packed(capture, job.folder, truth=truth)
 
 
-@lru_cache(maxsize=1)  # jobs come finish by finish, and materials of scenes that are kept are part of every kernel
-def _scene(path: str, wavelength_nm: float, parameters: tuple[tuple[str, str], ...], deviation: Deviation) -> Scene:
-    return load_scene(path, wavelength_nm, dict(parameters), deviation)
+#: the last scene: jobs come finish by finish, and materials of scenes that are kept are part of every kernel
+_scenes: dict[tuple[str, ...], Scene] = {}
+
+
+def _scene(job: CaptureJob, parameters: dict[str, str], deviation: Deviation) -> Scene:
+    """Return the scene of a job; it is kept while the files that it was made from are those of the next job."""
+    key = (job.scene, job.origin, repr(parameters), repr(deviation))
+    if key not in _scenes:
+        check_same_file(job.scene, origin_of(Path(job.scene), job.sensor, parameters), job.origin)
+        _scenes.clear()
+        _scenes[key] = load_scene(job.scene, job.sensor.wavelength_nm, parameters, deviation)
+    return _scenes[key]
 
 
 def origin_of(scene: Path, sensor: Sensor, parameters: Mapping[str, str]) -> str:

@@ -28,7 +28,7 @@ from mitsim.maps.campaign.missing_finishes import (
     seen_finishes,
     unknown_finishes,
 )
-from mitsim.maps.campaign.plan import Campaign, check_exposure, read_campaign, sensor_checksum
+from mitsim.maps.campaign.plan import Campaign, check_exposure, read_campaign
 from mitsim.running.progress import say
 from mitsim.scene.authoring.check_task import report_geometry
 from mitsim.scene.load import Scene, load_scene
@@ -37,6 +37,7 @@ from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.scene.surface.lay import lays_in_words
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.sensor import Sensor
+from mitsim.sensor.sensor_text import sensor_checksum
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
 from mitsim.study.screened_errors import needed_by_tolerance
 from mitsim.study.tables import CharacterisationTable, ExposureTable, StudyFile

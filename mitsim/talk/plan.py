@@ -21,9 +21,10 @@ from pydantic import BaseModel
 from characterisation.files.checked_files import read_bounded
 from characterisation.files.documents import read_toml
 from characterisation.maps.shipped import map_path
-from mitsim.maps.campaign.plan import CampaignFile, sensor_checksum
+from mitsim.maps.campaign.plan import CampaignFile
 from mitsim.scene import backend
 from mitsim.scene.xml_check import named_digests
+from mitsim.sensor.sensor_text import sensor_checksum
 from mitsim.talk import coupon_pieces, noise_pieces, opening_pieces, pictured, view_pieces
 from mitsim.talk.coupon_pieces import CouponPlace
 from mitsim.talk.results import VERSION

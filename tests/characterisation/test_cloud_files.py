@@ -40,6 +40,30 @@ def test_round_trip(tmp_path, labelled, sigma):
     assert [p.name for p in tmp_path.iterdir()] == ["cloud.ply"]
 
 
+def test_a_grid_that_is_too_wide_for_the_format_is_refused(tmp_path):
+    """Columns have 16 bits: point 65536 would come back as point 0."""
+    count = 65537
+    points = np.tile(np.array([0, 0, 500], np.float32), (1, count, 1))
+    grid = ViewGrid(1e5, 1e5, 0.0, 0.0, count, 1)
+    cloud = PointCloud(points, np.full((1, count), Status.VALID, np.uint8), grid, "scanner", "device")
+    with pytest.raises(InputError, match="65537 x 1 px"):
+        write_cloud(cloud, tmp_path / "cloud.ply")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_status_that_contradicts_its_point_is_told(tmp_path):
+    cloud = a_cloud()
+    cloud.status[2, 3] = Status.VALID if not cloud.valid[2, 3] else Status.NO_SURFACE
+    with pytest.raises(InputError, match="at row 2, column 3, 1 pixels in all"):
+        write_cloud(cloud, tmp_path / "cloud.ply")
+    write_cloud(a_cloud(), tmp_path / "cloud.ply")
+    data = bytearray((tmp_path / "cloud.ply").read_bytes())
+    data[-40 * 30 + 2 * 40 + 3] = cloud.status[2, 3]
+    (tmp_path / "cloud.ply").write_bytes(data)
+    with pytest.raises(InputError, match="at row 2, column 3, 1 pixels in all"):
+        read_cloud(tmp_path / "cloud.ply")
+
+
 def test_other_software_reads_the_points(tmp_path):
     cloud = a_cloud()
     write_cloud(cloud, tmp_path / "cloud.ply")

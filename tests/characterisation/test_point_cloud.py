@@ -50,3 +50,20 @@ def test_rays_of_some_pixels_are_among_all():
 def test_a_table_of_another_size_is_refused():
     with pytest.raises(ValueError, match="normalised"):
         replace(PINHOLE, normalised=np.zeros((80, 60, 2), np.float32))
+
+
+def test_grids_are_the_same_if_all_their_rays_are():
+    """Distortion may differ in the middle alone; a pixel without a ray has none in either."""
+    plain = ViewGrid(100.0, 100.0, 9.5, 7.5, 20, 16)
+    columns, rows = np.meshgrid(np.arange(20), np.arange(16))
+    table = (np.stack([columns - 9.5, rows - 7.5], axis=-1) / 100).astype(np.float32)
+    table[0, 0] = np.nan
+    bent = replace(plain, normalised=table)
+    assert bent.same_rays(replace(plain, normalised=table.copy())) and plain.same_rays(replace(plain))
+    other = table.copy()
+    other[8, 10, 0] += 0.001
+    assert not bent.same_rays(replace(plain, normalised=other))
+    assert not bent.same_rays(plain)
+    assert not plain.same_rays(replace(plain, cx=9.6))
+    far = replace(plain, origin=np.array([0, 0, 1000.0]))
+    assert not far.same_rays(replace(plain, origin=np.array([0, 0, 1000.002])))

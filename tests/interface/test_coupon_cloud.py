@@ -109,6 +109,8 @@ def test_a_cloud_and_its_points_say_the_same(rng):
         (np.zeros((50, 3)), {}, r"\(H, W, 3\)"),
         (np.full((50, 50, 3), np.nan), {}, "match no pinhole"),
         (np.zeros((50, 50, 3)), {"viewpoint": (0, 0)}, "three numbers"),
+        ([["a", "b"]], {}, "arrays of numbers"),
+        (np.zeros((50, 50, 3)), {"viewpoint": (0, 0, 9), "grid": ch.ViewGrid(9.0, 9.0, 0.0, 0.0, 50, 50)}, "origin"),
     ],
 )
 def test_what_is_no_organised_cloud_is_refused(points, options, match):
@@ -123,7 +125,19 @@ def test_points_that_no_pinhole_saw_are_refused(rng):
         ch.patch_metrics(points)
 
 
-@pytest.mark.parametrize("window", [(-1, 0, 50, 50), (300, 0, 50, 50), (0, 0, 0, 5)])
+@pytest.mark.parametrize("options", [{"viewpoint": (0, 0, 100.0)}, {"grid": ch.ViewGrid(9.0, 9.0, 0.0, 0.0, 50, 50)}])
+def test_a_cloud_has_its_own_viewpoint_and_grid(rng, options):
+    """They were ignored without a word."""
+    points = made(rng).astype(np.float32)
+    status = np.where(np.isfinite(points[..., 2]), ch.Status.VALID, ch.Status.AMBIGUOUS).astype(np.uint8)
+    grid = ch.ViewGrid(FOCAL, FOCAL, 159.5, 119.5, WIDTH, HEIGHT)
+    with pytest.raises(ch.InputError, match="it has both"):
+        ch.measure_coupon(ch.PointCloud(points, status, grid, "mine", "device"), **options)
+
+
+@pytest.mark.parametrize(
+    "window", [(-1, 0, 50, 50), (300, 0, 50, 50), (0, 0, 0, 5), (0, 0, 50), (0.5, 0, 50, 50), (0, np.nan, 50, 50), "no"]
+)
 def test_a_window_outside_the_image_is_refused(rng, window):
     with pytest.raises(ch.InputError, match="within 320 x 240 px"):
         ch.patch_metrics(made(rng), window=window)

@@ -12,7 +12,9 @@ import pytest
 from pydantic import ValidationError
 
 from mitsim.cli.program import app
+from mitsim.decoding.cloud import capture_cloud
 from mitsim.maps import data_sheet
+from mitsim.maps.campaign import acquire
 from mitsim.maps.data_sheet import correlation_length, gallery, measure_sensor
 from mitsim.report.sheet_figures import (
     gallery_figure,
@@ -139,3 +141,35 @@ def test_an_unknown_sensor_is_refused_before_anything_is_measured(tmp_path, monk
     assert done.exit_code != 0
     assert "ensenso-n1" in str(done.exception)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_plate_of_which_nothing_is_recovered_has_no_values(sheet, tmp_path):
+    """Set for matt white at 600 mm, the exposure saturates at the near end of the range."""
+    near, _ = sheet.sensor.working_range_mm
+    targets = data_sheet._SimulatedTargets(sheet.sensor, 1)
+    floor, residuals = targets.plane_floor(near, 0.0), targets.residuals(near)
+    assert math.isnan(floor.offset) and math.isnan(floor.flatness) and floor.fraction == 0
+    assert residuals.independent == 0 and math.isnan(residuals.skewness)
+    empty = replace(sheet, planes=[floor, floor], metal=list(sheet.metal), residuals=residuals)
+    empty.metal[0] = replace(empty.metal[0], fraction=math.nan)
+    assert "nan" not in sheet_table([empty])
+    assert write_png(residual_figure([empty]), tmp_path / "residuals.png").stat().st_size > 500
+    assert json.loads(json.dumps(empty.numbers()))["planes"][0]["fraction"] == 0
+
+
+def test_captures_without_noise_are_decoded_with_the_imager_that_took_them(sheet, monkeypatch):
+    """They have 16 bits and no black level, where the sensor has 12 and one."""
+    used = []
+
+    def spied(capture, settings, geometry=None, roi=None, imager=None):
+        used.append((capture.bits, imager))
+        return capture_cloud(capture, settings, geometry, roi, imager)
+
+    monkeypatch.setattr(acquire, "capture_cloud", spied)
+    monkeypatch.setattr(data_sheet, "capture_cloud", spied)
+    targets = data_sheet._SimulatedTargets(sheet.sensor, 1)
+    targets.plane_floor(600.0, 0.0)
+    targets.ball(600.0, 60.0)
+    assert [bits for bits, _ in used] == [16, 16] and all(imager.bits == 16 for _, imager in used)
+    targets.recovery("matt white", 600.0, 5.0)
+    assert used[-1] == (sheet.sensor.imager.bits, sheet.sensor.imager)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from characterisation.files.errors import InputError
-from mitsim.maps.campaign.plan import sensor_checksum
 from mitsim.sensor.fitted_to import FittedCapture, images_digest, recorded_in, records_of, shows_the_fit
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.sensor_text import sensor_checksum
 from mitsim.twin.sensor.run import sensor_path
 
 IMAGES = {"left": np.arange(24, dtype=np.uint8).reshape(2, 3, 4), "right": np.zeros((2, 3, 4), np.uint8)}

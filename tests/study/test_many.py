@@ -1,6 +1,7 @@
 """Many captures of a scene: the jobs of a plan, a start that goes on after kill -9, and the same bytes on a cluster."""
 
 import json
+import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -11,9 +12,10 @@ from typer.testing import CliRunner
 from characterisation.files.errors import InputError
 from mitsim.capture.folder import read_capture
 from mitsim.cli.program import app
+from mitsim.scene.surface.scatter import Deviation
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
-from mitsim.study.many_captures import CaptureSettings, ManyFile, digest_of, read_jobs
+from mitsim.study.many_captures import CaptureSettings, ManyFile, _scene, _scenes, digest_of, read_jobs
 from tests.quick_process import QuickProcess
 from tests.smaller_sensors import coarse_sensor
 
@@ -147,6 +149,22 @@ def test_a_worker_gives_the_same_capture(plan, coarse):
     there = take_job(job)
     assert {"capture.json", "settings.json", "images/left_000.png"} <= here.keys()
     assert here == there
+
+
+def test_a_worker_reads_a_scene_again_that_was_changed(plan, coarse, tmp_path):
+    shutil.copytree(SCENE.parent, tmp_path / "scene")
+    scene = tmp_path / "scene" / SCENE.name
+    text, roughness = SCENE.read_text(), []
+    for value in ("0.3", "0.6"):
+        scene.write_text(text.replace('name="pillar_Ra" value="0.37"', f'name="pillar_Ra" value="{value}"'))
+        job = read_jobs(plan, scene, load_sensor(coarse), replace(COMMON, parameters={}))[-1]
+        loaded = _scene(job, dict(job.settings.parameters), Deviation())
+        roughness.append({finish.roughness for finish in loaded.finishes})
+    assert 0.3 in roughness[0] and 0.6 in roughness[1] and 0.3 not in roughness[1]
+    scene.write_text(text)
+    _scenes.clear()
+    with pytest.raises(InputError, match="another content"):
+        _scene(job, dict(job.settings.parameters), Deviation())
 
 
 def test_smoothed_interreflections_are_part_of_the_job_and_of_its_capture(plan, coarse):

@@ -77,7 +77,7 @@ def test_a_turned_camera_moves_its_rows_and_the_capture_keeps_its_calibration(n1
 def test_a_map_is_told_from_that_of_another_room_and_old_maps_stay_known(n10):
     from characterisation.maps.performance_map import PerformanceMap
     from characterisation.maps.shipped import map_path
-    from mitsim.maps.campaign.plan import sensor_checksum
+    from mitsim.sensor.sensor_text import sensor_checksum
 
     lit = replace(n10, room=RoomTable(irradiance_w_mm2=2e-6))
     turned = replace(n10, misalignment=MisalignmentTable(row_mrad=0.1))

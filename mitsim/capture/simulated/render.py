@@ -21,10 +21,11 @@ from mitsim.scene.surface.scatter import NOMINAL, Deviation
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.poses import as_pose
 from mitsim.sensor.sensor import Sensor
+from mitsim.sensor.sensor_text import once_for_sensor
 from mitsim.sensor.transforms import Transform
 
-#: the last sensor and its simulation: preparing the patterns takes longer than tracing an image
-_prepared: list[tuple[Sensor, SimulatedSensor]] = []
+#: a sensor ready to take captures; the last one is kept: preparing the patterns takes longer than tracing an image
+simulated_sensor = once_for_sensor(SimulatedSensor)
 
 
 def load_scene(
@@ -73,13 +74,6 @@ def load_scene(
     """
     parameters = {name: str(value) for name, value in (definitions or {}).items()}
     return load.load_scene(path, sensor.wavelength_nm, parameters, deviation)
-
-
-def prepared_sensor(sensor: Sensor) -> SimulatedSensor:
-    """Return a sensor ready to take captures; the last one is kept for the next call."""
-    if not (_prepared and _prepared[0][0] is sensor):
-        _prepared[:] = [(sensor, SimulatedSensor(sensor))]
-    return _prepared[0][1]
 
 
 @overload
@@ -197,7 +191,7 @@ def render(  # noqa: PLR0913 - options of programs, all by name
             raise InputError("render", name, value, f"{low} to {high}")
     world_from_sensor = as_pose(pose, "render")
     chosen = Noise.parse(noise, "render: noise")
-    simulated = prepared_sensor(sensor)
+    simulated = simulated_sensor(sensor)
     rendering = Rendering.smoothed(samples, depth, smoothing_px)
     capture = simulated.capture(scene, world_from_sensor, seed=seed, rendering=rendering, noise=chosen)
     if check:

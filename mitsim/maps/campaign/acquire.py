@@ -9,6 +9,7 @@ While one shot is decoded and measured, the next is rendered.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
@@ -19,7 +20,8 @@ from typing import TypeVar
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from characterisation.coupon.patches import Coupon, measure_patches
+from characterisation.coupon.patches import Coupon, measure_patches, outline
+from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 from characterisation.region_of_interest import Roi
@@ -205,17 +207,19 @@ def coupon_cloud(capture: Capture, coupon: Coupon, geometry: Geometry, sensor: S
     geometry
         That of the capture.
     sensor
-        Gives decoder and imager.
+        Gives the decoder, and the imager if the capture does not state its own.
 
     See Also
     --------
     measured : decodes and measures the patches
     """
     grid = geometry.grid
-    corners = np.nan_to_num(grid.project(coupon.corners()))  # NaN is behind the sensor
+    seen = outline(grid, coupon)
+    corners = np.nan_to_num(seen) if len(seen) else np.zeros((1, 2))
     low = np.clip(np.floor(corners.min(axis=0)).astype(int) - 2, 0, [grid.width - 1, grid.height - 1])
     high = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 3, low + 1, [grid.width, grid.height])
-    return capture_cloud(capture, sensor.settings, geometry, Roi.between(*low, *high), sensor.imager)
+    imager = capture.decoding.imager or sensor.imager
+    return capture_cloud(capture, sensor.settings, geometry, Roi.between(*low, *high), imager)
 
 
 def coupon_residuals(sensor: SimulatedSensor, campaign: Campaign) -> list[RenderResidual]:
@@ -328,4 +332,5 @@ def _found_shot(folder: Path, campaign: Campaign) -> Shot:
         s for s in campaign.series if s.variant is None and s.distance == nominal and s.sample.label() == label
     )
     axis = campaign.sensor.rig.reference.sensor_from_camera.rotation[:, 2]
-    return Shot(series, view_axes(axis).T @ pose.rotation[:, 2], pose)
+    index = read_bounded(folder / "capture.json", "a complete capture folder")  # it has the digest of every other file
+    return Shot(series, view_axes(axis).T @ pose.rotation[:, 2], pose, hashlib.sha256(index).hexdigest())

@@ -32,6 +32,7 @@ from mitsim.maps.campaign.live import LiveCampaign, plan_live
 from mitsim.maps.campaign.orders import Order, PreparedSensor, order_of, prepared_sensor
 from mitsim.maps.campaign.plan import Campaign, CampaignFile, Shot, plan_campaign
 from mitsim.maps.prediction import performance
+from mitsim.running.executor import check_same_file
 from mitsim.sensor.sensor import Sensor
 
 #: relative extent in |V| of a patch on either side of its middle
@@ -259,8 +260,8 @@ def compared(
         math.acos(min(1.0, float(shot.normal[2]))),
         _pooled(measured, mapped_patches),
         _pooled(predicted, mapped_patches),
-        np.concatenate([residuals for _, residuals in measured]),
-        np.concatenate([residuals for _, residuals in predicted]),
+        _residuals(measured, mapped_patches),
+        _residuals(predicted, mapped_patches),
     )
 
 
@@ -292,8 +293,8 @@ def held_out_orders(campaign: Campaign, shots: list[Shot], map_path: Path, repea
     --------
     compare : in this process
     """
-    path = str(map_path.absolute())
-    return [HeldOutOrder(order_of(shot, campaign), path, _digest(path), repeats) for shot in shots]
+    path, digest = str(map_path.absolute()), _digest(map_path)
+    return [HeldOutOrder(order_of(shot, campaign), path, digest, repeats) for shot in shots]
 
 
 def hold_out_order(held_out: HeldOutOrder) -> Pair:
@@ -304,22 +305,23 @@ def hold_out_order(held_out: HeldOutOrder) -> Pair:
     InputError
         If the map is missing, or has another content.
     """
-    if _digest(held_out.map_path) != held_out.digest:
-        found, allowed = "another map than on the machine of the command", "the same file on every machine"
-        raise InputError(held_out.map_path, "", found, allowed)
+    performance_map = _map(held_out.map_path, held_out.digest)
     prepared = prepared_sensor(held_out.order.sensor)
     take = simulated_source(prepared.simulated, held_out.order.samples_per_pixel)
-    return compared(held_out.order.shot(), prepared, _map(held_out.map_path), take, held_out.repeats)
+    return compared(held_out.order.shot(), prepared, performance_map, take, held_out.repeats)
 
 
-@lru_cache(maxsize=8)
-def _digest(path: str) -> str:
-    return hashlib.sha256(read_bounded(Path(path), "a map")).hexdigest()
+@lru_cache(maxsize=2)
+def _map(path: str, digest: str) -> PerformanceMap:
+    check_same_file(path, _digest(Path(path)), digest)
+    return PerformanceMap.load(path)
 
 
-_map = lru_cache(maxsize=2)(PerformanceMap.load)
+def _digest(path: Path) -> str:
+    return hashlib.sha256(read_bounded(path, "a map")).hexdigest()
 
-#: the patches of a cloud, and the residuals of its points [mm]
+
+#: the patches of a cloud, and the residuals of the points of each [mm]
 _Measured = tuple[xr.Dataset, NDArray[np.float64]]
 
 
@@ -329,6 +331,12 @@ def _measure(cloud: PointCloud, coupon: Coupon) -> _Measured:
 
 def _pooled(measurements: list[_Measured], patch_indices: NDArray[np.int64]) -> Overall:
     return overall(xr.concat([patches.isel(patch=patch_indices) for patches, _ in measurements], "patch"))
+
+
+def _residuals(measurements: list[_Measured], patch_indices: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the residuals of all points of the patches that are compared, one after another."""
+    chosen = np.concatenate([residuals[patch_indices].ravel() for _, residuals in measurements])
+    return np.asarray(chosen[np.isfinite(chosen)])
 
 
 def _known(patches: xr.Dataset, sample: Sample, performance_map: PerformanceMap) -> NDArray[np.bool_]:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.coupon.orientations import Refinement
+from characterisation.coupon.view_frame import view_frame
 from characterisation.maps.joined import mean_over, with_directions
 from characterisation.maps.lay import mirror_direction, tangent_at
 from characterisation.maps.performance_map import PerformanceMap
@@ -34,7 +35,6 @@ from mitsim.maps.campaign.plan import (
     Series,
     Shot,
     half_size,
-    sensor_checksum,
     view_axes,
 )
 from mitsim.maps.campaign.run import run_campaign
@@ -42,10 +42,14 @@ from mitsim.running.version import __version__
 from mitsim.scene.load import flat_coupon
 from mitsim.scene.materials import Finish
 from mitsim.sensor.sensor import Sensor
+from mitsim.sensor.sensor_text import sensor_checksum
 from mitsim.sensor.transforms import Transform
 
 #: increased if the plan below changes, so that cached maps are made again
 DESIGN_VERSION = 2
+
+#: the same for a lay, of sensors whose baseline is not along their x
+LAY_DESIGN_VERSION = 1
 
 #: directions of u of a finish with a lay [deg], equally spaced from 0 to 180
 TURNS_DEG = (0.0, 45.0, 90.0, 135.0)
@@ -100,6 +104,9 @@ class OneFinish:
             self.seed,
             self.turns,
         ]
+        axis = self.sensor.rig.reference.sensor_from_camera.rotation[:, 2]
+        if len(self.turns) > 1 and not np.allclose(_sensor_from_view(self.sensor), view_axes(axis)):
+            content.append(LAY_DESIGN_VERSION)
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
@@ -115,8 +122,8 @@ class _RotatedCampaign(Campaign):
         if self.lay_deg is None:
             return shot
         mirror = mirror_direction(np.array(series.distance), mirror_mm(self.sensor))
-        u = _sensor_from_view(self.sensor) @ tangent_at(normal, self.lay_deg, mirror)
-        z = shot.sensor_from_coupon.rotation[:, 2]
+        view = _sensor_from_view(self.sensor)
+        u, z = view @ tangent_at(normal, self.lay_deg, mirror), view @ normal
         axes = np.stack([u, np.cross(z, u), z], axis=1)
         return replace(shot, sensor_from_coupon=Transform(axes, shot.sensor_from_coupon.translation))
 
@@ -135,7 +142,8 @@ def mirror_mm(sensor: Sensor) -> tuple[float, float]:
 
 
 def _sensor_from_view(sensor: Sensor) -> NDArray[np.float64]:
-    return view_axes(sensor.rig.reference.sensor_from_camera.rotation[:, 2])
+    """Return the axes of the view frame as a map has it, x along the baseline, as columns in the sensor frame."""
+    return view_frame(sensor.rig.reference.sensor_from_camera.rotation[:, 2], sensor.rig.baseline_direction).T
 
 
 def plan_of(largest_deg: float, seed: int = 1) -> CampaignFile:

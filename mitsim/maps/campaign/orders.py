@@ -6,6 +6,7 @@ the worker, whose sensor is prepared once -> capture, measured -> the process th
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -13,27 +14,39 @@ from pathlib import Path
 
 import numpy as np
 
+from mitsim.capture.simulated.render import simulated_sensor
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.campaign.acquire import Source, measured, simulated_source
-from mitsim.maps.campaign.coupons import CouponRecipe, load_sample
+from mitsim.maps.campaign.coupons import CouponRecipe, Sample, load_sample
 from mitsim.maps.campaign.plan import Campaign, Series, Shot
 from mitsim.maps.campaign.store import Finished
 from mitsim.maps.prediction import Predictor
-from mitsim.running.executor import Executor
+from mitsim.running.executor import Executor, check_same_file
 from mitsim.scene import backend
 from mitsim.sensor.sensor import Sensor
+from mitsim.sensor.sensor_text import once_for_sensor
 from mitsim.sensor.transforms import Transform
 
-_sample = lru_cache(maxsize=32)(load_sample)
+
+@lru_cache(maxsize=32)
+def _sample(recipe: CouponRecipe, origin: str) -> Sample:
+    sample = load_sample(recipe)
+    check_same_file(recipe.scene, _digest(sample), origin)
+    return sample
+
+
+def _digest(sample: Sample) -> str:
+    return hashlib.sha256(sample.origin.encode()).hexdigest()
 
 
 @dataclass(frozen=True)
 class Order:
-    """A shot as plain values."""
+    """A shot as plain values; ``origin`` is the digest of everything its coupon was made from."""
 
     sensor: Sensor
     recipe: CouponRecipe
+    origin: str
     distance: float
     normal: tuple[float, float, float]
     sensor_from_coupon: Transform
@@ -43,8 +56,8 @@ class Order:
     keep_images: bool
 
     def shot(self) -> Shot:
-        """Return the ordered shot; its coupon is loaded once in a process."""
-        series = Series(_sample(self.recipe), self.distance, None, self.series_name, self.series_seed)
+        """Return the ordered shot; its coupon is loaded once in a process, and again if its scene has changed."""
+        series = Series(_sample(self.recipe, self.origin), self.distance, None, self.series_name, self.series_seed)
         return Shot(series, np.array(self.normal), self.sensor_from_coupon)
 
 
@@ -71,6 +84,7 @@ def order_of(shot: Shot, campaign: Campaign) -> Order:
     return Order(
         campaign.sensor,
         replace(recipe, scene=str(Path(recipe.scene).absolute())),
+        _digest(shot.series.sample),
         series.distance,
         (x, y, z),
         shot.sensor_from_coupon,
@@ -91,7 +105,7 @@ class PreparedSensor:
     def simulated(self) -> SimulatedSensor:
         """Return the sensor on the device."""
         backend.activate(None)
-        return SimulatedSensor(self.sensor)
+        return simulated_sensor(self.sensor)
 
     @cached_property
     def predictor(self) -> Predictor:
@@ -99,13 +113,5 @@ class PreparedSensor:
         return Predictor.of_sensor(self.sensor, self.geometry)
 
 
-_prepared: dict[str, PreparedSensor] = {}
-
-
-def prepared_sensor(sensor: Sensor) -> PreparedSensor:
-    """Return the sensor of this process, prepared once."""
-    key = repr(sensor)
-    if key not in _prepared:
-        _prepared.clear()
-        _prepared[key] = PreparedSensor(sensor)
-    return _prepared[key]
+#: the sensor of this process, prepared once
+prepared_sensor = once_for_sensor(PreparedSensor)

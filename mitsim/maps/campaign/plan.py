@@ -13,11 +13,10 @@ import hashlib
 import itertools
 import json
 import math
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +33,7 @@ from mitsim.maps.campaign.coupons import VARIANTS, CouponRecipe, Sample, load_sa
 from mitsim.maps.campaign.stage_pose import StageTable
 from mitsim.running.version import __version__
 from mitsim.sensor.sensor import Sensor
-from mitsim.sensor.sensor_file import MisalignmentTable
+from mitsim.sensor.sensor_text import written
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.working_volume import field_of_view
 
@@ -139,11 +138,15 @@ class Series:
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One capture of a campaign: the coupon of a series with its ``normal`` (3,) in the view frame."""
+    """One capture of a campaign: the coupon of a series with its ``normal`` (3,) in the view frame.
+
+    ``found`` is the digest of a capture that exists already.
+    """
 
     series: Series
     normal: NDArray[np.float64]
     sensor_from_coupon: Transform
+    found: str | None = None
 
     @property
     def name(self) -> str:
@@ -345,50 +348,14 @@ def _series_of(
     return made
 
 
-def sensor_checksum(sensor: Sensor) -> str:
-    """Return twelve hexadecimal digits of all values of a sensor file, which identify the sensor of a map."""
-    return hashlib.sha256(_written(sensor).encode()).hexdigest()[:12]
-
-
-#: print options of numpy: its defaults with every digit of every value, whatever those of the caller are
-_NUMPY_PRINTS: dict[str, Any] = {
-    "precision": 17,
-    "threshold": sys.maxsize,
-    "linewidth": 75,
-    "edgeitems": 3,
-    "suppress": False,
-    "sign": "-",
-    "floatmode": "maxprec",
-    "formatter": None,
-    "nanstr": "nan",
-    "infstr": "inf",
-    "legacy": False,
-}
-
-
-def _written(sensor: Sensor) -> str:
-    # values of a single unit; a file without them keeps its former checksum, which existing maps have
-    additions = [sensor.room, sensor.misalignment, sensor.imager.smoothing_px]
-    lens, settings = sensor.imager.corner_blur_px, sensor.settings
-    # keys of a decoder that came later, which its text does not have
-    later = {
-        key: getattr(settings, key)
-        for key, field in type(settings).model_fields.items()
-        if not field.repr and getattr(settings, key) != field.default
-    }
-    with np.printoptions(**_NUMPY_PRINTS):
-        said = repr(sensor) + (repr(additions) if additions != [None, MisalignmentTable(), 0.0] else "")
-        return said + ("" if lens is None else f"corner_blur_px={lens!r}") + (repr(later) if later else "")
-
-
 def _digest(file: CampaignFile, sensor: Sensor, sample: Sample, distance: float, calibration: str) -> str:
     """Return twelve hexadecimal digits of everything that determines the captures of a series, except their normals.
 
     ``calibration`` is the checksum of a live stage's calibration; connection and limits of the stage are not included.
     """
     common = [__version__, MEASUREMENT_VERSION, file.samples_per_pixel, file.keep_images, file.seed]
-    written = [_written(sensor), sample.origin, sample.label(), f"{distance:.6g}"]
+    values = [written(sensor), sample.origin, sample.label(), f"{distance:.6g}"]
     if file.device is not None:  # campaigns without a device keep their former digest
-        written += [file.device.model_dump_json(exclude={"settings": _PATIENCE}), calibration]
-    text = json.dumps([*common, *written])
+        values += [file.device.model_dump_json(exclude={"settings": _PATIENCE}), calibration]
+    text = json.dumps([*common, *values])
     return hashlib.sha256(text.encode()).hexdigest()[:12]

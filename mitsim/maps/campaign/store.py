@@ -3,7 +3,7 @@
 ::
 
     coupons/aluminium-ground_Ra_0.37_600mm_0f3a9c1b2d4e/+0.1234-0.0567/
-      shot.json      coupon and pose of the shot, and the size and SHA-256 of every other file
+      shot.json      coupon and pose of the shot, the SHA-256 of a found capture, size and SHA-256 of every other file
       patches.npy    a row for each patch, a field for each metric
       capture/       the capture, if the campaign keeps images: see mitsim.capture.folder
 
@@ -72,6 +72,7 @@ class ShotDocument(Document):
     seed: int
     source: str
     mitsim: str
+    found: str | None = Field(default=None, pattern="^[0-9a-f]{64}$")
     files: dict[str, KeptFile] = Field(max_length=10_000)
     checksum: str = Field(pattern="^[0-9a-f]{64}$")
 
@@ -104,10 +105,12 @@ def write_shot(captures: Path, shot: Shot, finished: Finished) -> None:
         "mitsim": __version__,
         "files": {p: {"bytes": len(d), "sha256": hashlib.sha256(d).hexdigest()} for p, d in files.items()},
     }
+    if shot.found is not None:
+        document["found"] = shot.found
     document["checksum"] = content_checksum(document)
     files["shot.json"] = (json.dumps(document, indent=1) + "\n").encode()
     try:
-        write_folder(folder, files)
+        write_folder(folder, files, overwrite=shot.found is not None)
     except OSError as error:
         raise MissingEnvironmentError(
             f"{folder}: a capture that cannot be written ({error.strerror or error}); captures finished before are "
@@ -116,7 +119,7 @@ def write_shot(captures: Path, shot: Shot, finished: Finished) -> None:
 
 
 def read_shot(captures: Path, shot: Shot) -> Finished | None:
-    """Return a kept shot, None if it is missing; images are checked but not read.
+    """Return a kept shot, None if it is missing or of another found capture; images are checked but not read.
 
     Raises
     ------
@@ -127,6 +130,8 @@ def read_shot(captures: Path, shot: Shot) -> Finished | None:
     if not folder.exists():
         return None
     document = _document(folder)
+    if document.found != shot.found:
+        return None
     data = {path: _checked(folder, path, entry) for path, entry in document.files.items()}
     if "patches.npy" not in data:
         raise InputError(folder / "shot.json", "files", "no patches.npy", "a shot of mitsim map make", _AGAIN)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from characterisation.files.atomic_io import write_text
 from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.fitted_to import FittedCapture
 from mitsim.sensor.rig_covariance import write_rig_covariance
 from mitsim.sensor.rig_parameters import parameter_values
 from mitsim.study.calibration.halves import CheckedCalibration, in_words
@@ -18,15 +21,19 @@ def write_calibration(checked: CheckedCalibration, output: Path) -> Path:
     """Write the covariance to ``output`` and the rig beside it, as OpenCV's ``.yml``; return the path of the latter."""
     rig_file = output.with_suffix(".yml")
     rig = checked.calibration.rig
-    write_text(rig_file, opencv_text(rig))
+    write_text(rig_file, opencv_text(rig, checked.calibration.covariance.fitted_to))
     write_rig_covariance(output, checked.calibration.covariance, rig)
     return rig_file
 
 
-def opencv_text(rig: Rig) -> str:
-    """Return a rig as OpenCV's YAML, by the names of its stereo sample; a projector by ``proj_``."""
+def opencv_text(rig: Rig, fitted_to: Sequence[FittedCapture] = ()) -> str:
+    """Return a rig as OpenCV's YAML, by the names of its stereo sample; a projector by ``proj_``.
+
+    Comments name the images that it was ``fitted_to``.
+    """
     (_, first), *other_cameras = rig.cameras.items()
     lines = ["%YAML:1.0", "---"]
+    lines += [f"# fitted to {json.dumps(image.name)}, SHA-256 {image.images_sha256}" for image in fitted_to]
     if other_cameras:
         lines += _eye(first, "cameraMatrix1", "distCoeffs1", "image_size")
         lines += _eye(other_cameras[0][1], "cameraMatrix2", "distCoeffs2", "image_size_2") + _pose(other_cameras[0][1])

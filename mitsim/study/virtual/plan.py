@@ -19,11 +19,11 @@ from characterisation.files.errors import InputError
 from characterisation.tasks.folded import folded_values
 from mitsim.capture.simulated.indirect_light import IndirectLight, KeptSettings
 from mitsim.capture.simulated.rendering import Rendering
-from mitsim.maps.campaign.plan import sensor_checksum
 from mitsim.running.version import __version__
 from mitsim.scene.xml_check import named_digests
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.matcher import MatcherSettings
+from mitsim.sensor.sensor_text import sensor_checksum
 from mitsim.study import Study
 from mitsim.study.virtual.mapped import MappedMeasurements
 from mitsim.study.virtual.rendered import RenderedMeasurements

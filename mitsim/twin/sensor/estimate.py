@@ -42,7 +42,7 @@ class FittedKey:
     """A fitted number: ``key`` in the sensor file, ``value``, standard ``uncertainty`` on its ``scale``, ``unit``.
 
     ``captures`` that determine it, and the method ``method``. Noise determines the inverse of the full well, so that
-    inverse is approximately normal.
+    inverse is approximately normal. A number that is not ``determined`` is part of the fit, and near its assumed value.
     """
 
     key: str
@@ -52,6 +52,11 @@ class FittedKey:
     captures: tuple[str, ...]
     method: str
     scale: Scale = "linear"
+    determined: bool = True
+
+    def interval_in_words(self) -> str:
+        """Return the 95 % interval, or that the number is not determined: its interval would be the assumed one."""
+        return "{:.4g} to {:.4g}".format(*self.interval()) if self.determined else "not determined"
 
     def interval(self, coverage: float = 1.959964) -> tuple[float, float]:
         """Return the interval of ``coverage`` standard uncertainties about the value, on its scale; 95 % by default."""
@@ -98,6 +103,8 @@ def pooled(estimates: Sequence[FittedKey]) -> list[FittedKey]:
                 [fitted_key.uncertainty for fitted_key in group],
             )
             names = tuple(name for fitted_key in group for name in fitted_key.captures)
-            first = replace(first, value=unscaled(middle, first.scale), uncertainty=spread, captures=names)
+            known = any(fitted_key.determined for fitted_key in group)
+            value = unscaled(middle, first.scale)
+            first = replace(first, value=value, uncertainty=spread, captures=names, determined=known)
         out.append(first)
     return out

@@ -225,9 +225,13 @@ def _combined_estimates(
     parameters: dict[str, Parameter] = {}
     for name, fit in dots.items():
         values, spreads = fit.in_file_units()
-        for parameter, value, spread in zip(fit.parameters, values.tolist(), spreads.tolist(), strict=True):
-            method = "figures of the dots over the field"
-            estimates.append(FittedKey(parameter.key, value, spread, parameter.unit, (name,), method, parameter.scale))
+        determined = fit.moment_fit.determined.tolist()
+        rows = zip(fit.parameters, values.tolist(), spreads.tolist(), determined, strict=True)
+        for parameter, value, spread, known in rows:
+            how = ((name,), "figures of the dots over the field", parameter.scale)
+            # the room stays in the fit; others are left out where they are not determined, or are significant
+            known = known or not parameter.key.startswith("room.")
+            estimates.append(FittedKey(parameter.key, value, spread, parameter.unit, *how, known))
         parameters |= {parameter.key: parameter for parameter in (*fit.parameters, *fit.undetermined)}
     keys = {estimate.key for estimate in estimates}
     undetermined += [

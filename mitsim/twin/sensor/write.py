@@ -65,9 +65,8 @@ def fit_table(fit: SensorFit) -> str:
     """Return a Markdown table of the estimates and the undetermined numbers."""
     lines = ["| number | value | 95 % interval | unit | captures | how |", "| --- | --- | --- | --- | --- | --- |"]
     for estimate in fit.estimates:
-        low, high = estimate.interval()
         lines.append(
-            f"| {estimate.key} | {estimate.value:.4g} | {low:.4g} to {high:.4g} | {estimate.unit} | "
+            f"| {estimate.key} | {estimate.value:.4g} | {estimate.interval_in_words()} | {estimate.unit} | "
             f"{', '.join(estimate.captures)} | {estimate.method} |"
         )
     kept = [entry for entry in fit.undetermined if entry.value]
@@ -101,9 +100,11 @@ def _entries(fit: SensorFit) -> dict[str, Entry]:
     for key, parts in arrays.items():
         count, limit = (3, 200.0) if key == "room.curvature" else (2, 20.0)
         values = [parts[index].value if index in parts else 0.0 for index in range(count)]
-        spreads = [two_digits(parts[index].uncertainty) if index in parts else "-" for index in range(count)]
+        known = [index in parts and parts[index].determined for index in range(count)]
+        spreads = [two_digits(parts[index].uncertainty) if known[index] else "-" for index in range(count)]
         part = next(iter(parts.values()))
-        comment = f"fitted: standard uncertainties {', '.join(spreads)}; {part.method}; {', '.join(part.captures)}"
+        stated = f"standard uncertainties {', '.join(spreads)}" if any(known) else "not determined"
+        comment = f"fitted: {stated}; {part.method}; {', '.join(part.captures)}"
         entries[key] = Entry(numbers(np.clip(values, -limit, limit), 5), comment)
     for kept in fit.undetermined:
         if kept.contained:
@@ -118,8 +119,8 @@ def _entries(fit: SensorFit) -> dict[str, Entry]:
 
 
 def _comment(key: FittedKey) -> str:
-    low, high = key.interval()
-    text = f"fitted: {key.value:.4g} {key.unit}, 95 % interval {low:.4g} to {high:.4g}"
+    interval = f"95 % interval {key.interval_in_words()}" if key.determined else key.interval_in_words()
+    text = f"fitted: {key.value:.4g} {key.unit}, {interval}"
     return f"{text}; {key.method}; {', '.join(key.captures)}"
 
 

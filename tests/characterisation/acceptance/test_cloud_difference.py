@@ -7,7 +7,6 @@ from characterisation.acceptance.cloud_difference import (
     difference_along_rays,
     difference_to_surface,
     distribution,
-    same_grid,
 )
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
@@ -46,7 +45,7 @@ def test_to_the_surface_needs_no_shared_grid():
     assert np.nanmax(np.abs(found + 1.5)) < 1e-3
     with pytest.raises(InputError, match="140 x 120 px"):
         difference_along_rays(plane_cloud(), plane_cloud(grid=other))
-    assert not same_grid(GRID, other)
+    assert not GRID.same_rays(other)
 
 
 def test_points_beyond_the_edge_of_the_reference_have_no_difference():

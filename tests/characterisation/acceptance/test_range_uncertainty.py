@@ -46,3 +46,9 @@ def test_the_extremes_of_a_few_points_have_no_uncertainty():
     assert np.isnan(flatness_uncertainty(points[:900]))  # two are rejected
     assert np.isnan(flatness_uncertainty(points, 0.0))
     assert flatness_uncertainty(points) == flatness_uncertainty(points)
+
+
+def test_no_points_have_no_uncertainty():
+    none = np.full((5, 3), np.nan)
+    assert np.isnan(flatness_uncertainty(none)) and np.isnan(flatness_uncertainty(none[:0]))
+    assert np.isnan(form_error_uncertainty(none, (0, 0, 0)))

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.stats import beta
 
+from characterisation.coupon.discs import disc_offsets
 from characterisation.coupon.metrics import (
     clipped,
     density_fraction,
@@ -167,3 +168,19 @@ def test_a_ratio_to_a_reference_stays_in_order(count, reference):
         return
     assert 0 <= low <= found <= high <= 1
     assert np.isclose(found + excess, count / reference)
+
+
+@pytest.mark.parametrize("noise", [0.25, 0.3, 0.5])
+@pytest.mark.parametrize("place", [0.0, 0.3])
+def test_depths_in_steps_keep_their_noise(rng, noise, place):
+    """A square coupon of a device with steps of 1 mm, wider than its noise: most points have one depth."""
+    rows, columns = (disc_offsets(6.0) + np.array([-80, 100])).T / 500
+    depth = np.rint(600 + place + noise * rng.standard_normal((300, len(rows))))
+    patch = np.stack([columns * depth, rows * depth, depth], axis=-1)
+    patch[0, :5] *= 1.02  # real outliers
+    measured = ray_noise_std(patch)
+    stretch = np.sqrt(1 + np.mean(rows) ** 2 + np.mean(columns) ** 2)
+    pooled = np.sqrt(np.mean(measured.inlier_sigma**2))
+    assert pooled == pytest.approx(stretch * np.sqrt(depth[1:].var(axis=1).mean()), rel=0.03)
+    assert measured.outlier_share[0] == pytest.approx(5 / len(rows))
+    assert not measured.outlier_share[1:].any()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,6 +11,7 @@ from hypothesis import strategies as st
 
 from characterisation.coupon.discs import disc_offsets
 from characterisation.coupon.metrics import density_fraction
+from characterisation.coupon.patch_table import overall
 from characterisation.coupon.patches import Coupon, measure_patches, patch_centres
 from characterisation.coupon.view_frame import in_view_frame, view_frame
 from characterisation.files.errors import InputError
@@ -122,6 +125,19 @@ def test_a_coupon_behind_the_sensor_has_no_patches():
     assert measure_patches(cloud, coupon).sizes["patch"] == 0
 
 
+def test_a_plate_that_reaches_behind_the_sensor_has_patches_where_it_is_seen():
+    """A wide plate at 75 deg, whose near corners lie behind the sensor: as that part of it which is in front."""
+    normal = tilted(75, 0)
+    wide = coupon_at([0, 0, 600], normal, width=2600, height=200)
+    assert (wide.corners()[:, 2] < 0).sum() == 2
+    cloud = ideal_cloud(wide)
+    found = measure_patches(cloud, wide)
+    assert found.sizes["patch"] > 100 and (found.recovered_fraction == 1).all()
+    part = measure_patches(cloud, coupon_at([0, 0, 600], normal, width=1200, height=200))
+    places = [set(zip(one["row"].values, one["column"].values, strict=True)) for one in (part, found)]
+    assert places[0] <= places[1]
+
+
 unit = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1)
 
 
@@ -215,15 +231,49 @@ def test_a_place_where_the_reference_has_nothing_has_no_fraction():
         {"angular_pitch": 0.0},
         {"reference": "small"},
         {"reference": "same", "angular_pitch": 1e-3},
+        {"reference": "moved"},
+        {"radius_px": np.inf},
+        {"margin_px": np.nan},
+        {"margin_px": -20.0},
+        {"step_px": np.inf},
+        {"angular_pitch": np.inf},
     ],
 )
 def test_what_cannot_be_measured_is_refused(given):
     coupon = coupon_at([0, 0, 600], tilted(0, 0))
     cloud = ideal_cloud(coupon)
     small = ideal_cloud(coupon, grid=ViewGrid(626.0, 626.0, 50.0, 50.0, 100, 100))
-    given = given | ({"reference": {"small": small, "same": cloud}[given["reference"]]} if "reference" in given else {})
+    moved = ideal_cloud(coupon, grid=replace(GRID, cx=GRID.cx + 5))
+    given = given | (
+        {"reference": {"small": small, "same": cloud, "moved": moved}[given["reference"]]}
+        if "reference" in given
+        else {}
+    )
     with pytest.raises(InputError, match="measure_patches"):
         measure_patches(cloud, coupon, **given)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"width": 0.0}, {"height": np.nan}, {"normal": np.array([0, 0, -2.0])}, {"across": np.array([0, 0.1, 1.0])}],
+)
+def test_a_coupon_that_is_no_rectangle_is_refused(change):
+    coupon = coupon_at([0, 0, 600], tilted(0, 0))
+    with pytest.raises(InputError, match=r"measure_patches.*coupon"):
+        measure_patches(ideal_cloud(coupon), replace(coupon, **change))
+
+
+def test_a_pooled_fraction_is_at_most_one():
+    """By a pitch that is too large every point is more than one, and where a reference has none there is no F."""
+    coupon = coupon_at([0, 0, 600], tilted(10, 0))
+    cloud = ideal_cloud(coupon)
+    wrong = measure_patches(cloud, coupon, angular_pitch=1.07 * GRID.angular_pitch)
+    assert (wrong["points"] / wrong["points_possible"]).mean() > 1.13
+    assert overall(wrong).fraction == 1.0
+    half = ideal_cloud(coupon)
+    half.points[:, : GRID.width // 2] = np.nan
+    pooled = overall(measure_patches(half, coupon, reference=half))
+    assert pooled.fraction == 1.0 and pooled.fraction_error < 0.01
 
 
 def test_overlapping_patches_say_how_much_each_is_worth(rng):

@@ -5,9 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from characterisation.features.fits import belonging, fit_cylinder, fit_plane, fit_sphere
+from characterisation.features.fits import belonging, fit_cone, fit_cylinder, fit_plane, fit_sphere
 from characterisation.features.robust_fit import FitError, rays_from, robust_fit
-from characterisation.features.surfaces import Cylinder, Plane, Sphere, tangents
+from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere, tangents
+from characterisation.files.errors import InputError
 
 EYE = np.zeros(3)
 
@@ -341,3 +342,12 @@ def test_a_point_that_enters_and_leaves_the_selection_in_turn_ends_the_fit_soon(
     # least squares of the points used: residuals are perpendicular to every derivative
     cosine = jacobian.T @ residual / np.linalg.norm(jacobian, axis=0) / np.linalg.norm(residual)
     np.testing.assert_allclose(cosine, 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("fit", [fit_cylinder, fit_cone])
+@pytest.mark.parametrize(("axis", "radius", "named"), [([0, 0, 1], 0.0, "radius"), ([0, 0, 0], 5.0, "axis")])
+def test_a_nominal_surface_that_is_none_is_refused(fit, axis, radius, named, rng):
+    nominal = (np.zeros(3), np.array(axis, float), radius)
+    initial = Cylinder(*nominal) if fit is fit_cylinder else Cone(*nominal, 0.3)
+    with pytest.raises(InputError, match=f"initial.{named}"):
+        fit(rng.normal(size=(50, 3)), initial)

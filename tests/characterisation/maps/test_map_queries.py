@@ -184,6 +184,29 @@ def test_shapes_of_queries_are_kept():
     assert LINEAR.query("metal", 0.4, np.empty(0), np.empty((0, 3))).sigma.shape == (0,)
 
 
+def test_one_normal_is_that_of_every_distance():
+    distances = np.array([450.0, 500.0, 700.0])
+    one = LINEAR.query("metal", 0.4, distances, np.array([0.6, 0.0, 0.8]))
+    each = LINEAR.query("metal", 0.4, distances, np.tile([0.6, 0.0, 0.8], (3, 1)))
+    assert np.array_equal(one.sigma, each.sigma) and np.isfinite(one.sigma).all()
+    assert LINEAR.query("metal", 0.4, 500.0, [0.6, 0.0, 0.8]).sigma == each.sigma[1]
+
+
+@pytest.mark.parametrize(
+    ("distance", "normals", "message"),
+    [
+        ([500.0, 500.0], [[0.0, 0.0, 1.0], [0.0, 0.0, 2.0]], "0.0, 0.0, 2.0"),
+        (500.0, [0.0, 0.0, 0.0], "length 1"),
+        ([500.0, 500.0], [[0.0, 0.0, 1.0]] * 3, "as many"),
+        (500.0, [0.0, 1.0], "one"),
+    ],
+)
+def test_a_query_of_no_normals_is_refused(distance, normals, message):
+    """A normal twice as long was taken for another direction: F and sigma of another tilt."""
+    with pytest.raises(InputError, match=message):
+        LINEAR.query("metal", 0.4, distance, normals)
+
+
 def test_a_compact_file_is_small_and_answers_the_same(tmp_path):
     LINEAR.save(tmp_path / "whole.nc")
     LINEAR.save(tmp_path / "compact.nc", compact=True)

@@ -193,3 +193,12 @@ def test_the_mean_over_directions_pools_points_and_tells_their_spread():
     answer = mean.query(*steel[:2], [600.0], AHEAD, steel[2])
     assert answer.fraction[0] == pytest.approx(0.4, abs=1e-5)
     assert answer.fraction_spread[0] == pytest.approx(0.2, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", ["alpha_u", "mirror_v", "height_um"])
+def test_narrow_lobes_differ_by_their_share_of_the_width(name):
+    """0.005 and 0.0069 are lobes of other widths; shares of light that differ as little are the same to a sensor."""
+    narrow = light_at(0.1, **{name: 0.005})
+    assert not same_light(narrow, replace(narrow, **{name: 0.0069}))
+    assert same_light(narrow, replace(narrow, **{name: 0.00504}))
+    assert same_light(narrow, replace(narrow, wide_angle=narrow.wide_angle + 0.0019))

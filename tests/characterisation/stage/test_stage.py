@@ -96,3 +96,8 @@ def test_a_third_axis_reaches_what_two_do_not():
 def test_an_impossible_axis_is_refused(axis, message):
     with pytest.raises(InputError, match=message):
         stage(axes=[axis])
+
+
+def test_a_coupon_without_a_direction_is_refused():
+    with pytest.raises(InputError, match=r"normal.*not zero"):
+        stage(axes=[{"name": "pan", "direction": [0, 1, 0], "limits_deg": [-10, 10]}], normal=[0, 0, 0])

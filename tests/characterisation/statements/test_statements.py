@@ -249,3 +249,10 @@ def test_a_measurement_that_the_map_calls_impossible_is_led_by_the_view_that_mak
     nothing = standing(np.full((2, 3), np.nan), np.array([1.0, 2.0]), np.zeros(2))
     assert np.isfinite(nothing.risk).all()
     assert nothing.leader == 0
+
+
+def test_an_error_that_is_always_the_same_is_settled():
+    """More trials would change nothing: without this, a study took all that it was allowed."""
+    stated = statement("height", "mm", [0.25] * 20)
+    assert stated.numerical_tolerance == 0 and stated.settled
+    assert not statement("height", "mm", [0.25]).settled

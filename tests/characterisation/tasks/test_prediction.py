@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
+from scipy.stats import binom
 
 from characterisation.features.fits import fit_surface
 from characterisation.features.pose_fit import fit_pose
 from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import Surface
-from characterisation.tasks.covariance import ExpectedPoints
+from characterisation.tasks.covariance import ExpectedPoints, expected_fit
 from characterisation.tasks.measurement_model import evaluate, measurement_model
 from characterisation.tasks.prediction import (
     ExpectedInput,
@@ -151,6 +152,43 @@ def test_of_a_perfect_face_flatness_is_what_its_noise_makes(inputs) -> None:
         for q, one in inputs.items()
     }
     assert expected_measurement(TASK, "flat", twice).uncertainty == pytest.approx(2 * found.uncertainty)
+
+
+@pytest.mark.parametrize(
+    ("radius", "fraction", "doubt", "chance"),
+    [
+        (20.0, 0.9, 0.0, 1.0),
+        (20.0, 0.2, 0.0, 0.0),
+        (20.0, 0.4, 0.1, 0.8413),
+        (20.0, 0.2, 0.1, 0.1587),
+        (0.5, 0.9, 0.0, 0.0),
+    ],
+)
+def test_a_hole_is_possible_where_its_edge_can_be_fitted(clouds, radius, fraction, doubt, chance) -> None:
+    """Fits need F of 0.3 beside the edge and twelve crossings of it; one of radius 0.5 mm has under 6 at 0.7 mm."""
+    hole = {"kind": "circle", "of": ["plane"], "point_mm": [0, -60, 0], "radius_mm": radius}
+    size = {"kind": "radius", "features": ["hole"], "nominal": radius, "unit": "mm"}
+    task = Task.model_validate(
+        {"features": {"plane": TASK.features["plane"], "hole": hole}, "measurements": {"size": size}}
+    )
+    face = seen("plane", clouds["plane"])
+    face = replace(face, fraction=fraction * face.fraction, fraction_error=doubt * face.fraction)
+    known = expected_inputs(task, {"plane": face}, 100)
+    (hole_fit,) = (fit for quantity, fit in known.items() if quantity.features == ("hole",))
+    if radius < 1:
+        assert isinstance(hole_fit, FitError) and "crossings" in str(hole_fit)
+    else:
+        assert hole_fit.fit.chance == pytest.approx(chance, abs=1e-4)
+    assert expected_measurement(task, "size", known).chance <= chance + 1e-4
+
+
+@pytest.mark.parametrize(("fraction", "minimum"), [(0.1, 75), (0.1, 65), (0.5, 340), (0.9, 640)])
+def test_the_chance_of_enough_points_is_that_of_random_losses(clouds, fraction, minimum) -> None:
+    """Of independent pixels, whose noise area is 1 / F, the number of points is binomial."""
+    face = seen("plane", clouds["plane"])
+    face = replace(face, fraction=fraction * face.fraction, area=face.area / fraction)
+    fit = expected_fit(TASK.features["plane"].nominal(), face, minimum)
+    assert fit.chance == pytest.approx(binom.sf(minimum - 1, 700, fraction), abs=0.03)
 
 
 def test_what_is_not_seen_makes_a_measurement_impossible(clouds) -> None:

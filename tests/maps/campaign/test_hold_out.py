@@ -17,7 +17,9 @@ from mitsim.maps.campaign.acquire import simulated_source
 from mitsim.maps.campaign.hold_out import (
     LARGEST_SIGMA_ERROR,
     MOST_REPEATS,
+    _map,
     compare,
+    distances_between,
     held_out_campaign,
     held_out_orders,
     held_out_shots,
@@ -39,11 +41,11 @@ def held(n10, shipped):
     plan = held_out_campaign(MAPS, n10, shipped)
     source = simulated_source(SimulatedSensor(n10), plan.file.samples_per_pixel)
 
-    def hold(roughness, tilt_deg, repeats):
+    def hold(roughness, tilt_deg, repeats, distance=635):
         like = next(
             shot
             for shot in held_out_shots(plan, 1, seed=1)
-            if abs(shot.series.distance - 635) < 1 and str(shot.series.sample.roughness) == str(roughness)
+            if abs(shot.series.distance - distance) < 1 and str(shot.series.sample.roughness) == str(roughness)
         )
         tilt = math.radians(tilt_deg)
         taken = []
@@ -66,6 +68,14 @@ def test_where_all_points_come_back_a_pose_is_taken_as_often_as_was_asked(held):
     assert pair.measured.sigma_error < LARGEST_SIGMA_ERROR * pair.measured.sigma
     # as many clouds were drawn: the same points of each
     assert len(pair.predicted_residuals) == pytest.approx(len(pair.measured_residuals), rel=0.02)
+
+
+def test_residuals_are_those_of_patches_that_the_map_knows(held, shipped):
+    """At the far end of the map the farther half of a tilted coupon is unknown: nothing is predicted of it."""
+    farthest = distances_between(shipped)[-1]
+    pair, _ = held(math.nan, 60, 1, farthest)
+    assert len(pair.predicted_residuals) == pytest.approx(len(pair.measured_residuals), rel=0.03)
+    assert len(pair.measured_residuals) > 1000
 
 
 def test_where_few_points_come_back_a_pose_is_taken_until_sigma_is_known(held):
@@ -91,8 +101,21 @@ def test_an_order_gives_what_this_process_gives(n10, shipped):
     assert there.measured == here.measured and there.predicted == here.predicted
     assert there.measured_residuals.tobytes() == here.measured_residuals.tobytes()
     assert there.predicted_residuals.tobytes() == here.predicted_residuals.tobytes()
-    with pytest.raises(InputError, match="another map"):
+    with pytest.raises(InputError, match="another content"):
         hold_out_order(replace(order, digest="0"))
+
+
+def test_a_worker_reads_a_map_again_that_was_made_again(tmp_path, n10, shipped):
+    """The map of a campaign lies where the former one did; a worker of a cluster has read that."""
+    plan = held_out_campaign(MAPS, n10, shipped)
+    shots = held_out_shots(plan, 1, seed=3)[:1]
+    path = tmp_path / "map.nc"
+    shipped.save(path)
+    (before,) = held_out_orders(plan, shots, path, 1)
+    assert "again" not in _map(before.map_path, before.digest).data.attrs
+    PerformanceMap(shipped.data.assign_attrs(again="yes")).save(path)
+    (after,) = held_out_orders(plan, shots, path, 1)
+    assert _map(after.map_path, after.digest).data.attrs["again"] == "yes"
 
 
 def test_random_normals_reach_every_part_of_the_cap():

@@ -102,7 +102,7 @@ def test_nothing_is_simulated_in_the_place_of_a_device(written, n10):
 
 def test_a_campaign_without_a_device_keeps_the_digests_that_it_had(planned, n10):
     """Written out as it was before there were devices: captures that users have kept stay valid."""
-    from mitsim.maps.campaign.plan import _written
+    from mitsim.sensor.sensor_text import written
 
     axes = [{"name": "pan", "direction": [0, 1, 0], "limits_deg": [-30, 30]}]
     for changes in ({}, {"stage": {"axes": axes}}):
@@ -110,7 +110,7 @@ def test_a_campaign_without_a_device_keeps_the_digests_that_it_had(planned, n10)
         for series in plan.series:
             common = [mitsim.__version__, MEASUREMENT_VERSION, 1, False, 1]
             sample = series.sample
-            text = [*common, _written(n10), sample.origin, sample.label(), f"{series.distance:.6g}"]
+            text = [*common, written(n10), sample.origin, sample.label(), f"{series.distance:.6g}"]
             digest = hashlib.sha256(json.dumps(text).encode()).hexdigest()[:12]
             assert series.name.endswith(f"mm_{digest}")
             assert series.seed == int(digest, 16) % 2**32

@@ -6,8 +6,8 @@ import numpy as np
 
 import characterisation
 from characterisation import PerformanceMap
-from mitsim.maps.campaign.plan import sensor_checksum
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.sensor_text import sensor_checksum
 
 
 def test_how_a_caller_prints_arrays_does_not_change_a_sensor():

@@ -287,3 +287,24 @@ def test_a_coupon_out_of_the_image_is_told(kept, capfd, turn):
     place, shot = next(iter(found_shots(folder, plan).items()))
     pose = read_capture(place).world_from_sensor @ Transform.from_degrees(turn, (0.0, 0.0, 0.0))
     assert "the coupon at its pose is outside the image" in said_of(plan, place, shot, capfd, pose)
+
+
+def test_a_capture_that_was_taken_again_is_measured_again(tmp_path, kept):
+    """The same pose and another image, in the folder of the former; a capture that is the same is not read again."""
+    plan, folder = kept
+    place = next(place for place, shot in found_shots(folder, plan).items() if "white" in shot.series.sample.finish)
+    capture = read_capture(place)
+    read, fractions = [], []
+    for darker in (1, 1, 64):
+        images = {name: stack // darker for name, stack in capture.images.items()}
+        write_capture(replace(capture, images=images), tmp_path / "captures/one", overwrite=True)
+        (shot,) = found_shots(tmp_path / "captures", plan).values()
+
+        def take(shot):
+            read.append(darker)  # noqa: B023 - called in this turn
+            return found_source({tmp_path / "captures/one": shot})(shot)
+
+        measure_captures(plan, [shot], in_turn(take, plan), tmp_path / "map")
+        fractions.append(store.read_shot(tmp_path / "map/coupons", shot).patches["recovered_fraction"].values.mean())
+    assert read == [1, 64]
+    assert fractions[0] == fractions[1] > 0.9 > fractions[2]

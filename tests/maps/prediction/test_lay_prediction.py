@@ -72,17 +72,26 @@ def with_a_lay(sensor, finish) -> PerformanceMap:
     return with_samples(shipped, [PerformanceMap(whole.assign(light_variables([finish.light])))])
 
 
+@pytest.fixture(scope="module")
+def predictors():
+    """Of sensors whose baseline is along x, 28 deg off it, and against it."""
+    sensors = [load_sensor(name) for name in ("ensenso-n10", "david-sls-3", "xema")]
+    return {sensor.name: (sensor, Predictor.of_sensor(sensor, sensor_geometry(sensor))) for sensor in sensors}
+
+
+@pytest.mark.parametrize("name", ["ensenso-n10", "david-sls-3", "xema"])
 @pytest.mark.parametrize("lay_deg", [0.0, 30.0, 135.0])
 @pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.4, 0.2, 0.0), (-0.1, 0.6, 0.0), (-0.5, -0.5, 0.0)])
-def test_the_coupon_of_a_campaign_has_the_lay_angle_that_prediction_finds(n10, predictor, lay_deg, normal):
-    finish = finish_with_lay(n10)
+def test_the_coupon_of_a_campaign_has_the_lay_angle_that_prediction_finds(predictors, name, lay_deg, normal):
+    sensor, predictor = predictors[name]
+    finish = finish_with_lay(sensor)
     normal = np.array([*normal[:2], math.sqrt(1 - normal[0] ** 2 - normal[1] ** 2)])
-    campaign = one_finish_campaign(OneFinish(finish, n10, 80.0), DISTANCE, plan_of(80.0), lay_deg)
+    campaign = one_finish_campaign(OneFinish(finish, sensor, 80.0), DISTANCE, plan_of(80.0), lay_deg)
     pose = campaign.shot(campaign.series[0], normal).sensor_from_coupon.inverse()
     ideal = predictor.ideal(predictor.surfaces(flat_coupon(finish, 20.0), pose))
     middle = np.linalg.norm(ideal.point - ideal.point.mean(axis=0), axis=1).argmin()
     assert ideal.normal[middle] == pytest.approx(normal, abs=0.01)
-    mirror = mirror_direction(ideal.distance[middle], one_finish.mirror_mm(n10))
+    mirror = mirror_direction(ideal.distance[middle], one_finish.mirror_mm(sensor))
     angle = lay_angle_deg(ideal.normal[middle], ideal.along[middle], mirror)
     assert (angle - lay_deg + 90) % 180 - 90 == pytest.approx(0.0, abs=1.0)
 

@@ -154,6 +154,12 @@ def test_the_covariance_keeps_the_images_that_decided_it(tmp_path):
     again = read_rig_covariance(tmp_path / "unit.toml", checked.calibration.rig)
     drifted = with_drift(again, checked.calibration.rig, Drift(temperature_k=1.0))
     assert again.fitted_to == drifted.fitted_to == tuple(shown)
+    rig_file = tmp_path / "unit.yml"
+    assert f'# fitted to "boards/9", SHA-256 {9:064x}' in rig_file.read_text()
+    table = {"calibration": {"file": "unit.yml", "cameras": ["left", "right"], "projector": False}}
+    assert with_calibration(tmp_path / "sensor.toml", table)[0]["cameras"]["left"]["width"] == SIZE[0]
+    opened = cv2.FileStorage(str(rig_file), cv2.FILE_STORAGE_READ)
+    assert opened.getNode("cameraMatrix1").mat().shape == (3, 3)
 
 
 def test_a_calibration_whose_halves_agree_is_not_widened():

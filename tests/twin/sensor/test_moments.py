@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from mitsim.sensor.preset import load_sensor
 from mitsim.twin.sensor.defocus import modulation
 from mitsim.twin.sensor.estimate import FittedKey, combined, pooled
 from mitsim.twin.sensor.moments import Prior, match_moments
+from mitsim.twin.sensor.parameters import room_parameters
+from mitsim.twin.sensor.run import _combined_estimates
+from mitsim.twin.sensor.write import _entries, fit_table
 
 A = np.array([[1.0, 0.4], [0.2, 1.0], [0.5, -0.7]])
 
@@ -70,3 +77,30 @@ def test_modulation_of_blurred_stripes_is_that_of_stripes_that_were_blurred(blur
         wave = np.where((np.arange(int(40 * width * fine)) // (width * fine)) % 2 == 0, 1.0, -1.0)
         seen = gaussian_filter1d(wave, blur * fine, mode="wrap")
         assert modulation(blur, np.array(width)) == pytest.approx(np.abs(seen).mean(), abs=0.01)
+
+
+def test_the_assumed_interval_of_a_room_is_not_stated_as_a_fitted_one():
+    """A slope of 0 within 2 either way is what was assumed before the capture."""
+    key = FittedKey("room.gradient[0]", 0.1, 0.98, "1", ("a",), "dots", determined=False)
+    other = replace(key, key="room.gradient[1]", uncertainty=0.1, determined=True)
+    fit = SimpleNamespace(estimates=[key, other], undetermined=[])
+    rows = fit_table(fit).splitlines()
+    assert "not determined" in rows[2] and " to " not in rows[2] and " to " in rows[3]
+    assert "standard uncertainties -, 0.10;" in _entries(fit)["room.gradient"].comment
+    both = pooled([key, replace(key, uncertainty=0.1, captures=("b",), determined=True)])
+    assert [one.determined for one in both] == [True]
+    assert [one.determined for one in pooled([key, replace(key, captures=("b",))])] == [False]
+
+
+def test_a_room_that_the_dots_do_not_tell_is_named():
+    parameters = tuple(room_parameters(1.0)[:2])
+    moments = SimpleNamespace(determined=np.array([True, False]))
+    fit = SimpleNamespace(
+        parameters=parameters,
+        undetermined=(),
+        moment_fit=moments,
+        in_file_units=lambda: (np.array([1e-6, 0.1]), np.array([1e5, 0.9])),
+    )
+    sensor, imager = load_sensor("ensenso-n10"), SimpleNamespace(undetermined=())
+    estimates, _ = _combined_estimates({"wall": fit}, sensor, imager, None)
+    assert [one.determined for one in estimates] == [True, False]
