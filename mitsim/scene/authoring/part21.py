@@ -18,6 +18,7 @@ from characterisation.files.errors import InputError
 
 #: a record: its number and its text
 _RECORD = re.compile(r"\s*#(\d+)\s*=\s*", re.ASCII)
+_DATA = re.compile(r";\s*DATA\s*[;(]")
 _STOP = re.compile(r"'|/\*|;")
 _TOKEN = re.compile(
     r"\s*(?:(?P<string>'(?:[^']|'')*')|#(?P<reference>\d+)|\.(?P<enumeration>[A-Za-z0-9_]+)\."
@@ -121,7 +122,8 @@ def read_step_text(path: str | Path) -> StepText:
     if "ISO-10303-21" not in text[:2000]:
         raise InputError(path, "", "no ISO-10303-21 in its head", "a STEP file (Part 21)")
     records = {}
-    for statement in _statements(text, max(text.find("DATA"), 0)):
+    data_section = _DATA.search(text)
+    for statement in _statements(text, 0 if data_section is None else data_section.start() + 1):
         match = _RECORD.match(statement)
         if match is not None:
             records[int(match.group(1))] = statement[match.end() :]
