@@ -17,6 +17,8 @@ from mitsim.scene.light_transport.room_light import directional_albedos
 from mitsim.scene.load import load_scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.scene.ray_casting.self_view import sees_itself
+from mitsim.scene.surface.metals import CONSTANTS
+from mitsim.scene.surface.scatter import Deviation
 from mitsim.sensor.imager import electrons_per_radiance
 from mitsim.sensor.pattern import another_mask
 from mitsim.sensor.preset import load_sensor
@@ -32,7 +34,7 @@ from mitsim.study.virtual.plan import measurements_of, race_rendering, trial_dig
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.stated import budget_groups
-from mitsim.study.virtual.study_unknowns import study_unknowns
+from mitsim.study.virtual.study_unknowns import EXPANSION_PER_KELVIN, study_unknowns
 from mitsim.study.virtual.world import Trial
 from tests.smaller_sensors import binned, coarse_sensor, middle_part
 
@@ -144,6 +146,38 @@ def test_the_albedo_of_white_is_its_reflectance():
     scene = load_scene(SCENES / "matt_white.xml", 850.0)
     for albedo in directional_albedos(scene):
         np.testing.assert_allclose(albedo, 0.85, rtol=0.01)
+
+
+def test_each_stock_bsdf_has_its_own_albedo(tmp_path):
+    shape = (
+        '<shape type="rectangle"><transform name="to_world"><scale value="20"/></transform>'
+        '<bsdf type="diffuse"><spectrum name="reflectance" value="{}"/></bsdf></shape>'
+    )
+    (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0">{shape.format(0.2)}{shape.format(0.7)}</scene>')
+    means = [albedo.mean() for albedo in directional_albedos(load_scene(tmp_path / "scene.xml", 850.0))]
+    np.testing.assert_allclose(means, [0.2, 0.7], rtol=0.01)
+
+
+def test_finishes_without_an_id_are_drawn_each_by_its_own_in_every_loading(tmp_path):
+    shape = (
+        '<shape type="rectangle"><transform name="to_world"><scale value="20"/></transform>'
+        '<bsdf type="matt_white"/></shape>'
+    )
+    (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0">{shape * 2}</scene>')
+    asked = []
+
+    def deviation(name):
+        asked.append(name)
+        return Deviation(reflectance=len(asked))
+
+    scenes = [load_scene(tmp_path / "scene.xml", 850.0, deviation=deviation) for _ in range(2)]
+    scenes[1] = scenes[1].deviated(deviation)
+    assert asked == ["finish_0", "finish_1"] * 3
+    assert [shape.bsdf().id() for scene in scenes for shape in scene.shapes] == ["finish_0", "finish_1"] * 2
+
+
+def test_the_expansion_of_every_metal_of_a_finish_is_known():
+    assert set(EXPANSION_PER_KELVIN) == set(CONSTANTS)
 
 
 def test_finishes_are_loaded_with_the_alpha_that_was_drawn():
