@@ -41,7 +41,7 @@ class Scene:
     - ``mitsuba``: the ``mi.Scene``.
     - ``names``: ids of the shapes, in Mitsuba's order.
     - ``finishes`` of the shapes; None for a stock BSDF, about which nothing is known.
-    - ``bounds`` (2, 3): corners of the bounding box [mm], world frame.
+    - ``bounds`` (2, 3): corners of the bounding box of all shapes but lamps [mm], world frame.
     - ``where``: file that it was loaded from, or a description.
     - ``changeable``: whether :meth:`deviated` can change every finish: none is nested in another BSDF or an instance.
     """
@@ -132,7 +132,7 @@ class Scene:
         part = backend.mi.load_dict(
             {"type": "scene", **{f"shape_{i}": shapes[i] for i in chosen}}, parallel=False, optimize=False
         )
-        return Scene(part, names, tuple(self.finishes[i] for i in chosen), bounds_of(part), self.where)
+        return Scene(part, names, tuple(self.finishes[i] for i in chosen), _part_bounds(part), self.where)
 
 
 def load_scene(
@@ -256,11 +256,18 @@ def bounds_of(scene_object: Any) -> NDArray[np.float64]:
     return np.array([np.ravel(box.min), np.ravel(box.max)], float).reshape(2, 3)
 
 
+def _part_bounds(scene: Any) -> NDArray[np.float64]:
+    """Return the :func:`bounds_of` all shapes but lamps, or of lamps if there is nothing else."""
+    shapes = list(scene.shapes())
+    corners = np.stack([bounds_of(shape) for shape in [s for s in shapes if not s.is_emitter()] or shapes])
+    return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
+
+
 def _wrap(scene: Any, finishes: dict[str, Finish], where: str) -> Scene:
     shapes = list(scene.shapes())
     if not shapes:
         raise InputError(where, "shape", "no shape at all", "at least one shape to be seen")
-    bounds = bounds_of(scene)
+    bounds = _part_bounds(scene)
     size = float(np.linalg.norm(bounds[1] - bounds[0]))
     if not 1.0 <= size <= 1e5:
         hint = "lengths are in mm; a part modelled in metres needs <scale value='1000'/>"

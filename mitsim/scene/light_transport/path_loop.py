@@ -30,7 +30,7 @@ from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.low_discrepancy import r3_point, z_order
 from mitsim.scene.light_transport.plain_scene import SceneBsdfs, intersect_plane, single_bsdf, single_plane
 from mitsim.scene.light_transport.projector_light import ProjectedLight, ProjectorLight
-from mitsim.scene.load import Scene
+from mitsim.scene.load import Scene, bounds_of
 from mitsim.scene.ray_casting.camera_rays import CameraRays, bilinear, pixel_area
 from mitsim.scene.ray_casting.eye import Eye
 from mitsim.sensor.transforms import Transform
@@ -66,7 +66,7 @@ def launch(
         pixels = opaque_index(roi.width * roi.height)
         lane, index = index // pixels, index % pixels
     camera = Eye([pose @ rays.camera.sensor_from_camera for pose in poses], lane)
-    projector = ProjectorLight(poses, light.projector, scene.bounds, lane)
+    projector = ProjectorLight(poses, light.projector, bounds_of(scene.mitsuba), lane)
 
     width = opaque_index(roi.width)
     column = index % width + opaque_index(roi.left)
