@@ -10,7 +10,7 @@ image has its own random stream of noise.
 from __future__ import annotations
 
 import zlib
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -49,6 +49,9 @@ class LightOnImagers:
     rendered
         Settings of the rendering: scene, samples_per_pixel, light_path_depth, and indirect_light if it is rendered
         separately.
+    other
+        (h, w) of each camera, the part of every image's radiance that is not the projector's: of a scene with emitters,
+        or a sensor in a known room.
     """
 
     radiance: dict[str, NDArray[np.float32]]
@@ -57,6 +60,7 @@ class LightOnImagers:
     noise: Noise
     world_from_sensor: Transform
     rendered: dict[str, Any]
+    other: dict[str, NDArray[np.float32]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,12 @@ from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.scene.ray_casting.self_view import sees_itself
 from mitsim.scene.surface.metals import CONSTANTS
 from mitsim.scene.surface.scatter import Deviation
+from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.imager import electrons_per_radiance
 from mitsim.sensor.pattern import another_mask
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.rig_parameters import moved
+from mitsim.sensor.sensor_file import RoomTable
 from mitsim.sensor.transforms import Transform, look_at
 from mitsim.study import StudyFile, open_study
 from mitsim.study.session import Session
@@ -461,6 +463,35 @@ def test_scenes_whose_paths_cannot_be_kept_are_rendered_in_every_finish(coarse_n
     assert not maker._view_light(view).kept
     assert found[0] != found[1]
     np.testing.assert_equal(outcomes(study, jobs[1])[1], found[1:])
+
+
+@pytest.mark.parametrize("source", ["lamp", "room"])
+def test_power_is_that_of_the_projector_alone(coarse_n10, tmp_path, monkeypatch, source):
+    place, intensity = '<point name="position" x="99" y="-200" z="400"/>', '<rgb name="intensity" value="0.1"/>'
+    lamp = f'<emitter type="point">{place}{intensity}</emitter>'
+    study = metal_study(coarse_n10, tmp_path, lamp if source == "lamp" else "")
+    if source == "room":
+        study = replace(study, sensor=replace(study.sensor, room=RoomTable(irradiance_w_mm2=1e-6)))
+    images = []
+
+    def exposed(flux, power):
+        projector = replace(study.sensor.projector, flux=flux)
+        maker = measurements_of(replace(study, sensor=replace(study.sensor, projector=projector)), unknowns)
+        lit = maker.lit(study.views[0], replace(unknowns, varied=()).draw(Trial(0)))
+        maker.exposed(lit, PlannedExposure((1e-3,), power), 0)
+        return images.pop()
+
+    def kept(sensor, light, seed):
+        images.append(next(iter(light.radiance.values())))
+        return expose(sensor, light, seed)
+
+    unknowns, expose = study_unknowns(study), SimulatedSensor.expose
+    monkeypatch.setattr(SimulatedSensor, "expose", kept)
+    flux = study.sensor.projector.flux
+    alone, quarter, of_quarter = exposed(1e-9 * flux, 0.25), exposed(flux, 0.25), exposed(0.25 * flux, 1.0)
+    assert alone.mean() > 0.01 * of_quarter.mean()
+    np.testing.assert_allclose(alone, exposed(1e-9 * flux, 1.0), rtol=1e-4, atol=1e-6 * alone.mean())
+    np.testing.assert_allclose(quarter, of_quarter, rtol=1e-3, atol=1e-3 * alone.mean())
 
 
 def test_unknowns_of_a_study_are_checked(tmp_path):
