@@ -174,12 +174,12 @@ def launch(
         continues = hit & (bounce + 1 < rays_at_most)
         sampled, bsdf_weight = bsdf.sample(context, surface, sample1, sample2, continues)
         continues &= bsdf_weight[0] > 0
+        is_delta = mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Delta)
         next_ray = surface.spawn_ray(surface.to_world(sampled.wo))
         if photons:  # photons end at a delta lobe
             reverse_density = dr.select(
                 at_first, 1.0, _density_to_camera(bsdf, surface, sampled.wo, continues & ~at_first)
             )
-            is_delta = mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Delta)
             ratio *= dr.select(is_delta, 0.0, reverse_density * dr.abs(dr.dot(surface.n, next_ray.d)) / sampled.pdf)
             ratio = dr.select(continues, dr.minimum(ratio, _LARGEST_RATIO), 0.0)
         next_path = _PathState(
@@ -188,7 +188,7 @@ def launch(
             origin=dr.select(continues, next_ray.o, origin),
             direction=dr.select(continues, next_ray.d, direction),
             weight=dr.select(continues, weight * bsdf_weight[0], 1.0),
-            pdf=sampled.pdf,
+            pdf=dr.select(is_delta, _LARGEST_RATIO, sampled.pdf),  # sampling an emitter never finds a delta lobe
             length=length,
             ratio=ratio,
             random=random,
@@ -214,7 +214,7 @@ class _PathState:
     origin: Any
     direction: Any
     weight: Any  # of the light of the next ray
-    pdf: Any  # density of its direction [1/sr]
+    pdf: Any  # density of its direction [1/sr], as good as infinite after a delta lobe
     length: Any  # optical length so far [mm]
     ratio: Any  # n_L p_L / (n_C p_C) so far, of photons over camera paths
     random: Any

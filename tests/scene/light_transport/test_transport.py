@@ -195,6 +195,28 @@ LAMPS = {
 }
 
 
+@pytest.mark.parametrize(
+    ("bsdf", "reflectance"),
+    [
+        ({"type": "conductor", "material": "none", "specular_reflectance": 0.9}, 0.9),
+        ({"type": "plastic", "int_ior": 1.5, "ext_ior": 1.0, "diffuse_reflectance": 0.0}, 0.04),
+    ],
+)
+def test_a_lamp_is_seen_in_a_mirror_as_bright_as_the_mirror_reflects(bsdf, reflectance):
+    lamp = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([0, 0, 800]).rotate([1, 0, 0], 180).scale([900, 900, 1]),
+        "bsdf": {"type": "diffuse", "reflectance": 0.0},
+        "emitter": {"type": "area", "radiance": {"type": "uniform", "value": 2.0}},
+    }
+    mirror = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([200, 200, 1]), "bsdf": bsdf}
+    scene = scene_from_dict({"mirror": mirror, "lamp": lamp}, 850)
+    dark = ProjectedPatterns(np.zeros((1, 8, 8)), Projector(pinhole(8, 8, 20.0), flux=1.0))
+    paths, pose = LightPaths(samples=16, seed=1, depth=1), look_at([0, 0, 300], [0, 0, 0], [0, 1, 0])
+    image = trace(scene, CameraRays(pinhole(8, 8, 40.0)), dark, pose, paths)[0]
+    np.testing.assert_allclose(image / 2.0, reflectance, rtol=1e-3)
+
+
 @pytest.mark.parametrize("depth", [1, 3])
 def test_light_of_the_scene_is_that_of_stock_mitsuba(depth):
     """Sky, bulb and panel over a concave metal corner, with the projector on top; then the ambient image alone."""
