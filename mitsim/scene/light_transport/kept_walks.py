@@ -174,7 +174,7 @@ def _candidates(walk: Walk, record: Any, index: Any) -> CandidatePaths:
 
     surfaces = [*walk.surfaces, last]
     code = np.stack([np.asarray(lanes(value)) for value in (uv.x, uv.y, length)], axis=-1)
-    material = np.stack([np.asarray(lanes(surface[0])).astype(np.int8) for surface in surfaces], axis=-1)
+    material = np.stack([np.asarray(lanes(surface[0])).astype(np.int16) for surface in surfaces], axis=-1)
     toward = np.stack(
         [
             np.concatenate([vectors_to_host(lanes(surface[1])), vectors_to_host(lanes(surface[2]))], axis=1)
