@@ -193,11 +193,16 @@ def scene_from_dict(description: dict[str, Any], wavelength_nm: float, where: st
     Raises
     ------
     InputError
-        If there is no shape, or a part in mm cannot have the size.
+        If there is no shape, a part in mm cannot have the size, or a finish is not possible.
     """
     _prepare()
     with loading(wavelength_nm, where) as state:
-        scene = backend.mi.load_dict({"type": "scene", **description}, parallel=False, optimize=False)
+        try:
+            scene = backend.mi.load_dict({"type": "scene", **description}, parallel=False, optimize=False)
+        except Exception:
+            if state.fault is not None:  # Mitsuba wraps it in an error of its own
+                raise state.fault from None
+            raise
     return _wrap(scene, state.finishes, where)
 
 
