@@ -76,7 +76,7 @@ def test_who_is_no_longer_held_leaves_the_scheduler(cluster):
 
 
 def _failing(path):
-    with open(path, "a") as file:
+    with Path(path).open("a") as file:
         file.write("tried\n")
     raise InputError("scene.xml", "", "a fault", "none")
 
