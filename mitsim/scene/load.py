@@ -309,7 +309,7 @@ def _check_round(where: str, name: str, shape: Any) -> None:
 
 
 def _check_xml(path: Path, parameters: dict[str, str]) -> None:
-    root, *_ = trees = checked_trees(path)
+    root, *_ = trees = checked_trees(path, parameters)
     if root.tag != "scene":
         raise InputError(path, "", f"the root element <{root.tag}>", "<scene version='3.0.0'>")
     names = [str(d.get("name")) for d in root.iter("default")]
