@@ -1,8 +1,9 @@
 """Distribute work to the workers of a Dask cluster.
 
 Each order is sent to a worker as plain values, and its result is returned; only this process writes to a folder.
-Workers may join, leave and die during the work: the order of a dead worker goes to another. All workers need this build
-of mitsim (:mod:`mitsim.running.build`). It is compared before anything is sent, and again with every order, since
+Workers may join, leave and die during the work: the order of a dead worker goes to another, as often as the scheduler's
+``distributed.scheduler.allowed-failures`` says. An order that raises an error is not repeated. All workers need this
+build of mitsim (:mod:`mitsim.running.build`). It is compared before anything is sent, and again with every order, since
 workers may join later. They must see the scenes at the same paths, and run one thread each (``dask worker ADDRESS
 --nthreads 1``). The same kind of processor gives the same bytes as one machine.
 
@@ -31,9 +32,6 @@ Result = TypeVar("Result")
 
 #: orders that wait at each worker: enough to keep it busy, few enough to lose little at a stop
 AHEAD = 3
-
-#: number of workers that may die with one order before it is given up
-DEATHS = 5
 
 #: time limit for the answer of the scheduler [s]
 CONNECT_TIMEOUT_S = 10
@@ -91,7 +89,7 @@ class Cluster:
             return
         build = own_build()
         _compare_builds(self.client, self.address, build)
-        executor = self.client.get_executor(pure=False, retries=DEATHS)
+        executor = self.client.get_executor(pure=False)
         try:
             running: dict[Any, Item] = {}
             yield from finished_orders(

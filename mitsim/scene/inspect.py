@@ -217,7 +217,8 @@ def _count_first_hits(scene: Scene) -> tuple[NDArray[np.int64], NDArray[np.int64
 
     Parallel rays arrive from 42 directions around the scene, on a square grid for each direction.
     """
-    radius = 0.51 * float(np.linalg.norm(scene.bounds[1] - scene.bounds[0]))
+    bounds = bounds_of(scene.mitsuba)  # with lamps
+    radius = 0.51 * float(np.linalg.norm(bounds[1] - bounds[0]))
     steps = (np.arange(_ROW) + 0.5) / _ROW * 2 - 1
     grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) * radius
     origins, directions = [], []
@@ -226,7 +227,7 @@ def _count_first_hits(scene: Scene) -> tuple[NDArray[np.int64], NDArray[np.int64
         first = np.cross(direction, axis)
         first /= np.linalg.norm(first)
         offsets = grid @ np.stack([first, np.cross(direction, first)])
-        origins.append(scene.centre + 2 * radius * direction + offsets)
+        origins.append(bounds.mean(axis=0) + 2 * radius * direction + offsets)
         directions.append(np.broadcast_to(-direction, offsets.shape))
     hits = first_hits(scene.mitsuba, np.concatenate(origins), np.concatenate(directions))
     count = len(scene.names)

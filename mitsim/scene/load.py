@@ -132,7 +132,7 @@ class Scene:
         part = backend.mi.load_dict(
             {"type": "scene", **{f"shape_{i}": shapes[i] for i in chosen}}, parallel=False, optimize=False
         )
-        return Scene(part, names, tuple(self.finishes[i] for i in chosen), bounds_of(part), self.where)
+        return Scene(part, names, tuple(self.finishes[i] for i in chosen), _part_bounds(part), self.where)
 
 
 def load_scene(
@@ -193,11 +193,16 @@ def scene_from_dict(description: dict[str, Any], wavelength_nm: float, where: st
     Raises
     ------
     InputError
-        If there is no shape, or a part in mm cannot have the size.
+        If there is no shape, a part in mm cannot have the size, or a finish is not possible.
     """
     _prepare()
     with loading(wavelength_nm, where) as state:
-        scene = backend.mi.load_dict({"type": "scene", **description}, parallel=False, optimize=False)
+        try:
+            scene = backend.mi.load_dict({"type": "scene", **description}, parallel=False, optimize=False)
+        except Exception:
+            if state.fault is not None:  # Mitsuba wraps it in an error of its own
+                raise state.fault from None
+            raise
     return _wrap(scene, state.finishes, where)
 
 
@@ -256,12 +261,18 @@ def bounds_of(scene_object: Any) -> NDArray[np.float64]:
     return np.array([np.ravel(box.min), np.ravel(box.max)], float).reshape(2, 3)
 
 
+def _part_bounds(scene: Any) -> NDArray[np.float64]:
+    """Return the :func:`bounds_of` all shapes but lamps, or of lamps if there is nothing else."""
+    shapes = list(scene.shapes())
+    corners = np.stack([bounds_of(shape) for shape in [s for s in shapes if not s.is_emitter()] or shapes])
+    return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
+
+
 def _wrap(scene: Any, finishes: dict[str, Finish], where: str) -> Scene:
     shapes = list(scene.shapes())
     if not shapes:
         raise InputError(where, "shape", "no shape at all", "at least one shape to be seen")
-    seen = [bounds_of(shape) for shape in shapes if not shape.is_emitter()] or [bounds_of(scene)]
-    bounds = np.array([np.min(seen, axis=0)[0], np.max(seen, axis=0)[1]])
+    bounds = _part_bounds(scene)
     size = float(np.linalg.norm(bounds[1] - bounds[0]))
     if not 1.0 <= size <= 1e5:
         hint = "lengths are in mm; a part modelled in metres needs <scale value='1000'/>"
@@ -298,7 +309,7 @@ def _check_round(where: str, name: str, shape: Any) -> None:
 
 
 def _check_xml(path: Path, parameters: dict[str, str]) -> None:
-    root, *_ = trees = checked_trees(path)
+    root, *_ = trees = checked_trees(path, parameters)
     if root.tag != "scene":
         raise InputError(path, "", f"the root element <{root.tag}>", "<scene version='3.0.0'>")
     names = [str(d.get("name")) for d in root.iter("default")]

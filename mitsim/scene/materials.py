@@ -75,6 +75,8 @@ class Loading:
     - ``sprayed``: whether every finish is under a matt white spray.
     - ``finishes`` loaded so far, by the id of the BSDF.
     - ``fault``: first error of the author. It is kept here because Mitsuba replaces our exceptions by its own.
+    - ``unnamed``: numbers of BSDFs without an id of their own. They start anew, so that another loading of the scene
+      gives each the same id.
     """
 
     wavelength_nm: float = 850.0
@@ -84,6 +86,7 @@ class Loading:
     sprayed: bool = False
     finishes: dict[str, Finish] = field(default_factory=dict)
     fault: InputError | None = None
+    unnamed: Iterator[int] = field(default_factory=itertools.count)
 
 
 # state of scenes that a program loads by Mitsuba itself: nobody asks for their finishes
@@ -92,7 +95,6 @@ _OUTSIDE = Loading()
 # not a context variable: Mitsuba itself makes BSDFs in threads of its own
 _current = _OUTSIDE
 _lock = threading.Lock()
-_anonymous = itertools.count()
 
 
 @contextmanager
@@ -215,10 +217,9 @@ def _make_bsdf(props: Any, finish_of: Callable[[Deviation], Finish]) -> Any:
     """
     from mitsim.scene.backend import mi
 
-    numbers = _anonymous if _current is _OUTSIDE else itertools.count()
     name = props.id()
     while not name or name in _current.finishes:
-        name = f"{props.id() or 'finish'}_{next(numbers)}"
+        name = f"{props.id() or 'finish'}_{next(_current.unnamed)}"
     if _current.sprayed:
         finish_of = partial(_white_finish, USUAL_REFLECTANCE["matt_white"], _current.wavelength_nm)
 

@@ -48,8 +48,10 @@ _UNIT = 5e-5
 _ENCODING = re.compile(rb"""^[^>]*?encoding\s*=\s*["']([^"']*)["']""")
 
 
-def checked_trees(path: Path) -> list[ElementTree.Element]:
+def checked_trees(path: Path, parameters: Mapping[str, str] | None = None) -> list[ElementTree.Element]:
     """Read a scene XML and its includes, reject what Mitsuba cannot handle, and return their root elements.
+
+    ``parameters`` replace the values of ``<default>`` elements, of which names of files may consist.
 
     Raises
     ------
@@ -57,7 +59,7 @@ def checked_trees(path: Path) -> list[ElementTree.Element]:
         If a file is missing, does not parse, is not UTF-8, or is too large or too deeply nested. Also if it refers to
         something that is not a regular file.
     """
-    return [root for _, root in _with_includes(path)]
+    return [root for _, root in _with_includes(path, dict(parameters or {}))]
 
 
 def check_rotations(path: Path, trees: Sequence[ElementTree.Element], parameters: Mapping[str, str]) -> None:
@@ -95,7 +97,7 @@ def scene_files(path: Path, parameters: Mapping[str, str]) -> list[Path]:
     InputError
         As :func:`checked_trees`.
     """
-    trees = _with_includes(path)
+    trees = _with_includes(path, dict(parameters))
     elements = [element for _, root in trees for element in root.iter()]
     values = {str(e.get("name")): str(e.get("value")) for e in elements if e.tag == "default"} | dict(parameters)
     folders = [path.parent]
@@ -128,10 +130,13 @@ def _filled_in(text: str, values: Mapping[str, str]) -> str:
     return text
 
 
-def _with_includes(path: Path, include_depth: int = 0) -> list[tuple[Path, ElementTree.Element]]:
+def _with_includes(
+    path: Path, values: dict[str, str], include_depth: int = 0
+) -> list[tuple[Path, ElementTree.Element]]:
     """Return path and checked root element of a scene XML, then those of its includes.
 
-    ``include_depth`` is the number of includes that lead to this file.
+    ``values`` of parameters get those of the file's ``<default>`` elements that they lack. ``include_depth`` is the
+    number of includes that lead to this file.
     """
     xml_files = _xml_files_beside(path)
     data = read_bounded(path, "a Mitsuba scene XML", nearest(path.name, xml_files), LARGEST_XML)
@@ -149,6 +154,7 @@ def _with_includes(path: Path, include_depth: int = 0) -> list[tuple[Path, Eleme
         raise InputError(path, "", "a null character", "text")
     root = _parsed(path, text)
     trees = [(path, root)]
+    values |= {str(e.get("name")): str(e.get("value")) for e in root.iter("default")} | values
     bsdfs: dict[ElementTree.Element, int] = {}
     for parent in root.iter():
         for child in parent:
@@ -162,11 +168,12 @@ def _with_includes(path: Path, include_depth: int = 0) -> list[tuple[Path, Eleme
                 path, f"{element.tag} {element.get('type')}", "no filename", "<string name='filename' value='...'/>"
             )
         for name in names:
-            _check_named(path, name)
+            _check_named(path, _filled_in(name, values))
         if element.tag == "include":
             if include_depth >= _MOST_INCLUDES:
                 raise InputError(path, "include", f"files that include one another over {_MOST_INCLUDES} deep", "fewer")
-            trees += _with_includes(path.parent / str(element.get("filename")), include_depth + 1)
+            included = path.parent / _filled_in(str(element.get("filename")), values)
+            trees += _with_includes(included, values, include_depth + 1)
     return trees
 
 

@@ -4,14 +4,16 @@ Signal chain: pattern value 0..1 -> response curve -> black level -> irradiance 
 toward the corners -> a point of the lens's aperture -> radiant intensity toward a surface -> irradiance there.
 
 With flux Phi [W] of an all-white frame of W x H pixels and focal lengths fx, fy [px], the plane z = 1 receives
-E_1 = Phi fx fy / (W H) per unit of its (dimensionless) area. A direction at angle theta to the axis then has the
-radiant intensity I = E_1 / cos^3(theta) [W/sr], and a surface at distance r and incidence beta receives
+E_1 = Phi fx fy / (W H) per unit of its (dimensionless) area. Every pixel has the same flux, so a lens with distortion
+multiplies E_1 by the area of the distorted image of a small area of the plane. A direction at angle theta to the axis
+then has the radiant intensity I = E_1 / cos^3(theta) [W/sr], and a surface at distance r and incidence beta receives
 I cos(beta) / r^2 [W/mm^2]. (Mitsuba's own ``projector`` plugin emits pi times that for the same numbers.)
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +45,17 @@ class Projector:
     focus_mm: float = np.inf
     corner_illumination: float = 1.0
     pixel_gap: float = 0.0
+
+    @cached_property
+    def is_stretched(self) -> bool:
+        """Whether distortion changes the irradiance."""
+        return self.optics.model == "fisheye" or bool(self.optics.distortion.any())
+
+    def recalibrated(self, optics: Camera) -> Projector:
+        """Return the projector with optics close to its own: without distortion, it keeps its irradiance."""
+        other = replace(self, optics=optics)
+        vars(other)["is_stretched"] = self.is_stretched  # no field: checksums of sensors contain the fields
+        return other
 
     @property
     def plane_irradiance(self) -> float:

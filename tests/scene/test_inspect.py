@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 import trimesh
@@ -284,6 +286,24 @@ def test_a_finish_of_an_included_file_has_its_type(tmp_path):
         tmp_path, f'<include filename="finish.xml"/><shape type="cube" id="a">{TEN}<ref id="f"/></shape>'
     )
     assert shapes["a"].bsdf == "roughconductor"
+
+
+def test_names_of_files_may_consist_of_parameters(tmp_path):
+    for name in ("ball", "cube"):
+        kind = f'<shape type="{"sphere" if name == "ball" else name}" id="{name}">{TEN}{WHITE}</shape>'
+        (tmp_path / f"{name}.xml").write_text(f'<scene version="3.0.0">{kind}</scene>')
+    (tmp_path / "scene.xml").write_text(
+        '<scene version="3.0.0"><default name="part" value="ball"/><include filename="$part.xml"/></scene>'
+    )
+    assert load_scene(tmp_path / "scene.xml", 850).names == ("ball",)
+    assert load_scene(tmp_path / "scene.xml", 850, {"part": "cube"}).names == ("cube",)
+    (tmp_path / "mesh.xml").write_text(
+        '<scene version="3.0.0"><default name="part" value="no"/><shape type="ply">'
+        '<string name="filename" value="$part.ply"/></shape></scene>'
+    )
+    os.mkfifo(tmp_path / "pipe.ply")
+    with pytest.raises(InputError, match="not a regular file"):
+        load_scene(tmp_path / "mesh.xml", 850, {"part": "pipe"})
 
 
 def test_a_rotation_about_a_unit_vector_keeps_sizes_and_others_are_refused(tmp_path):

@@ -11,8 +11,8 @@ import pytest
 
 from characterisation.files.errors import InputError
 from mitsim.scene.light_transport.room_light import directional_albedos
-from mitsim.scene.load import load_scene, scene_from_dict
-from mitsim.scene.ray_casting.triangles import hull_corners
+from mitsim.scene.load import bounds_of, load_scene, scene_from_dict
+from mitsim.scene.ray_casting.triangles import hull_corners, triangles
 from mitsim.scene.surface.scatter import Deviation
 
 TWO = "two_pillars/two_pillars.xml"
@@ -25,7 +25,23 @@ def test_features_and_finishes_of_the_artefact(scenes):
     assert (finish["plane"].name, finish["plane"].roughness) == ("aluminium/ground", 0.74)
     assert finish["pillar2"].roughness == 0.09
     assert np.allclose(scene.bounds, [[-90, -60, 0], [90, 60, 60]])
+    assert np.array_equal(scene.bounds, bounds_of(scene.mitsuba))
     assert scene.only("pillar1").names == ("pillar1",)
+
+
+def test_a_lamp_does_not_move_the_part(scenes, tmp_path):
+    """Views are spread about the centre of the part, regions are those of its hull, and it must have a size."""
+    plain = load_scene(scenes / TWO, 850)
+    lamp = (
+        '<shape type="rectangle" id="lamp"><transform name="to_world"><scale value="50"/><translate z="5000"/>'
+        '</transform><emitter type="area"><rgb name="radiance" value="1"/></emitter></shape></scene>'
+    )
+    (tmp_path / "lit.xml").write_text((scenes / TWO).read_text().replace("</scene>", lamp))
+    lit = load_scene(tmp_path / "lit.xml", 850)
+    assert np.array_equal(lit.bounds, plain.bounds) and np.array_equal(lit.centre, plain.centre)
+    assert np.array_equal(hull_corners(lit), hull_corners(plain))
+    assert lit.only("plane", "lamp").bounds[1, 2] == 0 and lit.only("lamp").bounds[1, 2] == 5000
+    assert len(triangles(lit)) > len(triangles(plain))  # it can still be in the sensor's way
 
 
 def test_matt_white_has_no_roughness(scenes):
@@ -151,14 +167,3 @@ def test_stock_bsdfs_without_an_id_have_their_own_albedo(tmp_path):
     grey = '<bsdf type="diffuse"><spectrum name="reflectance" value="{}"/></bsdf>'
     scene = load_scene(inline(tmp_path, grey.format(0.5), grey.format(0.1)), 850)
     np.testing.assert_allclose([albedo.mean() for albedo in directional_albedos(scene)], [0.5, 0.1], rtol=1e-3)
-
-
-def test_a_lamp_is_no_part_of_the_bounds(tmp_path):
-    lamp = (
-        '<shape type="rectangle"><transform name="to_world"><translate z="900"/></transform>'
-        '<emitter type="area"><spectrum name="radiance" value="1"/></emitter></shape>'
-    )
-    alone, lit = (load_scene(inline(tmp_path, '<bsdf type="matt_white"/>', extra=extra), 850) for extra in ("", lamp))
-    np.testing.assert_array_equal(lit.bounds, alone.bounds)
-    np.testing.assert_allclose(lit.bounds, [[-20, -20, -20], [20, 20, 20]])
-    np.testing.assert_array_equal(hull_corners(lit), hull_corners(alone))

@@ -11,7 +11,7 @@ import pytest
 from characterisation.files.errors import InputError
 from mitsim.scene import backend
 from mitsim.scene.bsdf_descriptions import gloss_paint_bsdf, metal_bsdf, powder_coat_bsdf
-from mitsim.scene.load import load_scene
+from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.materials import Finish
 from mitsim.scene.surface.energy import directional_albedo, energy_factors
 from mitsim.scene.surface.machined import MachinedFace, machined
@@ -243,6 +243,26 @@ def test_what_an_author_gets_wrong_is_told(tmp_path, said, field, says):
     assert caught.value.field == field
     assert says in str(caught.value)
     assert "part.xml" in caught.value.where
+
+
+@pytest.mark.parametrize("wavelength_nm", [365.0, 1064.0])
+def test_metal_beyond_its_tabulated_constants_is_told(tmp_path, wavelength_nm):
+    (tmp_path / "part.xml").write_text(
+        f'<scene version="3.0.0"><shape type="rectangle">{metal(RA)}'
+        '<transform name="to_world"><scale value="50"/></transform></shape></scene>'
+    )
+    with pytest.raises(InputError, match=f"{wavelength_nm:g} nm; allowed: 400 to 1000 nm"):
+        load_scene(tmp_path / "part.xml", wavelength_nm)
+    shape = {"type": "rectangle", "bsdf": {"type": "machined_metal", "Ra": 0.4}}
+    with pytest.raises(InputError, match=f"{wavelength_nm:g} nm; allowed: 400 to 1000 nm"):
+        scene_from_dict({"shape": shape}, wavelength_nm)
+
+
+@pytest.mark.parametrize("row", ["{0}", "{0},1,2"])
+def test_a_profile_with_other_columns_than_its_header_is_told(tmp_path, row):
+    (tmp_path / "rough.csv").write_text("x_um,z_um\n" + "\n".join(row.format(i) for i in range(5000)))
+    with pytest.raises(InputError, match="numbers in a row; allowed: two"):
+        load(tmp_path, metal('<string name="profile" value="rough.csv"/>'))
 
 
 def test_a_paint_cannot_be_given_twice(tmp_path):

@@ -38,8 +38,6 @@ class LightOnImagers:
     ----------
     radiance
         (P, h, w) of each camera in its region [W / (mm^2 sr)].
-    other
-        (h, w) of each camera: what of it is not the projector's; none without lamps and a known room.
     rois
         Region of each camera's image.
     exposures
@@ -51,6 +49,9 @@ class LightOnImagers:
     rendered
         Settings of the rendering: scene, samples_per_pixel, light_path_depth, and indirect_light if it is rendered
         separately.
+    other
+        (h, w) of each camera, the part of every image's radiance that is not the projector's: of a scene with emitters,
+        or a sensor in a known room.
     """
 
     radiance: dict[str, NDArray[np.float32]]

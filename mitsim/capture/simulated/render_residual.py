@@ -116,11 +116,14 @@ def render_residual(
         return selected
 
     one, other, finer = electrons_per_s(0, 1), electrons_per_s(1, 1), electrons_per_s(2, 4)
-    exposure = sensor.exposure.exposures(finer[np.argmax(finer.mean(axis=(1, 2)))], sensor.imager.full_well)[0]
-    lit = (finer > 0) & (finer * np.float32(exposure) < sensor.imager.full_well)
+    exposures = sensor.exposure.exposures(finer[np.argmax(finer.mean(axis=(1, 2)))], sensor.imager.full_well)
+    fitting = np.zeros_like(finer)  # the longest exposure that does not saturate the pixel
+    for exposure in sorted(exposures):
+        fitting[finer * np.float32(exposure) < sensor.imager.full_well] = exposure
+    lit = (finer > 0) & (fitting > 0)
     if not lit.any():
         return RenderResidual(float("nan"), float("nan"), float("nan"))
-    one, other, finer = (images[lit] * exposure for images in (one, other, finer))
+    one, other, finer = (images[lit] * fitting[lit] for images in (one, other, finer))
     temporal = temporal_noise(finer, sensor.imager)
     noise = (one - other) / np.sqrt(2.0) / temporal
     error = (0.5 * (one + other) - finer) / temporal

@@ -99,7 +99,8 @@ class SimulatedSensor:
         """Return a sensor of the same type with a calibration close to this one's.
 
         Without another mask, the patterns of the projector are shared: they need most memory on the device. Speckle is
-        still drawn for the pixels of this sensor's rig, because a small change does not affect its statistics.
+        still drawn for the pixels of this sensor's rig, because a small change does not affect its statistics. A
+        projector that has no distortion in this sensor's rig keeps its irradiance for the same reason.
 
         Parameters
         ----------
@@ -113,8 +114,7 @@ class SimulatedSensor:
             this unit's.
         """
         other = copy.copy(self)
-        optics = rig.projector or self.sensor.projector.optics
-        projector = replace(self.sensor.projector, optics=optics)
+        projector = self.sensor.projector.recalibrated(rig.projector or self.sensor.projector.optics)
         other.sensor = replace(self.sensor, rig=rig, projector=projector, pattern=mask or self.sensor.pattern)
         cameras = self.sensor.misaligned(rig).cameras
         other.rays = {name: self.rays[name].recalibrated(camera) for name, camera in cameras.items()}

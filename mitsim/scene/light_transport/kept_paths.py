@@ -57,7 +57,7 @@ class CandidatePaths:
     pixel: NDArray[np.int32]
     weight: Floats
     code: Floats
-    material: NDArray[np.int8]
+    material: NDArray[np.int16]
     toward: Floats
 
     def __len__(self) -> int:
@@ -82,7 +82,7 @@ class CandidatePaths:
         if not parts:
             nothing = np.empty((0, surfaces, 6), np.float32)
             return cls(
-                np.empty(0, np.int32), nothing[:, 0, 0], nothing[:, 0, :3], np.empty((0, surfaces), np.int8), nothing
+                np.empty(0, np.int32), nothing[:, 0, 0], nothing[:, 0, :3], np.empty((0, surfaces), np.int16), nothing
             )
         return cls(
             np.concatenate([part.pixel for part in parts]),
@@ -96,7 +96,7 @@ class CandidatePaths:
 class Vertices:
     """The surfaces of paths, sorted by material: their BSDFs are evaluated with one call for each material."""
 
-    def __init__(self, material: NDArray[np.int8], toward: Floats) -> None:
+    def __init__(self, material: NDArray[np.int16], toward: Floats) -> None:
         flat = material.ravel()
         order = np.argsort(flat, kind="stable")
         order = order[np.searchsorted(flat[order], 0) :]

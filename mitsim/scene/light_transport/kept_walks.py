@@ -17,7 +17,7 @@ from mitsim.scene.device import opaque, opaque_index, vectors_to_host
 from mitsim.scene.light_transport.kept_paths import CandidatePaths
 from mitsim.scene.light_transport.plain_scene import SceneBsdfs
 from mitsim.scene.light_transport.projector_light import ProjectorLight
-from mitsim.scene.load import Scene
+from mitsim.scene.load import Scene, bounds_of
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.scene.ray_casting.eye import Eye
 from mitsim.scene.turned_lay import from_z_axis
@@ -84,7 +84,7 @@ class Tracer:
     ) -> None:
         self.scene, self.rays, self.roi, self.tracing = scene, rays, roi, tracing
         self.camera = Eye(pose @ rays.camera.sensor_from_camera)
-        self.projector = ProjectorLight(pose, projector, scene.bounds)
+        self.projector = ProjectorLight(pose, projector, bounds_of(scene.mitsuba))
         self.bsdfs = SceneBsdfs(scene, tracing.bsdfs)
         self.drawn = mi.Int32(np.asarray([*tracing.drawn, -1], np.int32))
         self.all_drawn = min(tracing.drawn) >= 0
@@ -174,7 +174,7 @@ def _candidates(walk: Walk, record: Any, index: Any) -> CandidatePaths:
 
     surfaces = [*walk.surfaces, last]
     code = np.stack([np.asarray(lanes(value)) for value in (uv.x, uv.y, length)], axis=-1)
-    material = np.stack([np.asarray(lanes(surface[0])).astype(np.int8) for surface in surfaces], axis=-1)
+    material = np.stack([np.asarray(lanes(surface[0])).astype(np.int16) for surface in surfaces], axis=-1)
     toward = np.stack(
         [
             np.concatenate([vectors_to_host(lanes(surface[1])), vectors_to_host(lanes(surface[2]))], axis=1)

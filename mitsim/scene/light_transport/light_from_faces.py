@@ -19,7 +19,7 @@ from mitsim.scene.backend import dr, mi
 from mitsim.scene.first_hits import shape_indices
 from mitsim.scene.light_transport.plain_scene import SceneBsdfs
 from mitsim.scene.light_transport.projector_light import ProjectedPatterns, ProjectorLight
-from mitsim.scene.load import Scene
+from mitsim.scene.load import Scene, bounds_of
 from mitsim.scene.ray_casting.camera_rays import CameraRays, bilinear
 from mitsim.scene.ray_casting.eye import Eye
 from mitsim.sensor.camera import Camera
@@ -110,7 +110,7 @@ def _traced(
     camera = rays.camera
     optics = projector.optics
     white = ProjectedPatterns(np.ones((1, optics.height, optics.width), np.float32), projector)
-    source = ProjectorLight([pose], projector, scene.bounds)
+    source = ProjectorLight([pose], projector, bounds_of(scene.mitsuba))
     eye = Eye([pose @ camera.sensor_from_camera])
     index = dr.arange(mi.UInt32, samples * roi.width * roi.height)
     pixel = index % (roi.width * roi.height)

@@ -45,7 +45,7 @@ from mitsim.scene.device import opaque, opaque_index
 from mitsim.scene.light_transport.low_discrepancy import r3_point, z_order
 from mitsim.scene.light_transport.plain_scene import SceneBsdfs
 from mitsim.scene.light_transport.projector_light import ProjectedLight, ProjectorLight
-from mitsim.scene.load import Scene
+from mitsim.scene.load import Scene, bounds_of
 from mitsim.scene.ray_casting.camera_rays import CameraRays, pixel_area
 from mitsim.scene.ray_casting.eye import Eye, shadow_ray
 from mitsim.sensor.transforms import Transform
@@ -142,7 +142,7 @@ def _launch(
         per_pose = opaque_index(len(batch))
         lane, index = index // per_pose, index % per_pose
     camera = Eye([pose @ rays.camera.sensor_from_camera for pose in poses], lane)
-    projector = ProjectorLight(poses, light.projector, scene.bounds, lane)
+    projector = ProjectorLight(poses, light.projector, bounds_of(scene.mitsuba), lane)
     has_aperture = rays.aperture_mm > 0
     aperture, inverse_focus = (opaque(value) for value in (0.5 * rays.aperture_mm, 1.0 / rays.focus_mm))
     in_row, surfaces = (opaque_index(n) for n in (rays.camera.width, depth))

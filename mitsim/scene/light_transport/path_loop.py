@@ -30,7 +30,7 @@ from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.low_discrepancy import r3_point, z_order
 from mitsim.scene.light_transport.plain_scene import SceneBsdfs, intersect_plane, single_bsdf, single_plane
 from mitsim.scene.light_transport.projector_light import ProjectedLight, ProjectorLight
-from mitsim.scene.load import Scene
+from mitsim.scene.load import Scene, bounds_of
 from mitsim.scene.ray_casting.camera_rays import CameraRays, bilinear, pixel_area
 from mitsim.scene.ray_casting.eye import Eye
 from mitsim.sensor.transforms import Transform
@@ -66,7 +66,7 @@ def launch(
         pixels = opaque_index(roi.width * roi.height)
         lane, index = index // pixels, index % pixels
     camera = Eye([pose @ rays.camera.sensor_from_camera for pose in poses], lane)
-    projector = ProjectorLight(poses, light.projector, scene.bounds, lane)
+    projector = ProjectorLight(poses, light.projector, bounds_of(scene.mitsuba), lane)
 
     width = opaque_index(roi.width)
     column = index % width + opaque_index(roi.left)
@@ -174,16 +174,14 @@ def launch(
         continues = hit & (bounce + 1 < rays_at_most)
         sampled, bsdf_weight = bsdf.sample(context, surface, sample1, sample2, continues)
         continues &= bsdf_weight[0] > 0
-        direction_pdf = sampled.pdf
-        if has_ambient:  # no other estimate of an emitter that a mirror shows
-            mirrored = mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Delta)
-            direction_pdf = dr.select(mirrored, ALONE, direction_pdf)
+        is_delta = mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Delta)
+        # no other estimate finds an emitter that a mirror shows
+        direction_pdf = dr.select(is_delta, ALONE, sampled.pdf) if has_ambient else sampled.pdf
         next_ray = surface.spawn_ray(surface.to_world(sampled.wo))
         if photons:  # photons end at a delta lobe
             reverse_density = dr.select(
                 at_first, 1.0, _density_to_camera(bsdf, surface, sampled.wo, continues & ~at_first)
             )
-            is_delta = mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Delta)
             ratio *= dr.select(is_delta, 0.0, reverse_density * dr.abs(dr.dot(surface.n, next_ray.d)) / sampled.pdf)
             ratio = dr.select(continues, dr.minimum(ratio, _LARGEST_RATIO), 0.0)
         next_path = _PathState(
@@ -218,7 +216,7 @@ class _PathState:
     origin: Any
     direction: Any
     weight: Any  # of the light of the next ray
-    pdf: Any  # density of its direction [1/sr]
+    pdf: Any  # density of its direction [1/sr], as good as infinite after a delta lobe
     length: Any  # optical length so far [mm]
     ratio: Any  # n_L p_L / (n_C p_C) so far, of photons over camera paths
     random: Any

@@ -235,6 +235,7 @@ class ProjectorLight(Eye):
         # value, and a comparison of sensors one for each sensor
         self.per_size = [opaque(1.0 / n) for n in (optics.width, optics.height)]
         self.distortion = Distortion(optics)
+        self.has_stretch = projector.is_stretched
         self.irradiance = opaque(projector.plane_irradiance)
         self.has_aperture = projector.aperture_mm > 0
         self.radius = opaque(0.5 * projector.aperture_mm)
@@ -304,6 +305,8 @@ class ProjectorLight(Eye):
             facing &= ~scene.ray_test(shadow_ray(surface, toward, distance), facing)
         cosine = z / distance
         arriving = self.irradiance / (dr.square(cosine) * cosine * dr.square(distance))
+        if self.has_stretch:
+            arriving *= self.distortion.stretch(x, y)
         if self.has_corner_loss:
             arriving *= self._corner_loss(u, v)
         return toward, dr.select(facing, arriving, 0.0), self._texture(u, v), distance
@@ -331,6 +334,8 @@ class ProjectorLight(Eye):
         x, y = (low + p * extent for p, (low, extent) in zip((position.x, position.y), self.extents, strict=True))
         u, v, inside = self.distortion.image(x, y, True)
         flux = self.irradiance * self.area
+        if self.has_stretch:
+            flux *= self.distortion.stretch(x, y)
         if self.has_corner_loss:
             flux *= self._corner_loss(u, v)
         local, origin = mi.Vector3f(x, y, 1.0), self.position

@@ -41,6 +41,7 @@ class Distortion:
         self._focal, self._principal = [opaque(k[i, i]) for i in (0, 1)], [opaque(c) for c in k[:2, 2]]
         self._coefficients = [opaque(c) for c in coefficients[:12]]
         self._tilt = None if homography is None else [[opaque(h) for h in row] for row in homography]
+        self._tilt_area = opaque(1.0 if homography is None else float(np.linalg.det(homography)))
         self._last = [opaque(n - 0.5) for n in (optics.width, optics.height)]
         self._reach_squared = opaque(self.reach**2)
 
@@ -58,6 +59,35 @@ class Distortion:
         u, v = self.pixel(x, y)
         return u, v, near & (u > -0.5) & (u < self._last[0]) & (v > -0.5) & (v < self._last[1])
 
+    def stretch(self, x: Any, y: Any) -> Any:
+        """Return the area of the image of a small area at the ideal image point (x, y), 1 without distortion [1].
+
+        It is the determinant of the derivative of the distorted by the ideal point.
+        """
+        if self._fisheye:
+            k1, k2, k3, k4 = self._coefficients[:4]
+            radius = dr.maximum(dr.sqrt(x * x + y * y), 1e-6)
+            theta = dr.atan(radius)
+            t2 = theta * theta
+            bent = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+            slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+            return dr.abs(bent / radius * slope / (1 + radius * radius))
+        k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = self._coefficients
+        r2 = x * x + y * y
+        above, below = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        radial = above / below
+        by_r2 = (k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
+        prism_x, prism_y = 2 * (s1 + 2 * r2 * s2), 2 * (s3 + 2 * r2 * s4)
+        shared = 2 * (x * y * by_r2 + p1 * x + p2 * y)
+        xx = radial + 2 * x * x * by_r2 + 2 * p1 * y + 6 * p2 * x + x * prism_x
+        yy = radial + 2 * y * y * by_r2 + 6 * p1 * y + 2 * p2 * x + y * prism_y
+        area = xx * yy - (shared + y * prism_x) * (shared + x * prism_y)
+        if self._tilt is not None:
+            t, (x, y) = self._tilt, self._perspective(x, y, tilted=False)
+            w = t[2][0] * x + t[2][1] * y + t[2][2]
+            area = area * self._tilt_area / (w * w * w)
+        return dr.abs(area)
+
     def _equidistant(self, x: Any, y: Any) -> tuple[Any, Any]:
         k1, k2, k3, k4 = self._coefficients[:4]
         radius = dr.sqrt(x * x + y * y)
@@ -68,7 +98,7 @@ class Distortion:
         )
         return x * scale, y * scale
 
-    def _perspective(self, x: Any, y: Any) -> tuple[Any, Any]:
+    def _perspective(self, x: Any, y: Any, tilted: bool = True) -> tuple[Any, Any]:
         k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = self._coefficients
         r2 = x * x + y * y
         radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
@@ -76,7 +106,7 @@ class Distortion:
             x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + r2 * (s1 + r2 * s2),
             y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + r2 * (s3 + r2 * s4),
         )
-        if self._tilt is not None:
+        if tilted and self._tilt is not None:
             t = self._tilt
             w = t[2][0] * x + t[2][1] * y + t[2][2]
             x, y = (t[0][0] * x + t[0][1] * y + t[0][2]) / w, (t[1][0] * x + t[1][1] * y + t[1][2]) / w

@@ -25,13 +25,14 @@ from mitsim.scene.load import Scene, bounds_of
 _ANGLES = np.linspace(0, 2 * np.pi, 129)
 
 
-def triangles(scene: Scene) -> Floats:
+def triangles(scene: Scene, lamps: bool = True) -> Floats:
     """Return triangles (n, 3, 3) [mm], world frame, with corners anticlockwise as seen from the side of the normal.
 
     Shapes whose BSDF transmits all light unchanged (``null``) are left out, because they bound a medium and are not
-    solid. Glass is solid.
+    solid. Glass is solid. ``lamps`` are left out on request.
     """
-    return np.concatenate([np.empty((0, 3, 3)), *triangles_by_shape(scene).values()])
+    parts = [_of_shape(shape) for shape in scene.shapes if _solid(shape) and (lamps or not shape.is_emitter())]
+    return np.concatenate([np.empty((0, 3, 3)), *parts])
 
 
 def triangles_by_shape(scene: Scene) -> dict[str, Floats]:
@@ -42,8 +43,7 @@ def triangles_by_shape(scene: Scene) -> dict[str, Floats]:
 
 def hull_corners(scene: Scene) -> Floats:
     """Return the corners (k, 3) [mm], world frame, of the convex hull of all solid surfaces but lamps."""
-    parts = [_of_shape(shape) for shape in scene.shapes if _solid(shape) and not shape.is_emitter()]
-    corners = np.unique(np.concatenate([np.empty((0, 3, 3)), *parts]).reshape(-1, 3), axis=0)
+    corners = np.unique(triangles(scene, lamps=False).reshape(-1, 3), axis=0)
     try:
         return np.asarray(corners[ConvexHull(corners).vertices])
     except QhullError:  # all in one plane, or on a line

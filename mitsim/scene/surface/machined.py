@@ -237,6 +237,9 @@ def check(face: MachinedFace, where: str) -> None:
             if getattr(face, name) is not None:
                 key = "nose_radius_mm" if name == "nose_radius" else name
                 raise InputError(where, key, f"{key} beside process {process_name}", "milled or turned faces only")
+    elif face.Rq is not None:
+        allowed = "none: the height between the feed marks is assumed from Ra"
+        raise InputError(where, "Rq", f"Rq beside process {process_name}", allowed, "leave Rq out")
     elif face.feed_marks == "resolved" and face.alpha is None and face.alpha_u is None and _said(face):
         allowed = "feed_marks blurred, or alpha of what lies between the marks"
         raise InputError(where, said[0], f"{said[0]} beside feed_marks resolved", allowed, "it includes the marks")

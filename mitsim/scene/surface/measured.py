@@ -129,6 +129,8 @@ def read_profile(path: str | Path, where: str | Path = "", key: str = "profile")
     if sorted(name[:2] for name in header) != ["x_", "z_"] or any(name[2:] not in _UM_PER for name in header):
         raise InputError(path, "header", repr(",".join(header)), allowed)
     values = _numbers(lines[1:], path)
+    if values.shape[1] != 2:
+        raise InputError(path, "", f"{values.shape[1]} numbers in a row", "two, as in the header")
     columns = {name[0]: values[:, i] * _UM_PER[name[2:]] for i, name in enumerate(header)}
     if len(values) < _FEWEST_POINTS:
         raise InputError(path, "", f"{len(values)} points", f"at least {_FEWEST_POINTS}")

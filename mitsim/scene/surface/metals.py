@@ -19,6 +19,8 @@ from importlib.resources import files
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.errors import InputError
+
 #: wavelengths at which every metal has tabulated constants [nm]
 WAVELENGTH_RANGE_NM = (400.0, 1000.0)
 
@@ -40,14 +42,13 @@ def refractive_index(metal: str, wavelength_nm: float) -> tuple[float, float]:
 
     Raises
     ------
-    ValueError
+    InputError
         Outside 400 to 1000 nm, since extrapolated constants have no source.
     """
     low, high = WAVELENGTH_RANGE_NM
     if not low <= wavelength_nm <= high:
-        raise ValueError(
-            f"{metal}: optical constants are tabulated from {low:g} to {high:g} nm, not at {wavelength_nm:g} nm"
-        )
+        allowed = f"{low:g} to {high:g} nm, for which optical constants are tabulated"
+        raise InputError(f"finish of {metal}", "wavelength_nm", f"{wavelength_nm:g} nm", allowed)
     wavelengths, n, k = CONSTANTS[metal].T
     return float(np.interp(wavelength_nm, wavelengths, n)), float(np.interp(wavelength_nm, wavelengths, k))
 

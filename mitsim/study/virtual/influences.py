@@ -61,7 +61,7 @@ def influences(table: UnknownsTable, source: str, depth: int, sprayed: bool = Fa
         ),
         Influence(
             "finish of the part",
-            rendered and table.finish.varies,
+            not rendered or table.finish.varies,
             "drawn: width and tail of the lobe, wide-angle share, reflectance, and a lay that is not given"
             if rendered
             else "drawn from errors and spread of the map; the finish is that of the map",

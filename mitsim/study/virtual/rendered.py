@@ -71,8 +71,9 @@ _CUBE_CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (
 class TracedLight:
     """Light of one draw on the imagers of a view before exposure: one tracing serves any number of exposures.
 
-    ``light`` is that of the projector at its nominal power, ``room`` all other light by camera, (h, w) [W / (mm^2 sr)]
-    each. ``sensor`` is the true sensor of the draw. ``assumed`` is the assumed pose of the sensor.
+    ``light`` is at the projector's nominal power, with that of lamps and of a known room. ``room`` is that of a room
+    that is not known by camera, (h, w) [W / (mm^2 sr)]. ``sensor`` is the true sensor of the draw. ``assumed`` is the
+    assumed pose of the sensor.
     """
 
     sensor: SimulatedSensor

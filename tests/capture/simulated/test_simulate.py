@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import correlate1d
 
 from mitsim.capture.simulated.lens_blur import gaussian_blur
+from mitsim.capture.simulated.render_residual import render_residual
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.scene.backend import mi
@@ -84,3 +86,22 @@ def test_the_light_of_a_plate_falls_off_toward_the_corners_as_cosines_do(name):
     lit = flat > 0
     assert lit.mean() > 0.7
     np.testing.assert_allclose(seen[lit] / flat[lit], law[lit], rtol=1e-4)
+
+
+def test_a_rendering_is_judged_at_the_longest_exposure_that_saturates_no_pixel():
+    sensor = load_sensor(ROOT / "tests/data/fringes.toml")
+    scene = load_scene(ROOT / "scenes/coupon/coupon.xml", sensor.wavelength_nm)
+    pose = look_at([150, -100, 560], [0, 0, 0], [0, 1, 0])
+    corners = pose.inverse().points(20.0 * np.array([[a, b, 0] for a in (-1, 1) for b in (-1, 1)]))
+
+    def residual(*exposures):
+        policy = SimpleNamespace(exposures=lambda *_: exposures)
+        simulated = SimulatedSensor(replace(sensor, exposure=policy))
+        camera = next(iter(sensor.rig.cameras))
+        return render_residual(simulated, scene, pose, camera, Rendering(1, 1), seed=1, around=corners)
+
+    usual = sensor.exposure.exposures(None, sensor.imager.full_well)[0]
+    short, long = usual / 64, usual / 8
+    assert residual(long).quadrature > 2 * residual(short).quadrature > 0
+    assert residual(short, long) == residual(long)
+    assert residual(short, 1e6 * usual) == residual(short)  # all pixels are saturated in the second

@@ -75,6 +75,18 @@ def test_who_is_no_longer_held_leaves_the_scheduler(cluster):
     assert client.status == "closed"
 
 
+def _failing(path):
+    with Path(path).open("a") as file:
+        file.write("tried\n")
+    raise InputError("scene.xml", "", "a fault", "none")
+
+
+def test_an_order_that_raises_is_not_repeated(tmp_path, cluster):
+    with pytest.raises(InputError, match="a fault"):
+        list(Cluster(cluster.scheduler_address).distribute(["one"], lambda _: str(tmp_path / "tries"), _failing))
+    assert (tmp_path / "tries").read_text() == "tried\n"
+
+
 def test_a_scheduler_that_is_not_there_is_told(monkeypatch):
     monkeypatch.setattr("mitsim.running.cluster.CONNECT_TIMEOUT_S", 1)
     with pytest.raises(MissingEnvironmentError, match="no scheduler answers there"):

@@ -280,6 +280,15 @@ def test_entities_of_a_file_are_read_as_they_are_written(tmp_path, name):
         read_step_text(tmp_path / "other.stp")
 
 
+@pytest.mark.parametrize("before", ["", " /* 1 */ ", " /* of the DATA; */\n"])
+@pytest.mark.parametrize("name", ["DATA of the pump", "METADATA; it''s", "two;\nDATA"])
+def test_a_header_that_says_data_hides_no_record(tmp_path, name, before):
+    path = tmp_path / "some.stp"
+    header = f"ISO-10303-21;\nHEADER;\nFILE_NAME('{name}','');\nENDSEC;"
+    path.write_text(f"{header}{before}DATA;\n#1=A('one');\n#2=B('two');\nENDSEC;\n")
+    assert set(read_step_text(path).record) == {1, 2}
+
+
 def test_a_text_with_open_strings_and_comments_is_read_in_one_pass(tmp_path):
     """Alternatives within alternatives made a regular expression take for ever on a missing quotation mark."""
     path = tmp_path / "open.stp"

@@ -10,7 +10,7 @@ from mitsim.scene.backend import mi
 from mitsim.scene.light_transport import kept_tracing
 from mitsim.scene.light_transport.kept_paths import CandidatePaths, KeptPaths, broad, light_of, mattering
 from mitsim.scene.light_transport.kept_tracing import camera_paths, photon_paths
-from mitsim.scene.light_transport.kept_walks import Tracing
+from mitsim.scene.light_transport.kept_walks import Tracing, Walk, split_walk
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.plain_scene import distinct_bsdfs
 from mitsim.scene.light_transport.projector_light import ModulatedLight, ProjectedPatterns
@@ -217,3 +217,12 @@ def test_a_batch_of_photons_that_all_pass_beside_the_image_of_the_projector_is_n
     split, _ = candidates(corner, rays, light, 3, samples=4)
     assert started[-1] == 0
     assert len(split) == len(whole) and split.weight.sum() == pytest.approx(whole.weight.sum(), rel=1e-5)
+
+
+def test_paths_keep_the_numbers_of_more_finishes_than_a_part_can_have():
+    ones, lanes = mi.Float([1.0, 1.0, 1.0]), mi.UInt32([0, 1, 2])
+    way, code = mi.Vector3f(0.0, 0.0, ones), mi.Point2f(ones, ones)
+    walk = Walk(lanes, lanes, mi.Point3f(way), way, ones, ones, ones, code)
+    record = ones, code, ones, mi.Int32([-1, 130, 300]), way, way
+    _, candidates = split_walk(walk, ones > 0, record, ones > 0, None)
+    assert candidates.material.ravel().tolist() == [-1, 130, 300]

@@ -9,6 +9,7 @@ import pytest
 
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
+from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.light_transport import transport
 from mitsim.scene.light_transport.aperture_samples import aperture_samples
@@ -87,6 +88,56 @@ def test_the_camera_sees_as_opencv_does(kind):
     # a pixel is 3 projector pixels wide: its mean is off its middle by the map's curvature, and single precision
     assert np.abs(found - true)[inner].max() < 0.1
     assert np.abs(np.median((found - true)[inner], axis=0)).max() < 0.005
+
+
+@pytest.mark.parametrize("kind", sorted(DISTORTED))
+def test_stretch_is_the_derivative_of_the_lens(kind):
+    model, coefficients = DISTORTED[kind]
+    optics = replace(pinhole(800, 600, 700.0), distortion=np.array(coefficients), model=model)
+    seen = optics.rays(np.random.default_rng(3).uniform([0, 0], [799, 599], (500, 2)))
+    ideal, step = seen[:, :2] / seen[:, 2:], 1e-4 * np.eye(2)
+
+    def pixels(points):
+        return optics.project(np.concatenate([points, np.ones((500, 1))], axis=1))
+
+    x, y = ((pixels(ideal + move) - pixels(ideal - move)) / (2e-4 * 700) for move in step)
+    stretch = ProjectorLight(Transform.identity(), Projector(optics, 1.0)).distortion.stretch(
+        *(mi.Float(one.astype(np.float32)) for one in ideal.T)
+    )
+    np.testing.assert_allclose(np.array(stretch), x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0], rtol=1e-5)
+    assert np.ptp(np.array(stretch)) > 0.02
+
+
+@pytest.mark.parametrize("kind", sorted(DISTORTED))
+def test_a_white_frame_carries_the_flux_through_any_lens(kind):
+    model, coefficients = DISTORTED[kind]
+    optics = replace(pinhole(80, 60, 80.0), distortion=0.5 * np.array(coefficients), model=model)
+    projector, camera = Projector(optics, 1.7), pinhole(400, 400, 120.0)  # the camera sees the whole frame
+    image = trace(
+        plate(size=8000, bsdf={"type": "diffuse", "reflectance": 1.0}),
+        CameraRays(camera),
+        ProjectedPatterns(np.ones((1, 60, 80)), projector),
+        facing(500.0),
+        LightPaths(samples=16, seed=1),
+    )[0]
+    assert not image[[0, -1]].any() and not image[:, [0, -1]].any()
+    assert np.pi * image.sum() * (500.0 / 120.0) ** 2 == pytest.approx(1.7, rel=3e-3)
+    steps = (np.arange(400) + 0.5) / 400
+    u, v = (mi.Float(a.ravel().astype(np.float32)) for a in np.meshgrid(steps, steps))
+    flux = ProjectorLight(Transform.identity(), projector).emit_photon(mi.Point2f(u, v), None)[2]
+    assert np.array(flux).mean() == pytest.approx(1.7, rel=3e-3)
+
+
+def test_a_drawn_calibration_keeps_the_light_of_a_lens_without_distortion(n10):
+    plain = pinhole(80, 60, 40.0)
+    assert not Projector(plain, 1.0).is_stretched and Projector(replace(plain, model="fisheye"), 1.0).is_stretched
+    for coefficients in (np.zeros(5), np.array([0.02, 0, 0, 0, 0])):
+        nominal = replace(n10.projector.optics, distortion=coefficients)
+        drawn = replace(nominal, distortion=coefficients + 1e-3)
+        sensor = replace(n10, projector=replace(n10.projector, optics=nominal))
+        other = SimulatedSensor(sensor).recalibrated(replace(n10.rig, projector=drawn))
+        assert other.sensor.projector is other.patterns.projector
+        assert other.patterns.projector.is_stretched == coefficients.any()
 
 
 def test_beyond_its_image_a_projector_sends_nothing():

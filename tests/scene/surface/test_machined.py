@@ -206,6 +206,8 @@ def test_every_metal_process_and_roughness_gives_shares_and_widths_that_can_be(m
         ({"alpha": 0.1, "lay": "u"}, "lay", "lay beside alpha"),
         ({"process": "bead_blasted", "lay": "u"}, "lay", "a lay on a bead_blasted face"),
         ({"Rq": 0.1}, "Rq", "1 to 2 times Ra"),
+        ({"Rq": 0.5, "process": "milled"}, "Rq", "Rq beside process milled"),
+        ({"Rq": 0.5, "process": "turned"}, "Rq", "Rq beside process turned"),
         ({"nose_radius": 0.8}, "nose_radius_mm", "nose_radius_mm beside process ground"),
         ({"feed_marks": "resolved"}, "feed_marks", "feed_marks beside process ground"),
         ({"process": "turned", "feed_marks": "resolved", "Rdq": 0.1}, "Rdq", "Rdq beside feed_marks resolved"),

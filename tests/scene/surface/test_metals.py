@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from characterisation.files.errors import InputError
 from mitsim.scene.surface.metals import CONSTANTS, WAVELENGTH_RANGE_NM, normal_reflectance, refractive_index
 from mitsim.scene.surface.microfacet import fresnel
 
@@ -36,7 +37,7 @@ def test_the_sources_cover_the_range_without_extrapolation(metal):
 
 
 def test_no_constant_is_extrapolated():
-    with pytest.raises(ValueError, match="not at 1064 nm"):
+    with pytest.raises(InputError, match="1064 nm; allowed: 400 to 1000 nm"):
         refractive_index("aluminium", 1064)
 
 

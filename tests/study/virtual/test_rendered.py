@@ -18,6 +18,7 @@ from mitsim.scene.load import load_scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.scene.ray_casting.self_view import sees_itself
 from mitsim.scene.surface.metals import CONSTANTS
+from mitsim.scene.surface.scatter import Deviation
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.imager import electrons_per_radiance
 from mitsim.sensor.pattern import another_mask
@@ -147,6 +148,38 @@ def test_the_albedo_of_white_is_its_reflectance():
     scene = load_scene(SCENES / "matt_white.xml", 850.0)
     for albedo in directional_albedos(scene):
         np.testing.assert_allclose(albedo, 0.85, rtol=0.01)
+
+
+def test_each_stock_bsdf_has_its_own_albedo(tmp_path):
+    shape = (
+        '<shape type="rectangle"><transform name="to_world"><scale value="20"/></transform>'
+        '<bsdf type="diffuse"><spectrum name="reflectance" value="{}"/></bsdf></shape>'
+    )
+    (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0">{shape.format(0.2)}{shape.format(0.7)}</scene>')
+    means = [albedo.mean() for albedo in directional_albedos(load_scene(tmp_path / "scene.xml", 850.0))]
+    np.testing.assert_allclose(means, [0.2, 0.7], rtol=0.01)
+
+
+def test_finishes_without_an_id_are_drawn_each_by_its_own_in_every_loading(tmp_path):
+    shape = (
+        '<shape type="rectangle"><transform name="to_world"><scale value="20"/></transform>'
+        '<bsdf type="matt_white"/></shape>'
+    )
+    (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0">{shape * 2}</scene>')
+    asked = []
+
+    def deviation(name):
+        asked.append(name)
+        return Deviation(reflectance=len(asked))
+
+    scenes = [load_scene(tmp_path / "scene.xml", 850.0, deviation=deviation) for _ in range(2)]
+    scenes[1] = scenes[1].deviated(deviation)
+    assert asked == ["finish_0", "finish_1"] * 3
+    assert [shape.bsdf().id() for scene in scenes for shape in scene.shapes] == ["finish_0", "finish_1"] * 2
+
+
+def test_the_expansion_of_every_metal_of_a_finish_is_known():
+    assert set(EXPANSION_PER_KELVIN) == set(CONSTANTS)
 
 
 def test_finishes_are_loaded_with_the_alpha_that_was_drawn():
@@ -432,30 +465,33 @@ def test_scenes_whose_paths_cannot_be_kept_are_rendered_in_every_finish(coarse_n
     np.testing.assert_equal(outcomes(study, jobs[1])[1], found[1:])
 
 
-@pytest.mark.parametrize("known_room", [False, True])
-def test_power_changes_the_light_of_the_projector_alone(coarse_n10, tmp_path, known_room):
-    """Before, lamps and a known room were dimmed with the projector."""
-    lamp = '<emitter type="constant"><float name="radiance" value="1e-6"/></emitter>'
-    study = metal_study(coarse_n10, tmp_path, "" if known_room else lamp)
-    if known_room:
-        study = replace(study, sensor=replace(study.sensor, room=RoomTable(irradiance_w_mm2=4e-6)))
-    maker = measurements_of(study, replace(study_unknowns(study), varied=()))
-    lit = maker.lit(study.views[0], maker.unknowns.draw(Trial(0)))
-    black = study.sensor.imager.black_level
+@pytest.mark.parametrize("source", ["lamp", "room"])
+def test_power_is_that_of_the_projector_alone(coarse_n10, tmp_path, monkeypatch, source):
+    place, intensity = '<point name="position" x="99" y="-200" z="400"/>', '<rgb name="intensity" value="0.1"/>'
+    lamp = f'<emitter type="point">{place}{intensity}</emitter>'
+    study = metal_study(coarse_n10, tmp_path, lamp if source == "lamp" else "")
+    if source == "room":
+        study = replace(study, sensor=replace(study.sensor, room=RoomTable(irradiance_w_mm2=1e-6)))
+    images = []
 
-    def grey(power):
-        capture = maker.exposed(lit, PlannedExposure((0.05 * lit.light.exposures[0],), power), 1, keep=True)
-        name, stack = next(iter(capture.images.items()))
-        return stack[(slice(None), *capture.decoding.read_out[name].slices)].mean() - black
+    def exposed(flux, power):
+        projector = replace(study.sensor.projector, flux=flux)
+        maker = measurements_of(replace(study, sensor=replace(study.sensor, projector=projector)), unknowns)
+        lit = maker.lit(study.views[0], replace(unknowns, varied=()).draw(Trial(0)))
+        maker.exposed(lit, PlannedExposure((1e-3,), power), 0)
+        return images.pop()
 
-    full, half, hardly = grey(1.0), grey(0.5), grey(1e-6)
-    assert half == pytest.approx((full + hardly) / 2, rel=0.02)
-    assert 0.1 * full < hardly < 0.9 * full
+    def kept(sensor, light, seed):
+        images.append(next(iter(light.radiance.values())))
+        return expose(sensor, light, seed)
 
-
-def test_every_metal_of_a_finish_expands_as_itself():
-    """Before, carbon steel by 17e-6, as a part of unknown material: the table called it steel."""
-    assert set(EXPANSION_PER_KELVIN) == set(CONSTANTS)
+    unknowns, expose = study_unknowns(study), SimulatedSensor.expose
+    monkeypatch.setattr(SimulatedSensor, "expose", kept)
+    flux = study.sensor.projector.flux
+    alone, quarter, of_quarter = exposed(1e-9 * flux, 0.25), exposed(flux, 0.25), exposed(0.25 * flux, 1.0)
+    assert alone.mean() > 0.01 * of_quarter.mean()
+    np.testing.assert_allclose(alone, exposed(1e-9 * flux, 1.0), rtol=1e-4, atol=1e-6 * alone.mean())
+    np.testing.assert_allclose(quarter, of_quarter, rtol=1e-3, atol=1e-3 * alone.mean())
 
 
 def test_unknowns_of_a_study_are_checked(tmp_path):

@@ -11,8 +11,9 @@ from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_parameters import parameter_names
 from mitsim.sensor.room_light import room_irradiance
-from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
+from mitsim.sensor.unknowns import MeasuredFinish, UnknownsTable, unknowns_of
 from mitsim.study.virtual.drawn_finish import DRAWN, finish_deviation, finish_numbers
+from mitsim.study.virtual.influences import influences
 from mitsim.study.virtual.world import (
     FRESH,
     GROUPS,
@@ -51,6 +52,22 @@ def told(world):
 
 def same(one, other):
     return np.array_equal(np.ravel(one), np.ravel(other))
+
+
+@pytest.mark.parametrize(
+    ("source", "sizes", "included"),
+    [("map", 0.0, True), ("map", 1.0, True), ("render", 1.0, True), ("render", 0.0, False)],
+)
+def test_a_finish_that_is_drawn_is_listed_as_included(source, sizes, included):
+    """A trial from a map draws the errors of the map, of whatever size the unknowns of the finish are."""
+    table = UnknownsTable()
+    finish = table.finish.model_copy(update=dict.fromkeys(MeasuredFinish.model_fields, sizes))
+    (found,) = (
+        one
+        for one in influences(table.model_copy(update={"finish": finish}), source, 1)
+        if one.name == "finish of the part"
+    )
+    assert found.included == included
 
 
 def test_a_trial_decides_its_world(unknowns):
