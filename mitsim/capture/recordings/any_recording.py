@@ -205,10 +205,11 @@ def _read_ros(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, byte
     bag = ros_bag.open_bag(path)
     chosen = ros_recording.chosen_topics(bag, options.topic or ())
     frame = frame_of(options.frame, path)
+    numbers: tuple[int, ...] = (frame or 0,)
     if chosen.content == "cloud":
         capture = _organised(ros_recording.read_ros_cloud(chosen, frame), options)
     elif chosen.content == "pair":
-        capture = ros_recording.read_ros_pair(
+        capture, numbers = ros_recording.read_ros_pair(
             chosen,
             frame,
             calibration=options.cameras,
@@ -225,9 +226,10 @@ def _read_ros(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, byte
             camera=options.camera,
             sensor=options.named,
         )
-    number = int(frame or 0)
-    messages = {f"{plain_name(topic.name.strip('/').replace('/', '_'))}_{number}.msg": topic for topic in chosen.topics}
-    kept = {name: bag.message(topic.name, number) for name, topic in messages.items() if number < topic.count}
+    kept = {
+        f"{plain_name(topic.name.strip('/').replace('/', '_'))}_{number}.msg": bag.message(topic.name, number)
+        for topic, number in zip(chosen.topics, numbers, strict=True)
+    }
     return capture, kept | _originals(_file_of(options.cameras))
 
 
