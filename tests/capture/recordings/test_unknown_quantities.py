@@ -67,3 +67,26 @@ def test_colours_before_the_points_of_a_text_are_refused():
     whole = [(i % 9, i // 9, 200 - i, 0.6, 0.0, -0.8) for i in range(50)]
     text = "\n".join(" ".join(map(str, row)) for row in whole).encode()
     assert points_of_text(text, Path("a.xyz"))[0][-1].tolist() == [4, 5, 151]
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"K": np.eye(3)},
+        {"pose": np.eye(4)},
+        {"dist": np.zeros((1, 5))},
+        {"poses": np.tile(np.eye(4), (4, 1, 1)), "K": np.eye(3)},
+    ],
+)
+@pytest.mark.parametrize("name", ["depth", "z_map"])
+def test_a_calibration_beside_depths_is_neither_points_nor_depths(tmp_path, name, other):
+    """Before, "shape: found depth 48 x 64, K 3 x 3"."""
+    depth = np.random.default_rng(0).uniform(600, 700, (48, 64))
+    np.savez(tmp_path / "a.npz", **{name: depth}, **other)
+    assert np.array_equal(map_in((tmp_path / "a.npz").read_bytes(), tmp_path / "a.npz"), depth)
+
+
+def test_depths_by_name_are_read_beside_a_list_of_points(tmp_path):
+    depth = np.random.default_rng(0).uniform(600, 700, (48, 64))
+    np.savez(tmp_path / "a.npz", depth=depth, corners=np.zeros((88, 3)))
+    assert np.array_equal(map_in((tmp_path / "a.npz").read_bytes(), tmp_path / "a.npz"), depth)
