@@ -160,7 +160,7 @@ def _blur(
     scales = _pixels_per_stripe(source, specimen)
     pairs = np.stack([linearised(seen.pairs[:, side], chip) for side in (0, 1)], axis=1)
     off = np.abs(pairs[:, 0] - pairs[:, 1])
-    focus = fit_defocus(source, white, black, pairs, seen.widths)
+    focus = fit_defocus(source, chip, white, black, pairs, seen.widths)
     if focus is not None and focus.aperture_mm > _SURE * np.sqrt(focus.covariance[1, 1]):
         return _focus(source, focus, float(np.mean(scales)))
     values = []
