@@ -4,7 +4,8 @@ Signal chain: bag -> topic, chosen or the only one that fits -> one message of i
 calibration of the user -> capture.
 
 A ``camera_info`` belongs to the images whose topic begins like its own: ``/camera/depth/camera_info`` to
-``/camera/depth/image_rect_raw``. Images whose topic has the word ``rect`` are rectified: their camera is the projection matrix.
+``/camera/depth/image_rect_raw``. Images with the word
+``rect`` in their topic are rectified: their camera is the projection matrix.
 """
 
 from __future__ import annotations
