@@ -197,6 +197,16 @@ def _focus(source: InputCapture, focus: Defocus, scale: float) -> list[FittedKey
     ]
 
 
+def focused(estimates: list[FittedKey]) -> list[FittedKey]:
+    """Return the estimates of captures; if some tell the focus, without the blur of those that do not.
+
+    Their blur includes the projector's.
+    """
+    telling = {estimate.captures for estimate in estimates if estimate.key == "projector.focus_mm"}
+    mixed = "imager.blur_px", "projector.aperture_mm"
+    return [one for one in estimates if not telling or one.captures in telling or one.key not in mixed]
+
+
 def _pixels_per_stripe(source: InputCapture, specimen: Specimen) -> tuple[float, float]:
     """Return the camera pixels per projector pixel, along columns and rows, at the centre of the specimen."""
     camera, projector = source.capture.rig.reference, source.capture.rig.projector

@@ -8,6 +8,7 @@ import pytest
 from mitsim.twin.sensor.defocus import modulation
 from mitsim.twin.sensor.estimate import FittedKey, combined, pooled
 from mitsim.twin.sensor.moments import Prior, match_moments
+from mitsim.twin.sensor.stripes import focused
 
 A = np.array([[1.0, 0.4], [0.2, 1.0], [0.5, -0.7]])
 
@@ -70,3 +71,17 @@ def test_modulation_of_blurred_stripes_is_that_of_stripes_that_were_blurred(blur
         wave = np.where((np.arange(int(40 * width * fine)) // (width * fine)) % 2 == 0, 1.0, -1.0)
         seen = gaussian_filter1d(wave, blur * fine, mode="wrap")
         assert modulation(blur, np.array(width)) == pytest.approx(np.abs(seen).mean(), abs=0.01)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_a_capture_that_tells_the_focus_decides_whatever_the_order(first):
+    """Before, the aperture was 5 or 0 mm by the order, and two definitions of the blur were averaged."""
+
+    def told(name, aperture, spread, blur):
+        keys = {"imager.blur_px": (blur, 0.1), "projector.aperture_mm": (aperture, spread)}
+        return [FittedKey(key, *pair, "", (name,), "") for key, pair in keys.items()]
+
+    sharp = [*told("deep", 5.0, 1.0, 0.4), FittedKey("projector.focus_mm", 700.0, 9.0, "mm", ("deep",), "")]
+    both = [sharp, told("flat", 0.0, 0.0, 0.9)]
+    assert pooled(focused([*both[first], *both[1 - first]])) == pooled(sharp)
+    assert pooled(focused(both[1])) == both[1]
