@@ -318,3 +318,22 @@ def test_numbers_that_no_two_images_share_are_paired_in_order(pairs, left):
     options = {"calibration": str(pairs / "stereo.yml"), "images": {"left": "cam0_*.png", "right": "cam1_*.png"}}
     files = read_recording(folder, ReadOptions(frame=1, **options)).capture.settings["files"]
     assert files == {"left": f"cam0_{left[1]}.png", "right": f"cam1_{left[1] + 1}.png"}
+
+
+@pytest.mark.parametrize("decimals", [4, 6, 12])
+@pytest.mark.parametrize("comment", ["# pose: mm\n", ""])
+def test_a_pose_of_few_decimals_is_the_nearest_rotation(tmp_path, decimals, comment):
+    """Before, six were "no rotation matrix"; and a colon in a comment was YAML."""
+    rows = [" ".join(f"{value:.{decimals}f}" for value in row) for row in POSE.matrix()]
+    (tmp_path / "pose").write_text(comment + "\n".join(rows))
+    pose, _ = read_pose(tmp_path / "pose")
+    np.testing.assert_allclose(pose.matrix(), POSE.matrix(), atol=10.0**-decimals)
+    assert np.abs(pose.rotation @ pose.rotation.T - np.eye(3)).max() < 1e-6
+
+
+def test_a_matrix_that_is_not_rounded_but_no_rotation_is_refused(tmp_path):
+    matrix = POSE.matrix()
+    matrix[:3, :3] *= 1.01
+    np.savetxt(tmp_path / "pose", matrix)
+    with pytest.raises(InputError, match="a rotation matrix"):
+        read_pose(tmp_path / "pose")
