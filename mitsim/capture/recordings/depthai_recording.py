@@ -189,7 +189,7 @@ def calibration_beside(path: Path) -> Path:
 
 def _stream_of(name: str) -> str | None:
     """Return the stream of a file's name; None for unused ones, such as rectified images and confidence."""
-    plain = re.sub("[^a-z0-9]", "", name.lower())
+    plain = re.sub("[^a-z0-9]", "", name.lower()).replace("depthai", "")
     if "rectified" in plain or "confidence" in plain:
         return None
     for stream, words in {

@@ -575,3 +575,15 @@ def test_without_the_extra_other_recordings_load_and_these_say_what_to_install(r
     assert "packages that are not installed (" in done.stdout and "pip install 'mitsim[recordings]'" in done.stdout, (
         done.stderr
     )
+
+
+def test_the_maker_s_name_is_no_depth(tmp_path):
+    """Before, both were the stream ``depth``: "depthai" contains it."""
+    for name in ("depthai_left", "depthai_right", "DepthAI-depth"):
+        (tmp_path / f"{name}.mcap").touch()
+    streams = depthai_recording.recorded_streams(tmp_path)
+    assert {name: file.stem for name, file in streams.items()} == {
+        "depth": "DepthAI-depth",
+        "left": "depthai_left",
+        "right": "depthai_right",
+    }
