@@ -86,7 +86,9 @@ class Capture:
         if self.source not in SOURCES:
             raise ValueError(f"capture source {self.source!r}: allowed are {', '.join(SOURCES)}")
         for name, stack in self.images.items():
-            camera = self.rig.cameras[name]
+            camera = self.rig.cameras.get(name)
+            if camera is None:
+                raise ValueError(f"images of {name}: the cameras are {', '.join(self.rig.cameras)}")
             if stack.ndim != 3 or stack.shape[1:] != (camera.height, camera.width):
                 raise ValueError(
                     f"images of {name}: shape {stack.shape}, but the camera has {camera.height} x {camera.width} pixels"
@@ -156,12 +158,13 @@ class Capture:
         from mitsim.capture.picture import draw_images, draw_maps
 
         caption = f"{self.sensor}, {self.source}"
+        drawn = list(self.images) or list(self.rig.cameras)[:1]  # maps are of the reference
+        if camera is not None and camera not in drawn:
+            raise InputError("plot", "camera", repr(camera), ", ".join(drawn))
         if not self.images:
             if not self.derived:
                 raise InputError(f"capture of {self.sensor}", "images", "none", "at least one image or map to draw")
             depth = {name: values[..., 2] if name == "points" else values for name, values in self.derived.items()}
             return draw_maps(depth, DERIVED_UNITS, caption, ax)
-        if camera is not None and camera not in self.images:
-            raise InputError("plot", "camera", repr(camera), ", ".join(self.images))
         stacks = self.images if camera is None else {camera: self.images[camera]}
         return draw_images(stacks, 2**self.bits - 1, caption, ax, image)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.sensor.camera import Camera, Rig
@@ -29,3 +30,15 @@ def test_brightness_leaves_out_the_image_of_ambient_light() -> None:
     images = np.full((3, 2, 2), 100, np.uint16) * np.array([1, 3, 9], np.uint16)[:, None, None]
     assert capture_of(images, "structured_light", ambient_image=True).brightness("left")[0, 0] == 200
     assert capture_of(images, "structured_light").brightness("left")[0, 0] == pytest.approx(1300 / 3)
+
+
+def test_a_camera_that_is_not_there_is_named() -> None:
+    """Before, images of an unknown camera were a KeyError, and a map was drawn for any name."""
+    one = capture_of(np.zeros((1, 4, 6), np.uint16), "depth_map")
+    with pytest.raises(ValueError, match="images of right: the cameras are left"):
+        Capture("one", "depth_map", "device", one.rig, {"right": one.images["left"]}, 16)
+    depth = {"depth": np.full((4, 6), 700, np.float32) + np.arange(6, dtype=np.float32)}
+    maps = Capture("one", "depth_map", "device", one.rig, {}, derived=depth)
+    with pytest.raises(InputError, match="camera: found 'right'; allowed: left"):
+        maps.plot(camera="right")
+    assert len(maps.plot(camera="left")) == 1

@@ -161,11 +161,13 @@ def _read_cloud(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, by
 def _read_array(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
     """Read an array of rows x columns as depths, and one of rows x columns x 3 as points."""
     is_depth = map_in(read_bounded(path), path, frame_of(options.frame, path)).ndim == 2
-    unused = ("unit", "axes", "link") if is_depth else ("scale_mm", "invalid")
+    unused = ("unit", "axes", "link") if is_depth else ("scale_mm", "invalid", "frame")
     for name in unused:
         if getattr(options, name) is not None:
             found = f"{_option(name)} for an array of {'depths' if is_depth else 'points'}"
-            raise InputError(path, "", found, "--scale and --invalid of depths; --unit, --axes and --link of points")
+            raise InputError(
+                path, "", found, "--scale, --invalid and --frame of depths; --unit, --axes and --link of points"
+            )
     return _read_depth(path, options) if is_depth else _read_cloud(path, options)
 
 

@@ -98,7 +98,8 @@ def map_in(data: bytes, where: Path, frame: int | None = None) -> NDArray[Any]:
         allowed = "points of rows x columns x 3, or depths of rows x columns"
         raise InputError(where, "shape", shapes or "no arrays", allowed)
     depth = next(iter(named.values()))
-    return depth if depth.ndim == 2 else depth[chosen_frame(frame, len(depth), where, "images of depths")]
+    images = depth if depth.ndim == 3 else depth[None]
+    return np.asarray(images[chosen_frame(frame, len(images), where, "images of depths")])
 
 
 def is_disparity(name: str) -> bool:
