@@ -587,3 +587,18 @@ def test_the_maker_s_name_is_no_depth(tmp_path):
         "left": "depthai_left",
         "right": "depthai_right",
     }
+
+
+@pytest.mark.parametrize(
+    ("name", "socket", "is_read"), [("depth", 2, False), ("depth", 1, True), ("disparity", 2, False)]
+)
+def test_a_map_of_another_camera_is_refused(recorded, tmp_path, name, socket, is_read):
+    """Before, a map that was aligned to the right camera stood in the left one."""
+    folder = only(recorded, tmp_path / "r", name)
+    file = folder / f"{name}.mcap"
+    file.write_bytes(changed(file.read_bytes(), instanceNum=socket))
+    if is_read:
+        assert read_depthai_recording(folder, frame=0).derived[name].any()
+        return
+    with pytest.raises(InputError, match="instanceNum: found 2; allowed: the camera at socket 1"):
+        read_depthai_recording(folder, frame=0)
