@@ -24,8 +24,12 @@ Row6 = tuple[Number, Number, Number, Number, Number, Number]
 Side = Annotated[int, Field(ge=1, le=LONGEST_SIDE_PX)]
 
 
+#: largest element of R R^T - I of a rotation in the files of mitsim
+EXACT = 1e-6
+
+
 def _rotation(rows: tuple[Row3, Row3, Row3]) -> tuple[Row3, Row3, Row3]:
-    if not is_rotation(np.array(rows), 1e-6):
+    if not is_rotation(np.array(rows), EXACT):
         raise ValueError("a rotation matrix, by rows")
     return rows
 

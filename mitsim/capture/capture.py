@@ -162,12 +162,13 @@ class Capture:
         from mitsim.capture.picture import draw_images, draw_maps
 
         caption = f"{self.sensor}, {self.source}"
+        drawn = list(self.images) or list(self.rig.cameras)[:1]  # maps are of the reference
+        if camera is not None and camera not in drawn:
+            raise InputError("plot", "camera", repr(camera), ", ".join(drawn))
         if not self.images:
             if not self.derived:
                 raise InputError(f"capture of {self.sensor}", "images", "none", "at least one image or map to draw")
             depth = {name: values[..., 2] if name == "points" else values for name, values in self.derived.items()}
             return draw_maps(depth, DERIVED_UNITS, caption, ax)
-        if camera is not None and camera not in self.images:
-            raise InputError("plot", "camera", repr(camera), ", ".join(self.images))
         stacks = self.images if camera is None else {camera: self.images[camera]}
         return draw_images(stacks, 2**self.bits - 1, caption, ax, image)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from characterisation.files.errors import InputError
 from characterisation.plots.clouds import depth_limits
 from characterisation.plots.style import SEQUENTIAL, VERMILION, axes_for, side_bar
+from mitsim.running.numbers import percent
 
 #: percentiles of the grey values shown as black and white; chosen: the few highlights of metal may be white
 STRETCH_PERCENTILES = (5, 99.9)
@@ -80,7 +81,7 @@ def draw_images(
             if saturated.any():
                 mask = np.ma.masked_equal(saturated, False)
                 axes.imshow(mask, cmap=ListedColormap([VERMILION]), interpolation="nearest")
-                label = f"saturated, {full_scale} DN: {100 * saturated.mean():.2g} % of the pixels"
+                label = f"saturated, {full_scale} DN: {percent(float(saturated.mean()))} of the pixels"
                 layout = {
                     "loc": "upper left",
                     "bbox_to_anchor": (0.0, -0.02),

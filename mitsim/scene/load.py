@@ -43,6 +43,7 @@ class Scene:
     - ``finishes`` of the shapes; None for a stock BSDF, about which nothing is known.
     - ``bounds`` (2, 3): corners of the bounding box of all shapes but lamps [mm], world frame.
     - ``where``: file that it was loaded from, or a description.
+    - ``parameters``: values given for its ``<default>`` elements.
     - ``changeable``: whether :meth:`deviated` can change every finish: none is nested in another BSDF or an instance.
     """
 
@@ -52,6 +53,7 @@ class Scene:
     bounds: NDArray[np.float64]
     where: str
     changeable: bool = False
+    parameters: dict[str, str] = field(default_factory=dict)
 
     @property
     def shapes(self) -> list[Any]:
@@ -132,7 +134,14 @@ class Scene:
         part = backend.mi.load_dict(
             {"type": "scene", **{f"shape_{i}": shapes[i] for i in chosen}}, parallel=False, optimize=False
         )
-        return Scene(part, names, tuple(self.finishes[i] for i in chosen), _part_bounds(part), self.where)
+        return Scene(
+            part,
+            names,
+            tuple(self.finishes[i] for i in chosen),
+            _part_bounds(part),
+            self.where,
+            parameters=self.parameters,
+        )
 
 
 def load_scene(
@@ -175,7 +184,7 @@ def load_scene(
         except Exception as error:  # Mitsuba raises plain RuntimeErrors for errors in the file
             mitsuba_error = InputError(path, "", _one_line(error), "a scene that Mitsuba 3 can load")
             raise state.fault or explain_error(mitsuba_error, path) from None
-    return _wrap(scene, state.finishes, str(path))
+    return replace(_wrap(scene, state.finishes, str(path)), parameters=parameters)
 
 
 def scene_from_dict(description: dict[str, Any], wavelength_nm: float, where: str = "scene") -> Scene:

@@ -60,3 +60,15 @@ def test_a_pair_of_which_one_camera_has_no_images_is_not_decoded(name: str) -> N
     other = {"left": "right", "right": "left"}[name]
     with pytest.raises(InputError, match=f"none of {other}; allowed: images of left and right"):
         capture_cloud(two_cameras([name]), MatcherSettings(near_mm=300, far_mm=900))
+
+
+def test_a_camera_that_is_not_there_is_named() -> None:
+    """Before, images of an unknown camera were a KeyError, and a map was drawn for any name."""
+    one = capture_of(np.zeros((1, 4, 6), np.uint16), "depth_map")
+    with pytest.raises(ValueError, match="images of right: the cameras are left"):
+        Capture("one", "depth_map", "device", one.rig, {"right": one.images["left"]}, 16)
+    depth = {"depth": np.full((4, 6), 700, np.float32) + np.arange(6, dtype=np.float32)}
+    maps = Capture("one", "depth_map", "device", one.rig, {}, derived=depth)
+    with pytest.raises(InputError, match="camera: found 'right'; allowed: left"):
+        maps.plot(camera="right")
+    assert len(maps.plot(camera="left")) == 1

@@ -101,7 +101,7 @@ def test_saturated_pixels_are_marked_in_their_own_camera_alone(bright):
     np.testing.assert_array_equal(grey.get_array(), bright.images["left"][0])
     np.testing.assert_array_equal(~np.ma.getmaskarray(marks.get_array()), bright.images["left"][0] == 255)
     np.testing.assert_allclose(marks.to_rgba(marks.get_array())[0, 0, :3], to_rgb(VERMILION))
-    assert texts(left.get_legend()) == ["saturated, 255 DN: 5 % of the pixels"]
+    assert texts(left.get_legend()) == ["saturated, 255 DN: 5.0\N{NO-BREAK SPACE}% of the pixels"]
     assert len(right.images) == 1 and right.get_legend() is None
     assert grey.get_clim() == right.images[0].get_clim()
 

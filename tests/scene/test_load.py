@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from characterisation.files.errors import InputError
-from mitsim.scene.light_transport.room_light import directional_albedos
 from mitsim.scene.load import bounds_of, load_scene, scene_from_dict
 from mitsim.scene.ray_casting.triangles import hull_corners, triangles
 from mitsim.scene.surface.scatter import Deviation
@@ -161,9 +160,3 @@ def test_finishes_without_an_id_have_the_same_names_in_each_loading_and_deviate_
         for one, other in zip(plain.finishes, deviated.finishes, strict=True)
     )
     assert first == 1.0 and second > 1.05
-
-
-def test_stock_bsdfs_without_an_id_have_their_own_albedo(tmp_path):
-    grey = '<bsdf type="diffuse"><spectrum name="reflectance" value="{}"/></bsdf>'
-    scene = load_scene(inline(tmp_path, grey.format(0.5), grey.format(0.1)), 850)
-    np.testing.assert_allclose([albedo.mean() for albedo in directional_albedos(scene)], [0.5, 0.1], rtol=1e-3)

@@ -220,7 +220,7 @@ def colour_and_depth(size):
 def test_of_several_cameras_the_one_of_the_images_is_used(tmp_path):
     read = read_calibration(saved(tmp_path / "a.json", colour_and_depth((1280, 720))), SIZE)
     assert list(read.rig.cameras) == ["color", "depth"]
-    sees(camera_of(read, None, SIZE, "depth.png"), K, D)
+    sees(camera_of(read, None, SIZE, "depth.png")[1], K, D)
 
 
 def test_of_several_cameras_of_one_size_one_is_to_be_named(tmp_path):

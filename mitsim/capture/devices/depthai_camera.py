@@ -58,7 +58,7 @@ class DepthaiCamera(LiveCamera):
 
     def __init__(self, settings: DepthaiSettings, identifier: str, dai: Any) -> None:
         self.where, self.settings = f"camera depthai{':' + identifier if identifier else ''}", settings
-        self._dai, self._device, self._pipeline = dai, None, None
+        self._dai, self._device, self._pipeline, self._last = dai, None, None, -1  # number of the last frames taken
         with self._closed_on_error("open"):
             self._device = dai.Device(dai.DeviceInfo(identifier)) if identifier else dai.Device()
             self._pipeline = dai.Pipeline(self._device)
@@ -83,12 +83,21 @@ class DepthaiCamera(LiveCamera):
             If the camera fails; its light is switched off before the error is raised.
         """
         with self._closed_on_error("capture"):
-            newest = -1
+            asked, deadline = self._dai.Clock.now(), time.monotonic() + self.settings.timeout_s
+            newest = self._last
             for queue in self._queues.values():  # queued frames are older than the call
                 for old in queue.tryGetAll():
                     newest = max(newest, old.getSequenceNum())
             # the frame in progress may have begun before the call: skip one more
             frames = aligned(self._queues, self.settings.timeout_s, self.where, newest + 2)
+            begin = self._dai.CameraExposureOffset.START
+            while any(frames[name].getTimestamp(begin) < asked for name in _IMAGES):  # more may be on their way
+                number, left = frames["left"].getSequenceNum(), deadline - time.monotonic()
+                if left <= 0:
+                    fault = f"no frame exposed after the call within {self.settings.timeout_s:g} s"
+                    raise DeviceError(self.where, "capture", fault, "frames", "Close and open the camera again")
+                frames = aligned(self._queues, left, self.where, number + 1)
+            self._last = frames["left"].getSequenceNum()
             settings = {
                 "maker": "Luxonis",
                 "stereo": self._configuration,

@@ -161,11 +161,13 @@ def _read_cloud(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, by
 def _read_array(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
     """Read an array of rows x columns as depths, and one of rows x columns x 3 as points."""
     is_depth = map_in(read_bounded(path), path, frame_of(options.frame, path)).ndim == 2
-    unused = ("unit", "axes", "link") if is_depth else ("scale_mm", "invalid")
+    unused = ("unit", "axes", "link") if is_depth else ("scale_mm", "invalid", "frame")
     for name in unused:
         if getattr(options, name) is not None:
             found = f"{_option(name)} for an array of {'depths' if is_depth else 'points'}"
-            raise InputError(path, "", found, "--scale and --invalid of depths; --unit, --axes and --link of points")
+            raise InputError(
+                path, "", found, "--scale, --invalid and --frame of depths; --unit, --axes and --link of points"
+            )
     return _read_depth(path, options) if is_depth else _read_cloud(path, options)
 
 
@@ -205,10 +207,11 @@ def _read_ros(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, byte
     bag = ros_bag.open_bag(path)
     chosen = ros_recording.chosen_topics(bag, options.topic or ())
     frame = frame_of(options.frame, path)
+    numbers: tuple[int, ...] = (frame or 0,)
     if chosen.content == "cloud":
         capture = _organised(ros_recording.read_ros_cloud(chosen, frame), options)
     elif chosen.content == "pair":
-        capture = ros_recording.read_ros_pair(
+        capture, numbers = ros_recording.read_ros_pair(
             chosen,
             frame,
             calibration=options.cameras,
@@ -225,9 +228,10 @@ def _read_ros(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, byte
             camera=options.camera,
             sensor=options.named,
         )
-    number = int(frame or 0)
-    messages = {f"{plain_name(topic.name.strip('/').replace('/', '_'))}_{number}.msg": topic for topic in chosen.topics}
-    kept = {name: bag.message(topic.name, number) for name, topic in messages.items() if number < topic.count}
+    kept = {
+        f"{plain_name(topic.name.strip('/').replace('/', '_'))}_{number}.msg": bag.message(topic.name, number)
+        for topic, number in zip(chosen.topics, numbers, strict=True)
+    }
     return capture, kept | _originals(_file_of(options.cameras))
 
 

@@ -26,6 +26,9 @@ _MOST_VALUES = 9
 _POINTS = re.compile(r"point|xyz|vert|cloud|location|pos", re.IGNORECASE)
 _NO_POINTS = re.compile(r"normal|colou?r|rgb|bgr|image|img|texture", re.IGNORECASE)
 
+#: least number of values of a map or a cloud beside others: a calibration, a pose or a covariance has fewer; chosen
+_LEAST_VALUES = 100
+
 #: largest unpacked archive [bytes]
 _LARGEST_ARCHIVE = 4 * 1024**3
 
@@ -77,6 +80,7 @@ def map_in(data: bytes, where: Path, frame: int | None = None) -> NDArray[Any]:
     arrays = (
         {"": numbers_of_npy(data, where, tables=True)} if data.startswith(NPY_MAGIC) else arrays_of_npz(data, where)
     )
+    arrays = _large(arrays)
     points = points_among(arrays)
     if points is not None and points.ndim == 3 and min(points.shape[:2]) > 1:
         return points
@@ -85,15 +89,17 @@ def map_in(data: bytes, where: Path, frame: int | None = None) -> NDArray[Any]:
     if depths and all(map(is_disparity, depths)):
         raise disparities(where)
     depths = {name: array for name, array in depths.items() if not is_disparity(name)}
-    named = {name: array for name, array in depths.items() if "depth" in name.lower()} or depths
-    if len(named) != 1 or points is not None:
+    called = {name: array for name, array in depths.items() if "depth" in name.lower()}
+    named = called or depths
+    if len(named) != 1 or (points is not None and not called):
         shapes = ", ".join(f"{name} {' x '.join(map(str, array.shape))}".strip() for name, array in arrays.items())[
             :300
         ]
         allowed = "points of rows x columns x 3, or depths of rows x columns"
         raise InputError(where, "shape", shapes or "no arrays", allowed)
     depth = next(iter(named.values()))
-    return depth if depth.ndim == 2 else depth[chosen_frame(frame, len(depth), where, "images of depths")]
+    images = depth if depth.ndim == 3 else depth[None]
+    return np.asarray(images[chosen_frame(frame, len(images), where, "images of depths")])
 
 
 def is_disparity(name: str) -> bool:
@@ -112,6 +118,7 @@ def points_among(arrays: dict[str, NDArray[Any]]) -> NDArray[Any] | None:
 
     Of several, one that is named so comes first, then the largest; colours and normals are none.
     """
+    arrays = _large(arrays)
     fields = {
         name: array[name]
         for array in arrays.values()
@@ -131,6 +138,11 @@ def points_among(arrays: dict[str, NDArray[Any]]) -> NDArray[Any] | None:
         if (_POINTS.search(name) or not _NO_POINTS.search(name)) and (points := _with_points_last(array)) is not None
     ]
     return max(turned, key=lambda candidate: candidate[:2], default=(False, 0, None))[2]
+
+
+def _large(arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Return the arrays that may be maps or clouds: all of them if all are small."""
+    return {name: array for name, array in arrays.items() if array.size >= _LEAST_VALUES} or arrays
 
 
 def _with_points_last(array: NDArray[Any]) -> NDArray[Any] | None:

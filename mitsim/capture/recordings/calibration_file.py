@@ -144,15 +144,15 @@ def calibrated_by(tables: dict[str, dict[str, Any]], where: Path, size: tuple[in
     return Calibrated(rig, "", notes=tuple(notes))
 
 
-def camera_of(calibrated: Calibrated, name: str | None, size: tuple[int, int], where: str | Path) -> Camera:
-    """Return the camera of a name, or the first.
+def camera_of(calibrated: Calibrated, name: str | None, size: tuple[int, int], where: str | Path) -> tuple[str, Camera]:
+    """Return the camera of a name, or the first; of unrelated ones, the only one of the size. With its name.
 
     Parameters
     ----------
     calibrated
         Cameras of a calibration.
     name
-        Name of the camera; None for the first.
+        Name of the camera; None for no choice.
     size
         (width, height) [px] of the images; that of the camera must be the same.
     where
@@ -174,12 +174,13 @@ def camera_of(calibrated: Calibrated, name: str | None, size: tuple[int, int], w
     if name is None and calibrated.unrelated and len(fitting) != 1:
         found = ", ".join(f"{label} {camera.width} x {camera.height} px" for label, camera in cameras.items())
         raise InputError(where, "--camera", f"{len(cameras)} cameras: {found}", "the one of these images", "name it")
-    name = fitting[0] if name is None and calibrated.unrelated else name
-    camera = calibrated.rig.reference if name is None else cameras[name]
+    if name is None:
+        name = fitting[0] if calibrated.unrelated else next(iter(cameras))
+    camera = cameras[name]
     if (camera.width, camera.height) != size:
         allowed = f"{camera.width} x {camera.height} px, as the calibration says"
         raise InputError(where, "size", f"{size[0]} x {size[1]} px", allowed, _scaled_hint(camera, size))
-    return camera
+    return name, camera
 
 
 def _scaled_hint(camera: Camera, size: tuple[int, int]) -> str:

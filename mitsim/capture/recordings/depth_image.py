@@ -23,6 +23,7 @@ from mitsim.capture.npy import NPY_MAGIC
 from mitsim.capture.recordings.array_file import disparities, is_disparity, map_in
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
 from mitsim.capture.recordings.cloud_numbers import FARTHEST_MM, METRES_UNDER, NEITHER_ABOVE
+from mitsim.running.numbers import percent
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.png import LONGEST_SIDE_PX
 
@@ -118,8 +119,7 @@ def missing_depths(image: NDArray[Any], invalid: int = 0) -> tuple[NDArray[np.bo
 
     def leave_out(pixels: NDArray[np.bool_], reason: str) -> None:
         if pixels.any():
-            share = 100 * float(np.mean(pixels))
-            warnings.append(f"{share:.2g} % of the pixels have {reason}: left out")
+            warnings.append(f"{percent(float(np.mean(pixels)))} of the pixels have {reason}: left out")
             missing[pixels] = True
 
     full = np.iinfo(np.uint16).max
@@ -192,7 +192,7 @@ def depth_capture(
     read_depth_image : of a file
     """
     height, width = depth.shape
-    eye = camera_of(calibrated, camera, (width, height), where)
+    name, eye = camera_of(calibrated, camera, (width, height), where)
     seen = depth[~np.isnan(depth)]
     if not seen.size:
         raise InputError(where, "", "no pixel with a depth", "an image with some depths")
@@ -206,7 +206,7 @@ def depth_capture(
         sensor=sensor or calibrated.sensor or "depth-camera",
         technology="depth_map",
         source="device",
-        rig=Rig({camera or next(iter(calibrated.rig.cameras)): eye}, calibrated.rig.projector),
+        rig=Rig({name: eye}, calibrated.rig.projector),
         images={},
         bits=16,
         decoding=Decoding(near_mm=near, far_mm=far),

@@ -46,7 +46,8 @@ _ODD = (DecodeError, McapError, AttributeError, LookupError, OverflowError, Runt
 class RecordedFrame:
     """One frame of a stream: ``image`` (H, W) uint8 or uint16, and the device's data about it.
 
-    ``matrix``: K (3, 3) of the frame's pixels [px], None if the device gave none. ``count``: number of frames.
+    ``matrix``: K (3, 3) of the frame's pixels [px], None if the device gave none. ``socket`` of its camera,
+    0 if not stated. ``count``: number of frames.
     """
 
     image: NDArray[Any]
@@ -54,6 +55,7 @@ class RecordedFrame:
     exposure_s: float
     sensitivity_iso: int
     sequence: int
+    socket: int
     count: int
 
 
@@ -120,7 +122,8 @@ def _frame(file: Path, position: int, count: int) -> RecordedFrame:
     with _in_words(file):
         matrix = _matrix(message.transformation)
         exposure_s, iso = float(message.cam.exposureTimeUs) * 1e-6, int(message.cam.sensitivityIso)
-        return RecordedFrame(_image(message, file), matrix, exposure_s, iso, int(message.sequenceNum), count)
+        sequence, socket = int(message.sequenceNum), int(getattr(message, "instanceNum", 0))
+        return RecordedFrame(_image(message, file), matrix, exposure_s, iso, sequence, socket, count)
 
 
 def _image(message: Any, file: Path) -> NDArray[Any]:

@@ -112,7 +112,7 @@ def read_depthai_recording(
     Raises
     ------
     InputError
-        If a file is missing, damaged or lossily compressed, or does not fit the calibration.
+        If a file is missing, damaged or lossily compressed, or not of the calibration and its camera.
     MissingEnvironmentError
         Without the packages of the extra ``recordings``.
 
@@ -124,6 +124,11 @@ def read_depthai_recording(
     streams = recorded_streams(path)
     device_calibration = read_depthai_calibration(calibration or calibration_beside(path))
     frames = _read_frames(streams, frame)
+    for stream, one in frames.items():
+        socket = device_calibration.right if stream == "right" else device_calibration.left
+        if one.socket not in (0, socket):
+            hint = "align maps to the left camera: setDepthAlign(RECTIFIED_LEFT)"
+            raise InputError(streams[stream], "instanceNum", one.socket, f"the camera at socket {socket}", hint)
     first = frames.get("left", next(iter(frames.values())))
     settings: dict[str, Any] = {
         "imported_from": path.name,
@@ -189,7 +194,7 @@ def calibration_beside(path: Path) -> Path:
 
 def _stream_of(name: str) -> str | None:
     """Return the stream of a file's name; None for unused ones, such as rectified images and confidence."""
-    plain = re.sub("[^a-z0-9]", "", name.lower())
+    plain = re.sub("[^a-z0-9]", "", name.lower()).replace("depthai", "")
     if "rectified" in plain or "confidence" in plain:
         return None
     for stream, words in {

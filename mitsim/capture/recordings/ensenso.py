@@ -188,12 +188,15 @@ def _stacked(images: list[Image]) -> Image:
 def _decoding(tree: NxLibTree) -> Decoding:
     """Return exposure and range of the camera; a value missing in the file is None."""
     exposure, volume = "Parameters/Capture/Exposure", "Parameters/DisparityMap/MeasurementVolume"
-    near, far = (
-        # z of a corner of the volume that NxLib searches, in the rectified left frame
-        float(tree.numbers(corner, (3,))[2]) if tree.has(corner) else None
-        for corner in (f"{volume}/Near/LeftTop", f"{volume}/Far/LeftTop")
-    )
+    corners = (f"{volume}/Near/LeftTop", f"{volume}/Far/LeftTop")
+    # z of a corner of the volume that NxLib searches, in the rectified left frame
+    near, far = (float(tree.numbers(corner, (3,))[2]) if tree.has(corner) else None for corner in corners)
+    for corner, depth in zip(corners, (near, far), strict=True):
+        if depth is not None and not 0 < depth <= 1e7:
+            raise tree.fault(corner, "z over 0 to 1e7 mm")
     seconds = float(tree.numbers(exposure, ())) / 1000 if tree.has(exposure) else None  # NxLib: ms
+    if seconds is not None and not 0 <= seconds <= 1e6:
+        raise tree.fault(exposure, "0 to 1e9 ms")
     return Decoding(exposure_s=seconds, near_mm=near, far_mm=far)
 
 

@@ -270,11 +270,10 @@ def _seen_by(
         )
     if calibrated is not None:
         eyes = _possible_cameras(calibrated, name, (width, height), path, turn)
-        measured = [(off_the_rays(eye.sensor_from_camera.points(points), eye), eye) for eye in eyes]
-        off, best = min(measured, key=lambda candidate: candidate[0], default=(math.inf, None))
+        measured = [(off_the_rays(eye.sensor_from_camera.points(points), eye), label, eye) for label, eye in eyes]
+        off, label, best = min(measured, key=lambda candidate: candidate[0], default=(math.inf, "", None))
         if best is not None and off <= CAMERA_OFF_PX:
-            alone = Rig({name or next(iter(calibrated.rig.cameras)): best}, calibrated.rig.projector)
-            return alone, {"off_the_rays_px": round(off, 6)}
+            return Rig({label: best}, calibrated.rig.projector), {"off_the_rays_px": round(off, 6)}
         if not calibrated.nominal:
             found = f"points {off:.3g} px from the view rays of their pixels (median)"
             allowed = f"up to {CAMERA_OFF_PX:g} px: points in the frame of the calibrated camera"
@@ -290,23 +289,23 @@ def _seen_by(
 
 def _possible_cameras(
     calibrated: Calibrated, name: str | None, size: tuple[int, int], path: Path, turn: Transform
-) -> list[Camera]:
-    """Return the cameras of a calibration that may own a grid of ``size`` (width, height), in the sensor frame.
+) -> list[tuple[str, Camera]]:
+    """Return the cameras that may own a grid of ``size`` (width, height), in the sensor frame, with their names.
 
     These are the camera itself and, for the first camera of a pair with a rectification, its rectified camera. The
     latter may be scaled as a device scales its maps: fx, fy, cx and cy by the same factor.
     """
     eyes, pair = [], calibrated.rig.rectification
-    left = calibrated.rig.reference
+    first, left = next(iter(calibrated.rig.cameras.items()))
     if pair is not None and (name is None or calibrated.rig.cameras.get(name) is left):
         scale = size[0] / pair.width
         if abs(scale * pair.height - size[1]) < 1:  # a side may be rounded
             pose = left.sensor_from_camera @ Transform(pair.rotation_left.T, np.zeros(3))
             matrix = np.diag([scale, scale, 1.0]) @ pair.matrix_left
-            eyes.append(Camera(matrix, np.zeros(5), *size, sensor_from_camera=pose))
+            eyes.append((first, Camera(matrix, np.zeros(5), *size, sensor_from_camera=pose)))
     if not eyes or size == (left.width, left.height):
         if calibrated.nominal and size != (left.width, left.height):
             return eyes
-        eye = camera_of(calibrated, name, size, path)
-        eyes.append(replace(eye, sensor_from_camera=eye.sensor_from_camera @ turn))
+        label, eye = camera_of(calibrated, name, size, path)
+        eyes.append((label, replace(eye, sensor_from_camera=eye.sensor_from_camera @ turn)))
     return eyes

@@ -7,6 +7,7 @@ order, such as a pose or a transform of ROS, which are in metres.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +17,21 @@ from numpy.typing import NDArray
 from characterisation.files.checked_files import read_bounded
 from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
-from mitsim.capture.calibration import PoseDocument
-from mitsim.capture.recordings.json_fields import parsed_json
+from mitsim.capture.calibration import EXACT, PoseDocument
+from mitsim.capture.recordings.json_fields import nearest_rotation, parsed_json
 from mitsim.sensor.calibration_numbers import vector
 from mitsim.sensor.calibration_qualifiers import UNIT_NAMES, unit_mm
 from mitsim.sensor.calibration_quaternions import ORDERED, with_rotations
-from mitsim.sensor.transforms import Transform
+from mitsim.sensor.transforms import Transform, is_rotation
 from mitsim.sensor.yaml_values import read_yaml
 
 _WANTED = (
     "pose.json of a capture; four rows of four numbers: a rigid motion, mm; or a map of position, mm or with its unit, "
     f"and orientation: {ORDERED}"
 )
+
+#: largest error of a rotation that was rounded, as by a robot or a text of few decimals; chosen
+_ROUNDED = 1e-3
 
 #: messages of ROS in which a pose stands
 _MESSAGES = ("pose", "transform")
@@ -49,20 +53,17 @@ def read_pose(file: str | Path) -> tuple[Transform, NDArray[np.float64] | None]:
     file = Path(file)
     data = read_bounded(file, "a pose")
     text = data.decode("utf-8", errors="replace").strip()
+    lines = [line for whole in text.splitlines() if (line := whole.partition("#")[0]).strip()]
     if text.startswith(("{", "[")):
         table = parsed_json(data, file, _WANTED)
         table = {"world_from_sensor": table} if isinstance(table, list) else table
-    elif ":" in text:
+    elif any(":" in line for line in lines):
         table, *more = read_yaml(file, data, _WANTED)
         if more:
             raise InputError(file, "", f"{1 + len(more)} documents", "one pose")
     else:
         try:
-            rows = [
-                [float(word) for word in line.replace(",", " ").replace(";", " ").split()]
-                for line in text.splitlines()
-                if line.strip() and not line.lstrip().startswith("#")
-            ]
+            rows = [[float(word) for word in line.replace(",", " ").replace(";", " ").split()] for line in lines]
         except ValueError:
             rows = []
         if [len(row) for row in rows] != [4, 4, 4, 4]:
@@ -72,6 +73,12 @@ def read_pose(file: str | Path) -> tuple[Transform, NDArray[np.float64] | None]:
         table = {"world_from_sensor": _rows_of(file, table)}
     if table["world_from_sensor"] is None:
         raise InputError(file, "world_from_sensor", "nothing", _WANTED)
+    with suppress(ValueError, TypeError, OverflowError):  # other values are told below
+        rows_given = np.array(table["world_from_sensor"], float)
+        turn = nearest_rotation(rows_given[:3, :3], _ROUNDED) if rows_given.shape == (4, 4) else None
+        if turn is not None and not is_rotation(rows_given[:3, :3], EXACT):
+            rows_given[:3, :3] = turn
+            table = table | {"world_from_sensor": rows_given.tolist()}
     document = validate(file, table, PoseDocument)
     pose = document.transform()
     assert pose is not None  # checked above

@@ -16,7 +16,7 @@ import sqlite3
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -127,7 +127,7 @@ def _joined(path: Path, bags: list[RosBag]) -> RosBag:
             number -= count
         raise LookupError(name)
 
-    return RosBag(path, {name: _counted(topic, counts[name]) for name, topic in topics.items()}, message)
+    return RosBag(path, {name: replace(topic, count=counts[name]) for name, topic in topics.items()}, message)
 
 
 def _of_ros1(path: Path) -> RosBag:
@@ -154,7 +154,7 @@ def _of_ros1(path: Path) -> RosBag:
             messages = reader.messages(chosen, start=start, stop=start + 1)
             return next(islice(messages, number - times.index(start), None))[2]
 
-    return RosBag(path, {name: _counted(topic, counts[name]) for name, topic in topics.items()}, message)
+    return RosBag(path, {name: replace(topic, count=counts[name]) for name, topic in topics.items()}, message)
 
 
 def _bounded_by(decompressor: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
@@ -224,7 +224,7 @@ def _of_mcap(path: Path) -> RosBag:
         with _in_words(path):
             return _unpacked(next(islice(messages, number, None)))
 
-    return RosBag(path, {name: _counted(topic, counts[name]) for name, topic in topics.items()}, message)
+    return RosBag(path, {name: replace(topic, count=counts[name]) for name, topic in topics.items()}, message)
 
 
 def _mcap(path: Path) -> Iterator[tuple[str, str, str, bytes]]:
@@ -251,10 +251,6 @@ def is_ros_mcap(path: Path) -> bool:
         return any(channel.message_encoding in ("cdr", "ros1") for _, channel, _ in first)
     except (InputError, ValueError, OSError):
         return False
-
-
-def _counted(topic: Topic, count: int) -> Topic:
-    return Topic(topic.name, topic.kind, count, topic.ros1, topic.digest)
 
 
 def _numbered(path: Path) -> list[Any]:

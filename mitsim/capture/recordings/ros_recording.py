@@ -4,11 +4,13 @@ Signal chain: bag -> topic, chosen or the only one that fits -> one message of i
 calibration of the user -> capture.
 
 A ``camera_info`` belongs to the images whose topic begins like its own: ``/camera/depth/camera_info`` to
-``/camera/depth/image_rect_raw``. Images whose topic says ``rect`` are rectified: their camera is the projection matrix.
+``/camera/depth/image_rect_raw``. Images with the word
+``rect`` in their topic are rectified: their camera is the projection matrix.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -204,8 +206,10 @@ def read_ros_pair(
     calibration: str | Path | None = None,
     channel: int = 1,
     sensor: str | None = None,
-) -> Capture:
+) -> tuple[Capture, tuple[int, int]]:
     """Read one stereo pair of a bag: the left image by its number, and the right image that is nearest in time.
+
+    Returned with the numbers of both messages.
 
     Parameters
     ----------
@@ -232,7 +236,7 @@ def read_ros_pair(
     bag, (left, right) = chosen.bag, chosen.topics
     number = chosen_frame(frame, left.count, bag.path, f"messages of {left.name}")
     first = read_message(bag, left, number)
-    second = _of_same_time(bag, right, first, number)
+    second, other = _of_same_time(bag, right, first, number)
     places = [label_of(topic, bag.path) for topic in chosen.topics]
     images = [grey_of(message, place, channel) for message, place in zip((first, second), places, strict=True)]
     size = (images[0].shape[1], images[0].shape[0])
@@ -240,11 +244,11 @@ def read_ros_pair(
     names = names_of_pair(calibrated, calibration or bag.path)
     settings: dict[str, Any] = {"imported_from": bag.path.name, "topic": [left.name, right.name]} | _stamp(first)
     levels, labels = dict(zip(names, images, strict=True)), dict(zip(names, places, strict=True))
-    return pair_capture(levels, labels, calibrated, settings, sensor)
+    return pair_capture(levels, labels, calibrated, settings, sensor), (number, other)
 
 
-def _of_same_time(bag: RosBag, topic: Topic, first: Any, number: int) -> Any:
-    """Return the message of a topic whose stamp is that of another one; it is searched near its number.
+def _of_same_time(bag: RosBag, topic: Topic, first: Any, number: int) -> tuple[Any, int]:
+    """Return the message of a topic whose stamp is that of another one, and its number; it is searched near that one's.
 
     Raises
     ------
@@ -258,11 +262,16 @@ def _of_same_time(bag: RosBag, topic: Topic, first: Any, number: int) -> Any:
         nearest_one = f"{min(apart):.3g} s from the left image" if apart else "no message"
         where = label_of(topic, bag.path)
         raise InputError(where, "stamp", nearest_one, f"an image within {_SAME_TIME_S:g} s", "choose another --frame")
-    return messages[int(np.argmin(apart))]
+    best = int(np.argmin(apart))
+    return messages[best], near[best]
 
 
 #: largest difference in time of the two images of a pair; assumed: under a quarter of a frame at 60 Hz
 _SAME_TIME_S = 0.004
+
+
+#: names of topics of rectified images; a transport may follow
+_RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:_[^/]*)?(?:/compressed(?:Depth)?)?$")
 
 
 def _calibrated(chosen: Chosen, size: tuple[int, int], calibration: str | Path | None) -> Calibrated:
@@ -271,7 +280,7 @@ def _calibrated(chosen: Chosen, size: tuple[int, int], calibration: str | Path |
     bag, tables = chosen.bag, {}
     for topic in chosen.topics:
         info = _info_of(bag, topic)
-        rectified = "rect" in topic.name.rpartition("/")[2]
+        rectified = _RECTIFIED.search(topic.name) is not None
         tables[info.name] = calibration_of(read_message(bag, info, 0), rectified)
     if len(tables) < len(chosen.topics):
         names = " and ".join(topic.name for topic in chosen.topics)

@@ -6,6 +6,7 @@ green channel of colour images -> capture for the matcher.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -80,6 +81,11 @@ def read_stereo_pair(
     stems = [file.stem for file in files[names[0]]]
     number = chosen_frame(frame_of(frame, folder, stems), counts[0], folder, f"pairs, {stems[0]} to {stems[-1]}")
     chosen = {name: paths[number] for name, paths in files.items()}
+    left, right = ([_last_number(path) for path in paths] for paths in files.values())
+    if left[number] != right[number] and {*left} & {*right} - {None}:
+        found = " with ".join(path.name for path in chosen.values())
+        hint = f"remove images without a partner, or name one pair by --images {names[0]}=FILE --images {names[1]}=FILE"
+        raise InputError(folder, f"pair {number}", found, "images of the same number", hint)
     levels = {name: read_grey(file, channel=channel) for name, file in chosen.items()}
     first = levels[names[0]]
     read = read_calibration(calibration, (first.shape[1], first.shape[0]))
@@ -87,6 +93,11 @@ def read_stereo_pair(
     if is_colour(chosen[names[0]]):
         settings["channel"] = channel_name(channel)
     return pair_capture(levels, chosen, read, settings, sensor)
+
+
+def _last_number(path: Path) -> int | None:
+    digits = re.findall(r"\d+", path.stem)
+    return int(digits[-1]) if digits else None
 
 
 def names_of_pair(calibrated: Calibrated, where: str | Path) -> list[str]:

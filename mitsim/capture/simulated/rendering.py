@@ -85,8 +85,14 @@ class Rendering:
         """Settings for interreflections that are rendered separately; None if they are not."""
         return self.indirect.settings if isinstance(self.indirect, IndirectImages) else self.indirect
 
-    def records(self, scene: str) -> dict[str, Any]:
-        """Return what a capture's settings say of the rendering of a scene, as JSON values."""
-        out: dict[str, Any] = {"scene": scene, "samples_per_pixel": self.samples, "light_path_depth": self.surfaces}
+    def records(self, scene: str, parameters: dict[str, str]) -> dict[str, Any]:
+        """Return what a capture's settings say of the rendering of a scene with parameters, as JSON values."""
+        given = {"scene_parameters": dict(sorted(parameters.items()))} if parameters else {}
+        out: dict[str, Any] = {
+            "scene": scene,
+            **given,
+            "samples_per_pixel": self.samples,
+            "light_path_depth": self.surfaces,
+        }
         indirect = self.indirect_settings
         return out if indirect is None else out | {"indirect_light": asdict(indirect)}

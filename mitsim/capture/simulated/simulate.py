@@ -314,7 +314,8 @@ class SimulatedSensor:
             check_finite(sensor, stack, f"camera {name}", "radiance")
         exposures = sensor.exposure.exposures(brightest_images(sensor, light), sensor.imager.full_well)
         check_finite(sensor, np.array(exposures) * sensor.electrons(), "imager", "electrons per radiance")
-        return LightOnImagers(light, rois, exposures, noise, world_from_sensor, rendering.records(scene.where), other)
+        records = rendering.records(scene.where, scene.parameters)
+        return LightOnImagers(light, rois, exposures, noise, world_from_sensor, records, other)
 
     def expose(self, light: LightOnImagers, seed: int) -> Capture:
         """Expose the imagers to light and return the capture.

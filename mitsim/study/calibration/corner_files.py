@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from characterisation.files.arrays import Floats
 from characterisation.files.checked_files import read_text_bounded
 from characterisation.files.errors import InputError
-from mitsim.capture.grey_image import read_grey
+from mitsim.capture.grey_image import SUFFIXES, read_grey
 from mitsim.sensor.calibration_formats import read_documents
 from mitsim.sensor.fitted_to import FittedCapture, joined_digest, stack_digest
 from mitsim.study.calibration.board import Board
@@ -52,8 +52,6 @@ _PAIRS = (("image_points1", "image_points2"), ("imgpoints_l", "imgpoints_r"), ("
 
 #: names of one camera's array
 _SINGLES = ("image_points", "imgpoints", "Image_points")
-
-_IMAGES = frozenset({".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm"})
 
 #: suffixes of files of arrays
 _OF_ARRAYS = (".npz", ".yml", ".yaml", ".xml", ".json")
@@ -149,7 +147,7 @@ def _are_equal(first: dict[str, Floats], second: dict[str, Floats]) -> bool:
 
 
 def _of_images(path: Path, board: Board) -> tuple[Seen, Sizes, dict[str, FittedCapture]]:
-    files = sorted(file for file in path.rglob("*") if file.suffix.lower() in _IMAGES and file.is_file())
+    files = sorted(file for file in path.rglob("*") if file.suffix.lower() in SUFFIXES and file.is_file())
     seen: Seen = {}
     sizes: Sizes = {}
     digests: dict[str, dict[str, bytes]] = {}
@@ -172,7 +170,7 @@ def _of_images(path: Path, board: Board) -> tuple[Seen, Sizes, dict[str, FittedC
             first, second = (np.array(list(by_camera[name].values())) for name in cameras)
             by_camera[cameras[1]] = dict(enumerate(turned_alike(first, second)))
     if not files:
-        raise InputError(path, "", "no image", f"images {', '.join(sorted(_IMAGES))} of the board")
+        raise InputError(path, "", "no image", f"images {', '.join(sorted(SUFFIXES))} of the board")
     images = {
         pose: FittedCapture(
             name=f"{path / pose}", images_sha256=joined_digest(by_camera[camera] for camera in sorted(by_camera))

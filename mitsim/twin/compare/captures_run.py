@@ -214,7 +214,7 @@ def _shown(name: str, capture: Capture, specimen: Specimen, patches: SpecimenPat
         f"{name}: {capture.sensor}",
         capture.source,
         image[cut],
-        patches.levels.sum(axis=0),
+        np.asarray(patches.levels.sum(axis=0)),
         patches.residual[roi.slices],
         shares,
     )

@@ -283,17 +283,18 @@ def _histogram_row(
     real_patches: SpecimenPatches, simulated_patches: SpecimenPatches, reasons: Mapping[str, str], seed: int
 ) -> ComparedRow:
     """Return the row of Wasserstein's distance [DN] between the histograms of all pixels on the specimen."""
-    counts = np.stack([real_patches.levels, simulated_patches.levels])
-    distance = _distance(*counts.sum(axis=1))
+    counts = real_patches.levels, simulated_patches.levels
+    totals = [np.asarray(levels.sum(axis=0)) for levels in counts]
+    distance = _distance(*totals)
     rng = np.random.default_rng([seed, len(QUANTITIES) - 1])
     exchanged = []
-    every = counts.sum(axis=(0, 1))
+    every = totals[0] + totals[1]
     for _ in range(DRAWS):
-        from_real = rng.integers(0, 2, (len(real_patches.levels), 1))
-        mixed = np.asarray(np.where(from_real == 1, counts[0], counts[1])).sum(axis=0)
+        from_real = rng.integers(0, 2, counts[0].shape[0])
+        mixed = np.asarray(from_real @ counts[0] + (1 - from_real) @ counts[1])
         exchanged.append(_distance(mixed, every - mixed))
     uncertainty = float(np.percentile(exchanged, 95)) / COVERAGE
-    margin = 0.05 * median_level(real_patches.levels.sum(axis=0))
+    margin = 0.05 * median_level(totals[0])
     verdict, why = _verdict(distance, uncertainty, margin, reasons.get(HISTOGRAMS, ""))
     return ComparedRow(HISTOGRAMS, "DN", float("nan"), float("nan"), distance, uncertainty, margin, verdict, why)
 

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from characterisation.coupon.residual_field import Autocorrelation
 from characterisation.files.arrays import Floats
@@ -52,10 +53,10 @@ def _quantile(values: Floats, share: float) -> Floats:
     return np.where(counts > 0, below + (at - low) * (above - below), np.nan)
 
 
-def _sums(values: Floats, picked: Picked) -> Floats:
+def _sums(values: Floats | csr_array, picked: Picked) -> Floats:
     """Return sums (D, ...) of values (P, ...) over the drawn patches (D, P)."""
-    times = np.stack([np.bincount(draw, minlength=len(values)) for draw in picked]).astype(float)
-    return np.asarray((times @ values.reshape(len(values), -1)).reshape(len(picked), *values.shape[1:]))
+    times = np.stack([np.bincount(draw, minlength=values.shape[0]) for draw in picked]).astype(float)
+    return np.asarray((times @ values.reshape((values.shape[0], -1))).reshape((len(picked), *values.shape[1:])))
 
 
 def _median(name: str) -> Figure:

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
+from scipy.sparse import csr_array
 
 from characterisation.coupon.metrics import RayNoise, ray_noise_std
 from characterisation.coupon.residual_field import LARGEST_LAG, autocorrelation
@@ -59,8 +60,9 @@ _MAD_TO_SIGMA = 1.482602218505602
 class SpecimenPatches:
     """P patches of the raw image and Q patches of the cloud's grid; unknown values are NaN.
 
-    Image: ``levels`` (P, 2^bits) are pixels of each grey level. ``contrast`` (P,) [1] is local deviation over local
-    mean. ``crossings`` (P,) count crossings of the local mean in ``pixels`` (P,) pixels. ``finest`` (P,) is in DN.
+    Image: ``levels`` (P, 2^bits), sparse, are pixels of each grey level. ``contrast`` (P,) [1] is local deviation over
+    local mean. ``crossings`` (P,) count crossings of the local mean in ``pixels`` (P,) pixels. ``finest`` (P,) is in
+    DN.
 
     Cloud: ``status`` (Q, 12) are pixels of each :class:`Status`, ``recovered`` (Q,) those with a point on the specimen,
     within 1 % of its distance as in F of a coupon (:mod:`characterisation.coupon.patches`). ``sigma`` (Q,) [mm] is
@@ -70,7 +72,7 @@ class SpecimenPatches:
     the planes of the patches.
     """
 
-    levels: Floats = field(repr=False)
+    levels: csr_array = field(repr=False)
     contrast: Floats
     crossings: Floats
     pixels: Floats
@@ -252,9 +254,10 @@ def _tiles(values: Floats, corners: list[tuple[int, int]]) -> Floats:
     return np.stack(tiles) if tiles else np.empty((0, PATCH_PX**2))
 
 
-def _histograms(levels: Floats, count: int) -> Floats:
-    tiles = [np.bincount(tile[np.isfinite(tile)].astype(int), minlength=count) for tile in levels]
-    return np.stack(tiles).astype(float) if tiles else np.empty((0, count))
+def _histograms(levels: Floats, count: int) -> csr_array:
+    known = np.isfinite(levels)
+    patch, level = np.nonzero(known)[0], levels[known].astype(int)
+    return csr_array((np.ones(len(level)), (patch, level)), shape=(len(levels), count))
 
 
 def _products(residual: Floats) -> tuple[Floats, Floats]:

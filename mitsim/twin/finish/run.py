@@ -168,10 +168,10 @@ def fit_captures(
     sensor
         Name of a preset, or path of a sensor file; by default, the preset that the captures name.
     scene
-        Scene file with size, metal and process of the coupon; its Ra has no influence. By default, the scene that the
-        captures name.
+        Scene file with size, metal and process of the coupon; its Ra sets only the prior of the finish. By default, the
+        scene that the first capture names, with its parameters.
     parameters
-        Values for the ``<default>`` elements of the scene.
+        Values for the ``<default>`` elements of the scene, before those of the capture.
     block_px
         Side of a block [px]; by default :data:`KNOWN_BLOCK_PX`, or :data:`UNKNOWN_BLOCK_PX` for an unknown pattern.
     roi
@@ -189,8 +189,8 @@ def fit_captures(
         raise InputError("CAPTURES", "", "a folder twice", "each capture once", "the same noise twice is not a repeat")
     first = read_capture(captures[0])
     chosen = sensor_of(first, sensor, captures[0])
-    path = scene or _own_scene(first, captures[0])
-    recipe = CouponRecipe(str(path), tuple(sorted((parameters or {}).items())), chosen.wavelength_nm)
+    path, values = (scene, {}) if scene else _own_scene(first, captures[0])
+    recipe = CouponRecipe(str(path), tuple(sorted((values | (parameters or {})).items())), chosen.wavelength_nm)
     sample = load_sample(recipe)
     finish = sample.scene.finishes[0]
     assert finish is not None  # load_sample checks this
@@ -245,10 +245,13 @@ def fit_captures(
     )
 
 
-def _own_scene(capture: Capture, folder: Path) -> Path:
-    named = capture.settings.get("scene")
+def _own_scene(capture: Capture, folder: Path) -> tuple[Path, dict[str, str]]:
+    """Return the scene that a capture was rendered of, and the values of its ``<default>`` elements."""
+    named, values = capture.settings.get("scene"), capture.settings.get("scene_parameters", {})
+    if not isinstance(values, dict) or not all(isinstance(value, str) for value in values.values()):
+        raise InputError(folder / "settings.json", "scene_parameters", repr(values), "a table of texts")
     if isinstance(named, str) and Path(named).is_file():
-        return Path(named)
+        return Path(named), values
     found, hint = repr(named) if named else "nothing", "give the scene of the coupon: --scene scenes/coupon/coupon.xml"
     raise InputError(folder / "settings.json", "scene", found, "an existing scene file", hint)
 

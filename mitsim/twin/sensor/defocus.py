@@ -20,6 +20,7 @@ from scipy.optimize import least_squares
 
 from characterisation.files.arrays import Floats
 from mitsim.decoding.cloud import capture_cloud, decoder_settings
+from mitsim.sensor.imager import Imager
 from mitsim.twin.sensor.input_captures import InputCapture
 
 #: terms of the series
@@ -87,17 +88,21 @@ class Defocus:
     covariance: Floats
 
 
-def fit_defocus(source: InputCapture, white: Floats, black: Floats, pairs: Floats, widths: Floats) -> Defocus | None:
+def fit_defocus(
+    source: InputCapture, chip: Imager, white: Floats, black: Floats, pairs: Floats, widths: Floats
+) -> Defocus | None:
     """Fit the focus of a capture's projector; None if there are too few blocks.
 
     Parameters
     ----------
     source
         Capture of a code with stripes.
+    chip
+        Imager by which grey levels were made electrons.
     white, black
-        (H, W) images of full light and of no light, linear in light.
+        (H, W) images of full light and of no light [e-].
     pairs
-        (n, 2, H, W) images of stripes and of their inverses, linear too.
+        (n, 2, H, W) images of stripes and of their inverses [e-].
     widths
         (n,) of the stripes [projector px].
 
@@ -113,7 +118,7 @@ def fit_defocus(source: InputCapture, white: Floats, black: Floats, pairs: Float
     depth = projector.sensor_from_camera.inverse().points(points.reshape(-1, 3)).reshape(points.shape)[..., 2]
     fine = widths < _WIDEST_PX
     difference = np.abs(pairs[fine, 0] - pairs[fine, 1])
-    least = _LEAST_DN * (2**source.capture.bits - 1) / 255
+    least = _LEAST_DN * (2**source.capture.bits - 1) / 255 / chip.gain
     rows = []
     for top in range(0, white.shape[0] - _BLOCK_PX + 1, _BLOCK_PX):
         for left in range(0, white.shape[1] - _BLOCK_PX + 1, _BLOCK_PX):

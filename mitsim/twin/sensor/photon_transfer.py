@@ -49,7 +49,7 @@ _FEWEST = 3
 #: least ratio of their largest and smallest means, which tells the slope from the offset; chosen
 _SPAN = 1.3
 
-#: standard uncertainties under 0 that an offset may lie by chance, and over 0 the slope of a parabola
+#: standard uncertainties under 0 that an offset may lie by chance, and a slope over 0
 _BY_CHANCE = 3.0
 
 #: standard uncertainties of a square term from which the line is a parabola, whose slope at 0 counts; chosen
@@ -207,7 +207,7 @@ def _line(rows: list[tuple[float, float, float]]) -> TransferLine | None:
         if abs(square) > _CURVED_SIGMAS * np.sqrt(wider[2, 2]):
             offset, slope, covariance = at_0, slope_at_0, wider
     spread_0, slope_spread = np.sqrt(np.diag(covariance)[:2])
-    if not slope > (0 if len(covariance) == 2 else _BY_CHANCE * slope_spread) or offset < -_BY_CHANCE * spread_0:
+    if not slope > _BY_CHANCE * slope_spread or offset < -_BY_CHANCE * spread_0:
         return None
     return TransferLine(float(offset), float(slope), covariance[:2, :2])
 

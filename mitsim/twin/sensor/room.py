@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from characterisation.files.arrays import Floats
 from mitsim.sensor.imager import electrons_per_radiance
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.vignetting import camera_illumination
@@ -29,6 +30,10 @@ _PATCH_PX = 20
 
 #: least number of patches for all six terms: four for each; fewer give a constant
 _FEWEST_FOR_TERMS = 24
+
+
+#: standard uncertainties of the irradiance up to which it has no shape; chosen
+_SURE = 2.0
 
 
 @dataclass(frozen=True)
@@ -70,9 +75,10 @@ def fit_room(input_captures: list[InputCapture], sensor: Sensor, specimens: dict
     design, seen = np.concatenate(rows), np.concatenate([np.array(medians) for medians in values])
     if len(seen) < _FEWEST_FOR_TERMS:
         design = design[:, :1]
-    solution = np.linalg.lstsq(design, seen, rcond=None)[0]
-    residual = seen - design @ solution
-    covariance = float(residual @ residual) / max(len(seen) - design.shape[1], 1) * np.linalg.inv(design.T @ design)
+    solution, covariance = _fitted(design, seen)
+    if solution[0] <= _SURE * np.sqrt(covariance[0, 0]):
+        solution, covariance = _fitted(design[:, :1], seen)
+        solution = np.maximum(solution, 0.0)  # a black level that is too high makes it negative
     terms = np.zeros(len(ROOM_KEYS))
     terms[: len(solution)] = solution
     names, estimates = tuple(source.name for source in input_captures), []
@@ -87,3 +93,11 @@ def fit_room(input_captures: list[InputCapture], sensor: Sensor, specimens: dict
         key, unit = f"room.{ROOM_KEYS[index]}", "W/mm^2" if index == 0 else "1"
         estimates.append(FittedKey(key, float(value), spread, unit, names, "level with the projector off"))
     return RoomFit(tuple(float(term) for term in terms), tuple(estimates))
+
+
+def _fitted(design: Floats, seen: Floats) -> tuple[Floats, Floats]:
+    """Return the least-squares solution of values, and its covariance from their scatter."""
+    solution = np.linalg.lstsq(design, seen, rcond=None)[0]
+    residual = seen - design @ solution
+    variance = float(residual @ residual) / max(len(seen) - design.shape[1], 1)
+    return np.asarray(solution), np.asarray(variance * np.linalg.inv(design.T @ design))

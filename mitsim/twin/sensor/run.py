@@ -44,7 +44,7 @@ from mitsim.twin.sensor.parameters import (
 )
 from mitsim.twin.sensor.room import RoomFit, fit_room
 from mitsim.twin.sensor.rows import row_turns
-from mitsim.twin.sensor.stripes import fit_stripes
+from mitsim.twin.sensor.stripes import fit_stripes, focused
 from mitsim.twin.sensor.verdict import DotAgreement, Verdict, verdict_of
 
 #: keys of the noise that a single image determines together with the fixed pattern
@@ -137,7 +137,7 @@ def fit_sensor(
             capture_sensor = replace(like(source.capture, base, source.name), imager=base.imager)
             coded += fit_stripes(source, capture_sensor, specimens[source.name])
         keys = {estimate.key for estimate in estimates}  # repeats and the dark before a single image
-        estimates += [estimate for estimate in pooled(coded) if estimate.key not in keys]
+        estimates += [estimate for estimate in pooled(focused(coded)) if estimate.key not in keys]
     if not imager.repeated and any(estimate.key in _NOISE for estimate in estimates):
         undetermined += unseparated(chosen.imager)
     turned, assumed, method = list[FittedKey](), chosen.unknowns.calibration, "row errors over the field"

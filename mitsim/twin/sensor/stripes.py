@@ -160,7 +160,7 @@ def _blur(
     scales = _pixels_per_stripe(source, specimen)
     pairs = np.stack([linearised(seen.pairs[:, side], chip) for side in (0, 1)], axis=1)
     off = np.abs(pairs[:, 0] - pairs[:, 1])
-    focus = fit_defocus(source, white, black, pairs, seen.widths)
+    focus = fit_defocus(source, chip, white, black, pairs, seen.widths)
     if focus is not None and focus.aperture_mm > _SURE * np.sqrt(focus.covariance[1, 1]):
         return _focus(source, focus, float(np.mean(scales)))
     values = []
@@ -195,6 +195,16 @@ def _focus(source: InputCapture, focus: Defocus, scale: float) -> list[FittedKey
         FittedKey("projector.aperture_mm", focus.aperture_mm, float(spread[1]), "mm", names, method),
         FittedKey("projector.focus_mm", focus.focus_mm, float(spread[2]), "mm", names, method),
     ]
+
+
+def focused(estimates: list[FittedKey]) -> list[FittedKey]:
+    """Return the estimates of captures; if some tell the focus, without the blur of those that do not.
+
+    Their blur includes the projector's.
+    """
+    telling = {estimate.captures for estimate in estimates if estimate.key == "projector.focus_mm"}
+    mixed = "imager.blur_px", "projector.aperture_mm"
+    return [one for one in estimates if not telling or one.captures in telling or one.key not in mixed]
 
 
 def _pixels_per_stripe(source: InputCapture, specimen: Specimen) -> tuple[float, float]:

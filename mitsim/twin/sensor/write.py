@@ -30,6 +30,8 @@ _TABLE = re.compile(r"^\s*\[(?!\[)\s*([^\]]+?)\s*\]")
 _ARRAY_OF_TABLES = re.compile(r"^\s*\[\[\s*([^\]]+?)\s*\]\]")
 _EXPOSURE_RULE = re.compile(r"\s*(rule|reflectance|distance_mm|level|percentile|exposure_s)\s*=")
 _KEY = re.compile(r"^(\s*)([A-Za-z0-9_]+)\s*=\s*(.*)$")
+#: a text in quotes, or a comment
+_QUOTED = re.compile(r"""\"([^\"]+)\"|'([^']+)'|#.*""")
 _ARRAY = re.compile(r"^(.*)\[(\d+)\]$")
 
 
@@ -210,14 +212,18 @@ def moved_paths(text: str, old: Path, new: Path) -> str:
     """Make the paths of calibration and covariance, relative to folder ``old``, relative to ``new``."""
 
     def moved(match: re.Match[str]) -> str:
-        path = (old / match[2]).absolute()
-        return f'{match[1]}"{Path(os.path.relpath(path, new.absolute())).as_posix()}"'
+        if match[0].startswith("#"):
+            return match[0]
+        path = (old / (match[1] or match[2])).absolute()
+        return f'"{Path(os.path.relpath(path, new.absolute())).as_posix()}"'
 
     out = []
     for table, lines in _blocks(text):
         key = {"calibration": "file", "unknowns.calibration": "covariance"}.get(table)
-        if key is not None:
-            lines = [re.sub(rf'^(\s*{key}\s*=\s*)"([^"]+)"', moved, line) for line in lines]
+        for index, line in enumerate(lines):
+            if (match := _KEY.match(line)) and match[2] == key:
+                for at in range(index, _end_of_value(lines, index) + 1):
+                    lines[at] = _QUOTED.sub(moved, lines[at])
         out += lines
     return "\n".join(out)
 

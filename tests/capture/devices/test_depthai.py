@@ -372,6 +372,29 @@ def test_a_capture_is_of_frames_exposed_after_it_was_asked_for_and_the_light_goe
     assert depthai_capture(shot).capture.rig.cameras.keys() == {"left", "right"}
 
 
+@pytest.mark.parametrize("late", [12, 10**9])
+def test_frames_on_their_way_at_the_call_are_skipped(monkeypatch, late):
+    """Before, with empty queues any next frame was taken, also one exposed before the call."""
+    of_queue, past = FakeQueue.get, dai.Clock.now() - timedelta(seconds=1)
+
+    def get(queue, timeout):
+        frame = of_queue(queue, timeout)
+        if frame.getSequenceNum() < late:
+            frame.setTimestamp(past)
+        return frame
+
+    monkeypatch.setattr(FakeQueue, "get", get)
+    monkeypatch.setattr(FakeQueue, "tryGetAll", lambda _: [])
+    settings = DepthaiSettings(exposure_s=0.004, warm_up_frames=2, timeout_s=5 if late == 12 else 1)
+    with DepthaiCamera(settings, "", FakePackage()) as camera:
+        if late > 12:
+            with pytest.raises(DeviceError, match="no frame exposed after the call within 1 s"):
+                camera.take()
+            return
+        assert camera.take().settings["sequence_number"] == 12
+        assert camera.take().settings["sequence_number"] == 14
+
+
 @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
 def test_an_error_and_ctrl_c_switch_the_light_off(error, monkeypatch):
     fake = FakePackage()

@@ -575,3 +575,30 @@ def test_without_the_extra_other_recordings_load_and_these_say_what_to_install(r
     assert "packages that are not installed (" in done.stdout and "pip install 'mitsim[recordings]'" in done.stdout, (
         done.stderr
     )
+
+
+def test_the_maker_s_name_is_no_depth(tmp_path):
+    """Before, both were the stream ``depth``: "depthai" contains it."""
+    for name in ("depthai_left", "depthai_right", "DepthAI-depth"):
+        (tmp_path / f"{name}.mcap").touch()
+    streams = depthai_recording.recorded_streams(tmp_path)
+    assert {name: file.stem for name, file in streams.items()} == {
+        "depth": "DepthAI-depth",
+        "left": "depthai_left",
+        "right": "depthai_right",
+    }
+
+
+@pytest.mark.parametrize(
+    ("name", "socket", "is_read"), [("depth", 2, False), ("depth", 1, True), ("disparity", 2, False)]
+)
+def test_a_map_of_another_camera_is_refused(recorded, tmp_path, name, socket, is_read):
+    """Before, a map that was aligned to the right camera stood in the left one."""
+    folder = only(recorded, tmp_path / "r", name)
+    file = folder / f"{name}.mcap"
+    file.write_bytes(changed(file.read_bytes(), instanceNum=socket))
+    if is_read:
+        assert read_depthai_recording(folder, frame=0).derived[name].any()
+        return
+    with pytest.raises(InputError, match="instanceNum: found 2; allowed: the camera at socket 1"):
+        read_depthai_recording(folder, frame=0)

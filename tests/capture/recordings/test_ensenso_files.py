@@ -213,6 +213,9 @@ def test_a_wrong_field_is_named(tmp_path, path, wrong):
         ("Calibration/Dynamic/Stereo/Right/Camera", intrinsic(34, 22, 11)),
         ("Parameters/DisparityMap/Scaling", 0),
         ("Sensor/Size", [WIDTH + 1, HEIGHT]),
+        ("Parameters/DisparityMap/MeasurementVolume/Near/LeftTop", [-1, -1, 0]),
+        ("Parameters/DisparityMap/MeasurementVolume/Far/LeftTop", [-2, -2, -600]),
+        ("Parameters/Capture/Exposure", -1.5),
     ],
 )
 def test_an_impossible_value_is_named(tmp_path, path, wrong):

@@ -192,7 +192,7 @@ def test_the_largest_level_is_no_depth(tmp_path):
     capture = read_recording(tmp_path / "a.png", options).capture
     assert np.isnan(capture.derived["depth"][:3]).all()
     assert np.nanmax(capture.derived["depth"]) == depth[3:].max()
-    assert "6.2 % of the pixels have the level 65535" in capture.settings["warnings"][0]
+    assert "6.2\N{NO-BREAK SPACE}% of the pixels have the level 65535" in capture.settings["warnings"][0]
     told = read_recording(tmp_path / "a.png", replace(options, invalid=65535)).capture
     assert "warnings" not in told.settings and np.isnan(told.derived["depth"][:3]).all()
 

@@ -291,3 +291,49 @@ def test_a_pose_of_unknown_meaning_is_refused(tmp_path, table, words):
         (tmp_path / "pose").write_text(text)
         with pytest.raises(InputError, match=words):
             read_pose(tmp_path / "pose")
+
+
+def test_images_of_different_numbers_are_no_pair(pairs):
+    """Before, left 0, 1, 3 and right 0, 2, 3 paired 1 with 2."""
+    folder = pairs / "pairs"
+    (folder / "cam0_2.png").rename(folder / "cam0_3.png")
+    (folder / "cam1_2.png").rename(folder / "cam1_3.png")
+    (folder / "cam1_1.png").rename(folder / "cam1_2.png")
+    patterns = {"left": "cam0_*.png", "right": "cam1_*.png"}
+    options = {"calibration": str(pairs / "stereo.yml"), "images": patterns}
+    with pytest.raises(InputError, match=r"pair 1: found cam0_1.png with cam1_2.png; allowed: images of the same"):
+        read_recording(folder, ReadOptions(frame=1, **options))
+    assert read_recording(folder, ReadOptions(frame=2, **options)).capture.settings["files"]["right"] == "cam1_3.png"
+    one = {"left": "cam0_1.png", "right": "cam1_2.png"}
+    assert read_recording(folder, ReadOptions(**options | {"images": one})).capture.images.keys() == one.keys()
+
+
+@pytest.mark.parametrize("left", [(10, 20, 30), (0, 2, 4)])
+def test_numbers_that_no_two_images_share_are_paired_in_order(pairs, left):
+    """Stamps of two clocks, or one count of both cameras."""
+    folder = pairs / "pairs"
+    for number in (2, 1, 0):
+        (folder / f"cam0_{number}.png").rename(folder / f"cam0_{left[number]}.png")
+        (folder / f"cam1_{number}.png").rename(folder / f"cam1_{left[number] + 1}.png")
+    options = {"calibration": str(pairs / "stereo.yml"), "images": {"left": "cam0_*.png", "right": "cam1_*.png"}}
+    files = read_recording(folder, ReadOptions(frame=1, **options)).capture.settings["files"]
+    assert files == {"left": f"cam0_{left[1]}.png", "right": f"cam1_{left[1] + 1}.png"}
+
+
+@pytest.mark.parametrize("decimals", [4, 6, 12])
+@pytest.mark.parametrize("comment", ["# pose: mm\n", ""])
+def test_a_pose_of_few_decimals_is_the_nearest_rotation(tmp_path, decimals, comment):
+    """Before, six were "no rotation matrix"; and a colon in a comment was YAML."""
+    rows = [" ".join(f"{value:.{decimals}f}" for value in row) for row in POSE.matrix()]
+    (tmp_path / "pose").write_text(comment + "\n".join(rows))
+    pose, _ = read_pose(tmp_path / "pose")
+    np.testing.assert_allclose(pose.matrix(), POSE.matrix(), atol=10.0**-decimals)
+    assert np.abs(pose.rotation @ pose.rotation.T - np.eye(3)).max() < 1e-6
+
+
+def test_a_matrix_that_is_not_rounded_but_no_rotation_is_refused(tmp_path):
+    matrix = POSE.matrix()
+    matrix[:3, :3] *= 1.01
+    np.savetxt(tmp_path / "pose", matrix)
+    with pytest.raises(InputError, match="a rotation matrix"):
+        read_pose(tmp_path / "pose")

@@ -307,3 +307,40 @@ def test_a_definition_of_its_own_is_refused(tmp_path):
     path.write_bytes(text.replace(digest, digest[::-1]))
     with pytest.raises(InputError, match="a definition of sensor_msgs/msg/Image that is not ROS's"):
         read_recording(path, ReadOptions())
+
+
+@pytest.mark.parametrize(
+    ("topic", "rectified"),
+    [
+        ("image_rect", True),
+        ("image_rect/compressed", True),
+        ("image_rect_raw", True),
+        ("image_rectified", True),
+        ("rect/image_raw", False),
+        ("image_corrected", False),
+        ("direct", False),
+    ],
+)
+def test_the_word_rect_tells_a_rectified_image(tmp_path, topic, rectified):
+    """Before, a transport hid the word, and ``corrected`` contained it."""
+    texture = np.random.default_rng(3).integers(0, 255, (48, 64)).astype(np.uint8)
+    messages = []
+    for side, shift in (("l", 0.0), ("r", -3.0)):
+        p = [50, 0, 31.3, shift, 0, 51, 22.8, 0, 0, 0, 1, 0]
+        shown = packed(ROS2, texture, "mono8; png compressed") if "/comp" in topic else image(ROS2, texture, "mono8")
+        messages += [(f"/{side}/camera_info", info(ROS2, p=p, d=[-0.3, 0, 0, 0, 0])), (f"/{side}/{topic}", shown)]
+    capture = read_recording(bag(tmp_path, messages), ReadOptions(topic=(f"/l/{topic}", f"/r/{topic}"))).capture
+    assert capture.rig.reference.matrix[0, 0] == (50 if rectified else 60)
+    assert capture.rig.reference.distortion.any() != rectified
+
+
+def test_the_kept_messages_of_a_pair_are_those_that_were_read(tmp_path):
+    """Before, the right one was that of the same number."""
+    (*calibration, (left, one), (right, other)) = pair(ROS2)
+    late = pair(ROS2, second=1.1)[-1][1]
+    early = pair(ROS2, second=0.9)[-1][1]
+    path = bag(tmp_path, [*calibration, (left, one), (right, early), (right, other), (right, late)])
+    kept = read_recording(path, ReadOptions(topic=(left, right))).originals
+    assert set(kept) == {"l_image_rect_raw_0.msg", "r_image_rect_raw_1.msg"}
+    message = ROS2.deserialize_cdr(kept["r_image_rect_raw_1.msg"], "sensor_msgs/msg/Image")
+    assert message.header.stamp.sec == 1 and message.header.stamp.nanosec == 0

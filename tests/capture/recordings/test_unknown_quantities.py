@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -9,9 +10,10 @@ import numpy as np
 import pytest
 
 from characterisation.files.errors import InputError
+from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
 from mitsim.capture.recordings.array_file import map_in
 from mitsim.capture.recordings.cloud_text import points_of_text
-from mitsim.capture.recordings.depth_image import read_depth_image
+from mitsim.capture.recordings.depth_image import missing_depths, read_depth_image
 from tests.capture.recordings.cloud_files_of_others import pinhole_cloud
 
 CLOUD = pinhole_cloud()
@@ -67,3 +69,60 @@ def test_colours_before_the_points_of_a_text_are_refused():
     whole = [(i % 9, i // 9, 200 - i, 0.6, 0.0, -0.8) for i in range(50)]
     text = "\n".join(" ".join(map(str, row)) for row in whole).encode()
     assert points_of_text(text, Path("a.xyz"))[0][-1].tolist() == [4, 5, 151]
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"K": np.eye(3)},
+        {"pose": np.eye(4)},
+        {"dist": np.zeros((1, 5))},
+        {"poses": np.tile(np.eye(4), (4, 1, 1)), "K": np.eye(3)},
+    ],
+)
+@pytest.mark.parametrize("name", ["depth", "z_map"])
+def test_a_calibration_beside_depths_is_neither_points_nor_depths(tmp_path, name, other):
+    """Before, "shape: found depth 48 x 64, K 3 x 3"."""
+    depth = np.random.default_rng(0).uniform(600, 700, (48, 64))
+    np.savez(tmp_path / "a.npz", **{name: depth}, **other)
+    assert np.array_equal(map_in((tmp_path / "a.npz").read_bytes(), tmp_path / "a.npz"), depth)
+
+
+def test_depths_by_name_are_read_beside_a_list_of_points(tmp_path):
+    depth = np.random.default_rng(0).uniform(600, 700, (48, 64))
+    np.savez(tmp_path / "a.npz", depth=depth, corners=np.zeros((88, 3)))
+    assert np.array_equal(map_in((tmp_path / "a.npz").read_bytes(), tmp_path / "a.npz"), depth)
+
+
+def test_a_map_is_of_the_camera_of_its_size(tmp_path):
+    """Before, it had the name of the first one."""
+    eyes = {
+        name: {"fx": f, "fy": f, "cx": w / 2, "cy": h / 2, "width": w, "height": h}
+        for name, f, w, h in (("color", 120, 128, 96), ("depth", 60, 64, 48))
+    }
+    (tmp_path / "eyes.json").write_text(json.dumps(eyes))
+    np.save(tmp_path / "a.npy", np.random.default_rng(0).uniform(600, 700, (48, 64)))
+    assert set(read_depth_image(tmp_path / "a.npy", tmp_path / "eyes.json").rig.cameras) == {"depth"}
+    rows, columns = np.mgrid[:48, :64]
+    z = 700 + 20 * np.sin(columns / 9)
+    np.save(tmp_path / "b.npy", np.stack([(columns - 32) / 60 * z, (rows - 24) / 60 * z, z], axis=-1))
+    options = ReadOptions(calibration=str(tmp_path / "eyes.json"))
+    assert set(read_recording(tmp_path / "b.npy", options).capture.rig.cameras) == {"depth"}
+
+
+@pytest.mark.parametrize(
+    ("values", "frame", "said"), [(CLOUD, "0", "--frame for an array of points"), (CLOUD[..., 2], "3", "frame")]
+)
+def test_a_frame_that_is_not_there_is_refused(tmp_path, values, frame, said):
+    """Before, it was ignored."""
+    np.save(tmp_path / "a.npy", values)
+    with pytest.raises(InputError, match=said):
+        read_recording(tmp_path / "a.npy", ReadOptions(calibration=str(pinhole(tmp_path)), frame=frame))
+
+
+@pytest.mark.parametrize(("left_out", "said"), [(3069, ">\u00a099\u00a0%"), (31, "1.0\u00a0%")])
+def test_a_share_is_a_plain_percentage(left_out, said):
+    """Before, 99.9 % were 1e+02 %."""
+    levels = np.full(48 * 64, 700, np.uint16)
+    levels[:left_out] = 65535
+    assert missing_depths(levels.reshape(48, 64))[1][0].startswith(f"{said} of the pixels")

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 
 from characterisation.coupon.discs import disc_offsets
 from characterisation.coupon.patches import Coupon, measure_patches
 from mitsim.sensor.transforms import look_at
-from mitsim.twin.compare.specimen_patches import points_on_specimen
+from mitsim.twin.compare.compared_quantities import _level
+from mitsim.twin.compare.plain_image import median_level
+from mitsim.twin.compare.specimen_patches import _histograms, points_on_specimen
 from mitsim.twin.finish.specimen import Bend, known_specimen
 from tests.seen_shapes import GRID, cloud_of, plane
 
@@ -40,3 +44,20 @@ def test_one_definition_of_f_for_comparisons_and_coupons(rng):
 def pixels_of(rows, columns, radius=6.0):
     offsets = disc_offsets(radius)
     return (rows[:, None] + offsets[:, 0]) * GRID.width + columns[:, None] + offsets[:, 1]
+
+
+def test_histograms_of_sixteen_bits_are_as_large_as_the_image():
+    """Before, 2^16 numbers of every patch: 0.34 GB of 640, and 0.55 s of each of 400 draws."""
+    levels = np.random.default_rng(0).integers(0, 2**16, (640, 1600)).astype(float)
+    levels[:, ::7] = np.nan
+    tracemalloc.start()
+    histograms = _histograms(levels, 2**16)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 10 * levels.nbytes
+    dense = np.zeros((640, 2**16))
+    for tile, row in zip(levels, dense, strict=True):
+        np.add.at(row, tile[np.isfinite(tile)].astype(int), 1)
+    patches, draws = SimpleNamespace(levels=histograms), np.random.default_rng(1).integers(0, 640, (3, 640))
+    expected = [median_level(dense[draw].sum(axis=0)) for draw in draws]
+    assert np.array_equal(_level(patches, draws), expected)

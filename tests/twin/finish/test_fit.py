@@ -478,6 +478,17 @@ def refused(arguments, *words):
         assert word in str(result.exception)
 
 
+def test_a_capture_is_fitted_by_the_scene_that_it_was_rendered_of(captures, tmp_path):
+    """Before, by the scene's default metal."""
+    capture = read_capture(captures[0])
+    assert capture.settings["scene_parameters"] == {"Ra": "0.46"}
+    for name, values in (("copper", {"metal": "copper"}), ("list", ["copper"])):
+        write_capture(replace(capture, settings={**capture.settings, "scene_parameters": values}), tmp_path / name)
+    assert fit_captures([tmp_path / "copper"]).metal.metal == "copper"
+    assert fit_captures([tmp_path / "copper"], parameters={"metal": "aluminium"}).metal.metal == "aluminium"
+    refused([tmp_path / "list"], "scene_parameters", "a table of texts")
+
+
 def test_what_does_not_go_together_is_refused(captures, tmp_path, n10, scenes):
     refused([tmp_path / "none"], "no such folder", "a capture folder")
     refused([captures[0], captures[0]], "a folder twice")

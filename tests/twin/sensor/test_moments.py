@@ -14,6 +14,7 @@ from mitsim.twin.sensor.estimate import FittedKey, combined, pooled
 from mitsim.twin.sensor.moments import Prior, match_moments
 from mitsim.twin.sensor.parameters import room_parameters
 from mitsim.twin.sensor.run import _combined_estimates
+from mitsim.twin.sensor.stripes import focused
 from mitsim.twin.sensor.write import _entries, fit_table
 
 A = np.array([[1.0, 0.4], [0.2, 1.0], [0.5, -0.7]])
@@ -104,3 +105,17 @@ def test_a_room_that_the_dots_do_not_tell_is_named():
     sensor, imager = load_sensor("ensenso-n10"), SimpleNamespace(undetermined=())
     estimates, _ = _combined_estimates({"wall": fit}, sensor, imager, None)
     assert [one.determined for one in estimates] == [True, False]
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_a_capture_that_tells_the_focus_decides_whatever_the_order(first):
+    """Before, the aperture was 5 or 0 mm by the order, and two definitions of the blur were averaged."""
+
+    def told(name, aperture, spread, blur):
+        keys = {"imager.blur_px": (blur, 0.1), "projector.aperture_mm": (aperture, spread)}
+        return [FittedKey(key, *pair, "", (name,), "") for key, pair in keys.items()]
+
+    sharp = [*told("deep", 5.0, 1.0, 0.4), FittedKey("projector.focus_mm", 700.0, 9.0, "mm", ("deep",), "")]
+    both = [sharp, told("flat", 0.0, 0.0, 0.9)]
+    assert pooled(focused([*both[first], *both[1 - first]])) == pooled(sharp)
+    assert pooled(focused(both[1])) == both[1]

@@ -2,6 +2,7 @@
 
 import itertools
 import re
+from pathlib import Path
 
 import pytest
 from scipy.stats import chi2
@@ -9,7 +10,7 @@ from scipy.stats import chi2
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.twin.sensor.run import sensor_path
 from mitsim.twin.sensor.verdict import DotAgreement, verdict_of
-from mitsim.twin.sensor.write import Entry, with_cameras, with_entries, with_exposure
+from mitsim.twin.sensor.write import Entry, moved_paths, with_cameras, with_entries, with_exposure
 
 ENTRIES = {
     "projector.flux_w": "0.5",
@@ -95,3 +96,15 @@ def test_an_array_over_several_lines_is_replaced_whole():
 def test_the_title_of_a_file_stays_above_its_first_key():
     made = with_entries('# A camera.\n\ntechnology = "x"\n', {"name": Entry('"mine"', "fitted")})
     assert made.splitlines()[:4] == ["# A camera.", "", "# fitted", 'name = "mine"']
+
+
+def test_paths_of_every_form_are_moved():
+    """Before, only one path in double quotes was; a list was looked for beside the new file after the whole fit."""
+    text = "[calibration]\nfile = {}\n\n[other]\nfile = 'l.yml'\n"
+    for before, after in (
+        ('"l.yml"', '"../a/l.yml"'),
+        ("'l.yml'  # of the unit's \"left\"", '"../a/l.yml"  # of the unit\'s "left"'),
+        ('["l.yml", "../r.yml"]', '["../a/l.yml", "../r.yml"]'),
+        ("[\n  \"l.yml\",  # left\n  'r.yml',\n]", '[\n  "../a/l.yml",  # left\n  "../a/r.yml",\n]'),
+    ):
+        assert moved_paths(text.format(before), Path("/x/a"), Path("/x/b")) == text.format(after)
