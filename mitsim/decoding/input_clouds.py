@@ -154,7 +154,8 @@ def read_cloud(
         for warning in capture.settings.get("warnings", []):
             say(f"warning: {warning}")
     settings, imager = decoder_settings(capture, sensor)
-    chosen = (settings, imager, topic, frame, sensor, unit)
+    # the rig may come from files elsewhere
+    chosen = (settings, imager, capture.rig, capture.decoding, topic, frame, sensor, unit)
     cloud = kept_cloud(path, chosen, lambda: decoded_once(capture, settings, imager)[0])
     return InputCloud(path, cloud, capture, margin_of(settings))
 

@@ -13,9 +13,14 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
+from dataclasses import fields, is_dataclass
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel
 
 from characterisation.cloud_files import read_cloud, write_cloud
 from characterisation.files.errors import InputError
@@ -41,7 +46,7 @@ def kept_cloud(path: Path, settings: Iterable[object], decode: Callable[[], Poin
     path
         File or folder of the capture; all its files count.
     settings
-        Everything else that determines the cloud; each object by its ``repr``.
+        Everything else that determines the cloud; each object by all of its values.
     decode
         Function that decodes the capture.
     """
@@ -76,7 +81,7 @@ def _digest(path: Path, settings: Iterable[object]) -> str | None:
     """Return the SHA-256 of everything that determines a cloud; None if the files are too many, too large or gone."""
     sha = hashlib.sha256(repr(own_build()).encode())
     for setting in settings:
-        sha.update(repr(setting).encode())
+        sha.update(repr(_values(setting)).encode())
     files = [path] if path.is_file() else sorted(entry for entry in path.rglob("*") if entry.is_file())
     try:
         if len(files) > MOST_FILES or sum(file.stat().st_size for file in files) > _LARGEST:
@@ -88,6 +93,19 @@ def _digest(path: Path, settings: Iterable[object]) -> str | None:
     except OSError:
         return None
     return sha.hexdigest()
+
+
+def _values(setting: Any) -> Any:
+    """Return all values of an object, whose representation may leave some out or shorten them."""
+    if isinstance(setting, BaseModel):
+        return type(setting).__name__, [(name, _values(getattr(setting, name))) for name in type(setting).model_fields]
+    if is_dataclass(setting):
+        return type(setting).__name__, [(one.name, _values(getattr(setting, one.name))) for one in fields(setting)]
+    if isinstance(setting, np.ndarray):
+        return setting.shape, setting.tolist()
+    if isinstance(setting, Mapping):
+        return [(name, _values(value)) for name, value in setting.items()]
+    return [_values(value) for value in setting] if isinstance(setting, list | tuple) else setting
 
 
 def _remove_oldest(folder: Path) -> None:

@@ -1,10 +1,14 @@
 """A capture is decoded once for several commands, and again when anything of it changes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mitsim.decoding import kept_clouds
 from mitsim.decoding.kept_clouds import kept_cloud
+from mitsim.sensor.matcher import MatcherSettings
+from mitsim.sensor.preset import load_sensor
 from tests.seen_shapes import cloud_of, plane
 
 
@@ -39,6 +43,19 @@ def test_a_change_of_files_or_settings_decodes_again(decoder):
     (path / "image.png").write_bytes(b"other")
     kept_cloud(path, (3,), decode)
     assert len(calls) == 3
+
+
+def test_a_change_that_no_representation_shows_decodes_again(decoder):
+    """Before, another filter of the matcher, or another calibration file, gave the kept cloud."""
+    path, decode, calls = decoder
+    rig = load_sensor("ensenso-n10").rig
+    matcher = MatcherSettings(near_mm=300, far_mm=900)
+    longer = replace(rig.reference, matrix=rig.reference.matrix * [[1 + 1e-10], [1], [1]])
+    for count in (3, 3):
+        kept_cloud(path, (matcher, rig), decode)
+        kept_cloud(path, (matcher.model_copy(update={"median_px": 5}), rig), decode)
+        kept_cloud(path, (matcher, replace(rig, cameras=rig.cameras | {"left": longer})), decode)
+        assert len(calls) == count
 
 
 def test_a_damaged_cache_or_none_decodes(decoder, tmp_path, monkeypatch):
