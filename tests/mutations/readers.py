@@ -105,7 +105,7 @@ def _map(path):
     from characterisation.maps.performance_map import PerformanceMap
 
     found = PerformanceMap.load(path)
-    normals = np.array([[0.0, 0.0, 1.0], [0.3, 0.0, 0.95]])
+    normals = np.array([[0.0, 0.0, 1.0], [0.28, 0.0, 0.96]])
     for finish, roughness in found.samples:
         found.query(finish, roughness, [500.0, 600.0], normals)
 
