@@ -41,7 +41,7 @@ class Scene:
     - ``mitsuba``: the ``mi.Scene``.
     - ``names``: ids of the shapes, in Mitsuba's order.
     - ``finishes`` of the shapes; None for a stock BSDF, about which nothing is known.
-    - ``bounds`` (2, 3): corners of the bounding box [mm], world frame.
+    - ``bounds`` (2, 3): corners of the bounding box of all shapes but lamps [mm], world frame.
     - ``where``: file that it was loaded from, or a description.
     - ``parameters``: values given for its ``<default>`` elements.
     - ``changeable``: whether :meth:`deviated` can change every finish: none is nested in another BSDF or an instance.
@@ -269,7 +269,8 @@ def _wrap(scene: Any, finishes: dict[str, Finish], where: str) -> Scene:
     shapes = list(scene.shapes())
     if not shapes:
         raise InputError(where, "shape", "no shape at all", "at least one shape to be seen")
-    bounds = bounds_of(scene)
+    seen = [bounds_of(shape) for shape in shapes if not shape.is_emitter()] or [bounds_of(scene)]
+    bounds = np.array([np.min(seen, axis=0)[0], np.max(seen, axis=0)[1]])
     size = float(np.linalg.norm(bounds[1] - bounds[0]))
     if not 1.0 <= size <= 1e5:
         hint = "lengths are in mm; a part modelled in metres needs <scale value='1000'/>"

@@ -211,22 +211,22 @@ def _paint(kind: str, greatest: float, describe: Callable[[float, Scatter], dict
 def _make_bsdf(props: Any, finish_of: Callable[[Deviation], Finish]) -> Any:
     """Make the BSDF of a finish and store the finish under the id of the BSDF.
 
-    BSDFs inside shapes of a dictionary may all have the id ``bsdf``; those after the first get a number.
+    BSDFs inside shapes have no id, or all that of a dictionary's key; they get a number, the same in each loading.
     """
     from mitsim.scene.backend import mi
 
-    asked = props.id()
+    numbers = _anonymous if _current is _OUTSIDE else itertools.count()
+    name = props.id()
+    while not name or name in _current.finishes:
+        name = f"{props.id() or 'finish'}_{next(numbers)}"
     if _current.sprayed:
         finish_of = partial(_white_finish, USUAL_REFLECTANCE["matt_white"], _current.wavelength_nm)
 
     def deviated(deviation: Callable[[str], Deviation]) -> Finish:
-        return finish_of(deviation(asked))
+        return finish_of(deviation(name))
 
     finish = deviated(_current.deviation)
     bsdf = mi.load_dict(finish.description, parallel=False)
-    name = props.id()
-    while not name or name in _current.finishes:
-        name = f"{props.id() or 'finish'}_{next(_anonymous)}"
     bsdf.set_id(name)
     if _current is not _OUTSIDE:
         _current.finishes[name] = replace(finish, deviated=deviated)

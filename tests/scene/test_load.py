@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 
 from characterisation.files.errors import InputError
+from mitsim.scene.light_transport.room_light import directional_albedos
 from mitsim.scene.load import load_scene, scene_from_dict
+from mitsim.scene.ray_casting.triangles import hull_corners
+from mitsim.scene.surface.scatter import Deviation
 
 TWO = "two_pillars/two_pillars.xml"
 
@@ -109,3 +112,53 @@ def test_only_finishes_inside_other_bsdfs_keep_a_scene_from_being_changed(tmp_pa
     file = tmp_path / "scene.xml"
     file.write_text(f'<scene version="3.0.0">{bsdfs}{shape}</scene>')
     assert load_scene(file, 850).changeable == changeable
+
+
+def inline(tmp_path, *bsdfs, extra=""):
+    """A scene of spheres beside one another, each with a BSDF of its own that has no id."""
+    spheres = "".join(
+        f'<shape type="sphere"><point name="center" x="{60 * k}" y="0" z="0"/>'
+        f'<float name="radius" value="20"/>{bsdf}</shape>'
+        for k, bsdf in enumerate(bsdfs)
+    )
+    file = tmp_path / "inline.xml"
+    file.write_text(f'<scene version="3.0.0">{spheres}{extra}</scene>')
+    return file
+
+
+def test_finishes_without_an_id_have_the_same_names_in_each_loading_and_deviate_apart(tmp_path):
+    """Before, a number of the process, while draws asked for no name: all shared one draw."""
+    file = inline(
+        tmp_path, *(f'<bsdf type="machined_metal"><float name="Ra" value="{Ra}"/></bsdf>' for Ra in (0.3, 0.4))
+    )
+    asked = []
+
+    def deviation(name):
+        asked.append(name)
+        return Deviation(alpha=1.0 if name == "finish_1" else 0.0)
+
+    plain, deviated = load_scene(file, 850), load_scene(file, 850, {}, deviation)
+    names = [shape.bsdf().id() for shape in plain.shapes]
+    assert names == [shape.bsdf().id() for shape in deviated.shapes] == ["finish_0", "finish_1"] == asked
+    first, second = (
+        other.scatter.alpha_v / one.scatter.alpha_v
+        for one, other in zip(plain.finishes, deviated.finishes, strict=True)
+    )
+    assert first == 1.0 and second > 1.05
+
+
+def test_stock_bsdfs_without_an_id_have_their_own_albedo(tmp_path):
+    grey = '<bsdf type="diffuse"><spectrum name="reflectance" value="{}"/></bsdf>'
+    scene = load_scene(inline(tmp_path, grey.format(0.5), grey.format(0.1)), 850)
+    np.testing.assert_allclose([albedo.mean() for albedo in directional_albedos(scene)], [0.5, 0.1], rtol=1e-3)
+
+
+def test_a_lamp_is_no_part_of_the_bounds(tmp_path):
+    lamp = (
+        '<shape type="rectangle"><transform name="to_world"><translate z="900"/></transform>'
+        '<emitter type="area"><spectrum name="radiance" value="1"/></emitter></shape>'
+    )
+    alone, lit = (load_scene(inline(tmp_path, '<bsdf type="matt_white"/>', extra=extra), 850) for extra in ("", lamp))
+    np.testing.assert_array_equal(lit.bounds, alone.bounds)
+    np.testing.assert_allclose(lit.bounds, [[-20, -20, -20], [20, 20, 20]])
+    np.testing.assert_array_equal(hull_corners(lit), hull_corners(alone))

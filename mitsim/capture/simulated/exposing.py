@@ -10,7 +10,7 @@ image has its own random stream of noise.
 from __future__ import annotations
 
 import zlib
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,8 @@ class LightOnImagers:
     ----------
     radiance
         (P, h, w) of each camera in its region [W / (mm^2 sr)].
+    other
+        (h, w) of each camera: what of it is not the projector's; none without lamps and a known room.
     rois
         Region of each camera's image.
     exposures
@@ -57,6 +59,7 @@ class LightOnImagers:
     noise: Noise
     world_from_sensor: Transform
     rendered: dict[str, Any]
+    other: dict[str, NDArray[np.float32]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -210,9 +210,23 @@ class SimulatedSensor:
         --------
         light : the radiance of all cameras, with exposures
         """
+        return self._radiance(scene, world_from_sensor, camera, rendering, seed, roi, speckle)[0]
+
+    def _radiance(
+        self,
+        scene: Scene,
+        world_from_sensor: Transform,
+        camera: str,
+        rendering: Rendering,
+        seed: int,
+        roi: Roi | None,
+        speckle: SpeckleField | None,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        """Return the radiance, and what of it is not the projector's (h, w); None without lamps and a known room."""
         rays, ambient_image = self.rays[camera], self.sensor.ambient_image
         roi = roi or rays.whole
-        separate_ambient = ambient_image or (speckle is not None and has_emitters(scene))
+        lamps = has_emitters(scene)
+        separate_ambient = ambient_image or lamps
         depth = rendering.surfaces
         indirect = rendering.indirect_settings if depth > 1 else None
         paths = LightPaths(rendering.samples, seed, depth if indirect is None else 1, with_ambient=separate_ambient)
@@ -239,10 +253,13 @@ class SimulatedSensor:
         for image in ambient_images:
             image[:] = self.apply_lens(image, camera, roi)
         in_threads(finish_projected, projected)
+        other = ambient_images[0].copy() if lamps else None
         if self.sensor.room is not None:
             room = room_image(self.sensor, scene, world_from_sensor, camera, self.pixel_rays(camera), roi)
-            images += self.apply_lens(room, camera, roi)
-        return images[: self.patterns.count + ambient_image]
+            room = self.apply_lens(room, camera, roi)
+            images += room
+            other = room if other is None else other + room
+        return images[: self.patterns.count + ambient_image], other
 
     def apply_lens(self, image: NDArray[np.float32], camera: str, roi: Roi) -> NDArray[np.float32]:
         """Return the image (h, w) of a region, blurred by a camera's lens and darkened toward the corners."""
@@ -280,7 +297,7 @@ class SimulatedSensor:
             If the radiance or the exposure is not finite.
         """
         noise, sensor, prerendered = noise or Noise(), self.sensor, rendering.prerendered
-        light, rois = {}, {}
+        light, rois, other = {}, {}, dict[str, NDArray[np.float32]]()
         for index, (name, camera) in enumerate(sensor.rig.cameras.items()):
             read_out = None if around is None else roi_around(camera, around, _MARGIN_PX)
             roi = rois[name] = prerendered.rois[name] if prerendered is not None else read_out or self.rays[name].whole
@@ -289,21 +306,16 @@ class SimulatedSensor:
             if noise.speckle:
                 rng = np.random.default_rng(speckle_stream)
                 speckle = draw_speckle(scene, sensor, camera, self.pixel_rays(name), world_from_sensor, roi, rng)
-            light[name] = self.radiance(
-                scene,
-                world_from_sensor,
-                name,
-                rendering,
-                seed=int(render_stream.generate_state(1)[0]),
-                roi=roi,
-                speckle=speckle,
-            )
+            own = int(render_stream.generate_state(1)[0])
+            light[name], apart = self._radiance(scene, world_from_sensor, name, rendering, own, roi, speckle)
+            if apart is not None:
+                other[name] = apart
         for name, stack in light.items():
             check_finite(sensor, stack, f"camera {name}", "radiance")
         exposures = sensor.exposure.exposures(brightest_images(sensor, light), sensor.imager.full_well)
         check_finite(sensor, np.array(exposures) * sensor.electrons(), "imager", "electrons per radiance")
         records = rendering.records(scene.where, scene.parameters)
-        return LightOnImagers(light, rois, exposures, noise, world_from_sensor, records)
+        return LightOnImagers(light, rois, exposures, noise, world_from_sensor, records, other)
 
     def expose(self, light: LightOnImagers, seed: int) -> Capture:
         """Expose the imagers to light and return the capture.

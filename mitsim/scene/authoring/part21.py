@@ -121,17 +121,17 @@ def read_step_text(path: str | Path) -> StepText:
     if "ISO-10303-21" not in text[:2000]:
         raise InputError(path, "", "no ISO-10303-21 in its head", "a STEP file (Part 21)")
     records = {}
-    for statement in _statements(text, max(text.find("DATA"), 0)):
+    for statement in _statements(text):
         match = _RECORD.match(statement)
         if match is not None:
             records[int(match.group(1))] = statement[match.end() :]
     return StepText(records)
 
 
-def _statements(text: str, at: int) -> Iterator[str]:
+def _statements(text: str) -> Iterator[str]:
     """Yield the text before each semicolon outside strings and comments, without comments, in one pass."""
     pieces: list[str] = []
-    start, ends = at, {"'": "'", "/*": "*/"}
+    start, at, ends = 0, 0, {"'": "'", "/*": "*/"}
     while (stop := _STOP.search(text, at)) is not None:
         mark, at = stop.group(), stop.end()
         if mark == ";":

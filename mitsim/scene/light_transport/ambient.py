@@ -15,6 +15,9 @@ from typing import Any
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.load import Scene
 
+#: in place of a density, of a ray whose direction no other estimate finds: from the camera, or mirrored
+ALONE = -1.0
+
 
 def has_emitters(scene: Scene) -> bool:
     """Whether the scene has emitters of its own."""
@@ -44,7 +47,7 @@ def sampled_emitter_light(scene: Scene, surface: Any, bsdf: Any, random: Any, ac
     return dr.select(usable, reflected[0] * weight[0] * heuristic, 0.0)
 
 
-def hit_emitter_light(scene: Scene, surface: Any, origin: Any, pdf: Any, first: Any) -> Any:
+def hit_emitter_light(scene: Scene, surface: Any, origin: Any, pdf: Any) -> Any:
     """Return the weighted radiance of an emitter that a ray meets [W / (mm^2 sr)].
 
     Parameters
@@ -52,9 +55,7 @@ def hit_emitter_light(scene: Scene, surface: Any, origin: Any, pdf: Any, first: 
     scene, surface
         The scene, and the surface that the ray meets.
     origin, pdf
-        Point that the ray left, and density of its direction there [1/sr].
-    first
-        Whether the ray comes from the camera; it has no such density, and the weight 1.
+        Point that the ray left, and density of its direction there [1/sr], or :data:`ALONE` for the weight 1.
 
     See Also
     --------
@@ -65,6 +66,7 @@ def hit_emitter_light(scene: Scene, surface: Any, origin: Any, pdf: Any, first: 
     reference = dr.zeros(mi.Interaction3f)
     reference.p = origin
     sample = mi.DirectionSample3f(scene.mitsuba, surface, reference)
-    emitter_pdf = scene.mitsuba.pdf_emitter_direction(reference, sample, ~first)
-    heuristic = dr.select(first, 1.0, pdf / (pdf + emitter_pdf))
+    alone = pdf < 0
+    emitter_pdf = scene.mitsuba.pdf_emitter_direction(reference, sample, ~alone)
+    heuristic = dr.select(alone, 1.0, pdf / (pdf + emitter_pdf))
     return dr.select(emitted > 0, emitted * heuristic, 0.0)

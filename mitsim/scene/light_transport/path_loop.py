@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import opaque, opaque_index, to_device
-from mitsim.scene.light_transport.ambient import has_emitters, hit_emitter_light, sampled_emitter_light
+from mitsim.scene.light_transport.ambient import ALONE, has_emitters, hit_emitter_light, sampled_emitter_light
 from mitsim.scene.light_transport.aperture_samples import aperture_samples
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.low_discrepancy import r3_point, z_order
@@ -133,7 +133,7 @@ def launch(
         ray = mi.Ray3f(origin, direction)
         surface = scene.mitsuba.ray_intersect(ray) if plane is None else intersect_plane(plane, ray)
         if has_ambient:
-            ambient = weight * hit_emitter_light(scene, surface, origin, pdf, at_first)
+            ambient = weight * hit_emitter_light(scene, surface, origin, dr.select(at_first, ALONE, pdf))
             if paths.indirect_only:  # an emitter behind the first surface is its direct light
                 ambient = dr.select(bounce > 1, ambient, 0.0)
         hit = surface.is_valid() & (bounce < surfaces)
@@ -174,6 +174,10 @@ def launch(
         continues = hit & (bounce + 1 < rays_at_most)
         sampled, bsdf_weight = bsdf.sample(context, surface, sample1, sample2, continues)
         continues &= bsdf_weight[0] > 0
+        direction_pdf = sampled.pdf
+        if has_ambient:  # no other estimate of an emitter that a mirror shows
+            mirrored = mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Delta)
+            direction_pdf = dr.select(mirrored, ALONE, direction_pdf)
         next_ray = surface.spawn_ray(surface.to_world(sampled.wo))
         if photons:  # photons end at a delta lobe
             reverse_density = dr.select(
@@ -188,7 +192,7 @@ def launch(
             origin=dr.select(continues, next_ray.o, origin),
             direction=dr.select(continues, next_ray.d, direction),
             weight=dr.select(continues, weight * bsdf_weight[0], 1.0),
-            pdf=sampled.pdf,
+            pdf=direction_pdf,
             length=length,
             ratio=ratio,
             random=random,

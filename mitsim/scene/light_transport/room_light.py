@@ -83,12 +83,9 @@ def room_radiance(
 
 def directional_albedos(scene: Scene) -> list[NDArray[np.float64]]:
     """Return the :func:`directional_albedo` of each shape; shapes with one BSDF share it."""
-    albedos: dict[str, NDArray[np.float64]] = {}
     bsdfs = [shape.bsdf() for shape in scene.shapes]
-    for bsdf in bsdfs:
-        if bsdf.id() not in albedos:
-            albedos[bsdf.id()] = directional_albedo(bsdf)
-    return [albedos[bsdf.id()] for bsdf in bsdfs]
+    albedos = {bsdf: directional_albedo(bsdf) for bsdf in dict.fromkeys(bsdfs)}
+    return [albedos[bsdf] for bsdf in bsdfs]
 
 
 def directional_albedo(bsdf: Any) -> NDArray[np.float64]:

@@ -31,8 +31,7 @@ def triangles(scene: Scene) -> Floats:
     Shapes whose BSDF transmits all light unchanged (``null``) are left out, because they bound a medium and are not
     solid. Glass is solid.
     """
-    parts = [_of_shape(shape) for shape in scene.shapes if _solid(shape)]
-    return np.concatenate([np.empty((0, 3, 3)), *parts])
+    return np.concatenate([np.empty((0, 3, 3)), *triangles_by_shape(scene).values()])
 
 
 def triangles_by_shape(scene: Scene) -> dict[str, Floats]:
@@ -42,8 +41,9 @@ def triangles_by_shape(scene: Scene) -> dict[str, Floats]:
 
 
 def hull_corners(scene: Scene) -> Floats:
-    """Return the corners (k, 3) [mm], world frame, of the convex hull of all solid surfaces."""
-    corners = np.unique(triangles(scene).reshape(-1, 3), axis=0)
+    """Return the corners (k, 3) [mm], world frame, of the convex hull of all solid surfaces but lamps."""
+    parts = [_of_shape(shape) for shape in scene.shapes if _solid(shape) and not shape.is_emitter()]
+    corners = np.unique(np.concatenate([np.empty((0, 3, 3)), *parts]).reshape(-1, 3), axis=0)
     try:
         return np.asarray(corners[ConvexHull(corners).vertices])
     except QhullError:  # all in one plane, or on a line

@@ -225,7 +225,10 @@ class RenderedMeasurements:
         exposures = lit.light.exposures if planned is None else planned.exposures_s
         radiance = {name: images.copy() for name, images in lit.light.radiance.items()} if keep else lit.light.radiance
         for name, images in radiance.items():
+            other = lit.light.other.get(name)
             images *= np.float32(power)
+            if other is not None:  # lamps and a known room
+                images += other * np.float32(1 - power)
             if not has_room:  # a known room is part of the traced light
                 images += lit.room[name] * np.float32(drawn.room)
         light = replace(

@@ -25,19 +25,15 @@ from mitsim.study.virtual.coat import coated_shapes
 from mitsim.study.virtual.form import drawn_form
 from mitsim.study.virtual.world import GROUPS, Unknowns
 
-#: linear expansion near 20 C [1/K], by the metal of a finish (CRC Handbook of Chemistry and Physics; steel: unalloyed)
+#: linear expansion near 20 C [1/K], by the metal of a finish (CRC Handbook of Chemistry and Physics; AISI 304)
 EXPANSION_PER_KELVIN = {
     "aluminium": 23.1e-6,
-    "steel": 11.8e-6,
-    "iron": 11.8e-6,
     "copper": 16.5e-6,
     "brass": 19e-6,
+    "stainless_steel": 17.3e-6,
+    "carbon_steel": 11.8e-6,
     "chromium": 4.9e-6,
     "nickel": 13.4e-6,
-    "titanium": 8.6e-6,
-    "gold": 14.2e-6,
-    "silver": 18.9e-6,
-    "tungsten": 4.5e-6,
 }
 
 #: thermal expansion of a part whose finish names no metal [1/K]: between steel and aluminium

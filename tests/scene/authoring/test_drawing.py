@@ -256,10 +256,13 @@ def test_nists_part_becomes_a_task(ctc, tmp_path, step_here):
     assert {letter: len(faces) for letter, faces in part.drawing.datums.items()} == {"A": 1, "B": 1, "C": 1}
 
 
-def test_entities_of_a_file_are_read_as_they_are_written(tmp_path):
+@pytest.mark.parametrize("name", ["#9=NOT(1);", "MY DATA; IT'S", "a DATABASE /* of parts"])
+def test_entities_of_a_file_are_read_as_they_are_written(tmp_path, name):
+    """Before, DATA in the name of a file hid all of its entities."""
     path = tmp_path / "some.stp"
+    written = name.replace("'", "''")
     path.write_text(
-        "ISO-10303-21;\nHEADER;\nFILE_NAME('#9=NOT(1);','',(''),(''),'','','');\nENDSEC;\nDATA;\n"
+        f"ISO-10303-21;\nHEADER;\nFILE_NAME('{written}','',(''),(''),'','','');\nENDSEC;\nDATA;\n"
         "#1=A('it''s; /* no comment */ \\X2\\00E4\\X0\\',$,*,.T.,(#2,(1.5E-3,-2)));/* #7=B(); */\n"
         "#2 = ( X_1(LENGTH_MEASURE(3.)) Y() );\n#3=BROKEN((1,);\nENDSEC;\nEND-ISO-10303-21;\n"
     )

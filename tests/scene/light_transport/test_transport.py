@@ -349,3 +349,24 @@ def test_sphere_through_an_ideal_code(n10):
     assert np.linalg.norm(fit.centre - pose.inverse().points(np.zeros(3))) < 0.05
     assert fit.residual_std < 0.05
     print(f"sphere through an ideal code: radius error {1000 * (fit.radius - 100):.2f} um")
+
+
+@pytest.mark.parametrize("kind", ["conductor", "diffuse"])
+def test_a_mirror_shows_a_lamp_as_bright_as_the_lamp(kind):
+    """Before, 0.28 of it, as if sampling the lamp had found the rest."""
+    whole = {"sky": {"type": "constant", "radiance": {"type": "uniform", "value": 2e-7}}}
+    panel = {
+        "panel": {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().translate([0, 0, 900]).rotate([1, 0, 0], 180).scale([4000, 4000, 1]),
+            "emitter": {"type": "area", "radiance": {"type": "uniform", "value": 2e-7}},
+        }
+    }
+    bsdf = {"type": kind} if kind == "conductor" else {"type": kind, "reflectance": {"type": "uniform", "value": 0.5}}
+    to_world = mi.ScalarTransform4f().scale([200, 200, 1])
+    plate = {"plate": {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}}
+    scene = scene_from_dict(plate | (panel if kind == "conductor" else whole), 850)
+    dark = ProjectedPatterns(np.zeros((1, 14, 20)), Projector(pinhole(20, 14, 22.0, BESIDE), flux=1e-2))
+    paths = LightPaths(samples=256, seed=1, depth=2, with_ambient=True)
+    seen = trace(scene, CameraRays(pinhole(8, 8, 80.0)), dark, look_at([0, -100, 300], [0, 0, 0], [0, 0, 1]), paths)[-1]
+    assert seen.mean() == pytest.approx(2e-7 * (1.0 if kind == "conductor" else 0.5), rel=0.01)

@@ -17,10 +17,13 @@ from mitsim.scene.light_transport.room_light import directional_albedos
 from mitsim.scene.load import load_scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.scene.ray_casting.self_view import sees_itself
+from mitsim.scene.surface.metals import CONSTANTS
+from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.imager import electrons_per_radiance
 from mitsim.sensor.pattern import another_mask
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.rig_parameters import moved
+from mitsim.sensor.sensor_file import RoomTable
 from mitsim.sensor.transforms import Transform, look_at
 from mitsim.study import StudyFile, open_study
 from mitsim.study.session import Session
@@ -32,7 +35,7 @@ from mitsim.study.virtual.plan import measurements_of, race_rendering, trial_dig
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.stated import budget_groups
-from mitsim.study.virtual.study_unknowns import study_unknowns
+from mitsim.study.virtual.study_unknowns import EXPANSION_PER_KELVIN, study_unknowns
 from mitsim.study.virtual.world import Trial
 from tests.smaller_sensors import binned, coarse_sensor, middle_part
 
@@ -427,6 +430,32 @@ def test_scenes_whose_paths_cannot_be_kept_are_rendered_in_every_finish(coarse_n
     assert not maker._view_light(view).kept
     assert found[0] != found[1]
     np.testing.assert_equal(outcomes(study, jobs[1])[1], found[1:])
+
+
+@pytest.mark.parametrize("known_room", [False, True])
+def test_power_changes_the_light_of_the_projector_alone(coarse_n10, tmp_path, known_room):
+    """Before, lamps and a known room were dimmed with the projector."""
+    lamp = '<emitter type="constant"><float name="radiance" value="1e-6"/></emitter>'
+    study = metal_study(coarse_n10, tmp_path, "" if known_room else lamp)
+    if known_room:
+        study = replace(study, sensor=replace(study.sensor, room=RoomTable(irradiance_w_mm2=4e-6)))
+    maker = measurements_of(study, replace(study_unknowns(study), varied=()))
+    lit = maker.lit(study.views[0], maker.unknowns.draw(Trial(0)))
+    black = study.sensor.imager.black_level
+
+    def grey(power):
+        capture = maker.exposed(lit, PlannedExposure((0.05 * lit.light.exposures[0],), power), 1, keep=True)
+        name, stack = next(iter(capture.images.items()))
+        return stack[(slice(None), *capture.decoding.read_out[name].slices)].mean() - black
+
+    full, half, hardly = grey(1.0), grey(0.5), grey(1e-6)
+    assert half == pytest.approx((full + hardly) / 2, rel=0.02)
+    assert 0.1 * full < hardly < 0.9 * full
+
+
+def test_every_metal_of_a_finish_expands_as_itself():
+    """Before, carbon steel by 17e-6, as a part of unknown material: the table called it steel."""
+    assert set(EXPANSION_PER_KELVIN) == set(CONSTANTS)
 
 
 def test_unknowns_of_a_study_are_checked(tmp_path):
