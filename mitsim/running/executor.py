@@ -43,6 +43,17 @@ AHEAD = 2
 DEATHS = 5
 
 
+#: where Linux tells the memory of a container: limit, use and its parts, and the name of cached files, of versions 2, 1
+_GROUP = Path("/sys/fs/cgroup")
+_GROUP_FILES = (
+    (("memory.max", "memory.current", "memory.stat"), "inactive_file"),
+    (
+        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "memory/memory.stat"),
+        "total_inactive_file",
+    ),
+)
+
+
 class Executor(Protocol):
     """Distributes work: :class:`Pool`, or :class:`mitsim.running.cluster.Cluster`."""
 
@@ -85,10 +96,12 @@ def available_memory() -> int:
     with contextlib.suppress(OSError, ValueError, StopIteration):
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
         available = [1024 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))]
-    with contextlib.suppress(OSError, ValueError):
-        group = Path("/sys/fs/cgroup")
-        limit, used = (int((group / f"memory.{name}").read_text(encoding="ascii")) for name in ("max", "current"))
-        available.append(max(limit - used, 0))
+    for names, cached in _GROUP_FILES:
+        with contextlib.suppress(OSError, ValueError, StopIteration):
+            limit, used, numbers = ((_GROUP / name).read_text(encoding="ascii") for name in names)
+            # files in memory that nobody reads are dropped before the limit is exceeded
+            cache = next(int(line.split()[1]) for line in numbers.splitlines() if line.split()[0] == cached)
+            available.append(max(int(limit) - max(int(used) - cache, 0), 0))
     return min(available)
 
 

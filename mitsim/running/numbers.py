@@ -42,7 +42,7 @@ def beside(value: float, uncertainty: float | None) -> str:
 
 def interval_text(low: float, high: float) -> str:
     """Write the ends of an interval with the decimal places that two digits of half its width need."""
-    half = (high - low) / 2 or max(abs(low), abs(high), 1e-12)
+    half = (high - low) / 2 or max(abs(low), abs(high)) or 1.0
     decimals = max(0, 1 - math.floor(math.log10(half)))
     return f"{rounded(low, decimals)} to {rounded(high, decimals)}"
 
@@ -52,7 +52,8 @@ def accepted_text(low: float, high: float, tolerance: float) -> str:
 
     ``low`` is -inf for ``up to 0.13``.
     """
-    decimals = max(0, 2 - math.floor(math.log10(tolerance)), 1 - math.floor(math.log10(min(tolerance, high - low))))
+    finest = min(tolerance, high - low) if high > low else tolerance
+    decimals = max(0, 2 - math.floor(math.log10(tolerance)), 1 - math.floor(math.log10(finest)))
     unit, near = 10.0**decimals, 1e-6  # a number that is written with these decimals stays
     most = rounded(math.floor(high * unit + near) / unit, decimals)
     return f"up to {most}" if math.isinf(low) else f"{rounded(math.ceil(low * unit - near) / unit, decimals)} to {most}"
@@ -88,7 +89,7 @@ def percent(share: float | None) -> str:
         return f"0{SPACE}%"
     if 0 < share < 0.0005:
         return f"<{SPACE}0.1{SPACE}%"
-    if 0.995 < share < 1:
+    if 0.995 <= share < 1:
         return f">{SPACE}99{SPACE}%"
     return f"{100 * share:.{1 if share < 0.0995 else 0}f}{SPACE}%"
 

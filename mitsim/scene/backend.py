@@ -199,11 +199,26 @@ def activate(requested: str | None = None) -> str:
     import mitsuba as mi
 
     mi.set_variant(variant)
+    if variant == "llvm_ad_mono":
+        _check_loaded_library()
     mi.set_log_level(mi.LogLevel.Error)
     if count := asked_threads():
         limit_threads(count)
     _active = os.environ[VARIANT_VARIABLE] = variant
     return variant
+
+
+def _check_loaded_library() -> None:
+    """Reject the library that Dr.Jit chose by itself when a program imported it before mitsim chose one."""
+    import drjit as dr
+
+    version = ".".join(map(str, dr.detail.llvm_version()))
+    if int(version.partition(".")[0]) < LLVM_MINIMUM:
+        raise MissingEnvironmentError(
+            f"this process has loaded LLVM {version}, which aborts it at the first render: mitsuba or drjit "
+            "was imported before mitsim chose a library. Import them after mitsim has rendered, or start the program "
+            f"with {LLVM_VARIABLE}={os.environ[LLVM_VARIABLE]}"
+        )
 
 
 def limit_threads(count: int) -> None:

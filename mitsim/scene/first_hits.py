@@ -41,13 +41,21 @@ def first_hits(scene: Any, origins: NDArray[np.floating], directions: NDArray[np
     two_sided = (surface.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.BackSide))) != 0
     front = ~behind | two_sided
     normal = dr.select(behind, -surface.n, surface.n)
-    inside, instance = (dr.reinterpret_array(mi.UInt32, pointer) for pointer in (surface.shape, surface.instance))
-    shape_id_of_ray = dr.select(surface.is_valid(), dr.select(instance != 0, instance, inside), 0)
+    shape_id_of_ray = numbers_met(surface, surface.is_valid())
     distance = dr.select(surface.is_valid(), surface.t, dr.nan)
     dr.eval(front, normal, shape_id_of_ray, distance)
     shape = shape_indices(scene, shape_id_of_ray)
     vectors = np.where((shape >= 0)[:, None], vectors_to_host(normal, float), np.nan)
     return Hits(shape, np.array(front, bool) & (shape >= 0), vectors, np.array(distance, float))
+
+
+def numbers_met(surface: Any, valid: Any) -> Any:
+    """Return Mitsuba's number of the shape that each lane met, of the instance for a shape in a group; 0 for none.
+
+    ``surface`` is an interaction or a preliminary intersection.
+    """
+    inside, instance = (dr.reinterpret_array(mi.UInt32, pointer) for pointer in (surface.shape, surface.instance))
+    return dr.select(valid, dr.select(instance != 0, instance, inside), 0)
 
 
 def shape_indices(scene: Any, numbers: Any) -> NDArray[np.int16]:

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from mitsim.running.numbers import accepted_text, beside, interval_text
+from mitsim.running.numbers import SPACE, accepted_text, beside, interval_text, percent
 
 
 @pytest.mark.parametrize(
@@ -22,6 +22,7 @@ def test_an_estimate_has_the_places_of_its_uncertainty(value, uncertainty, writt
         (-0.81, 0.19, "−0.81 to 0.19"),
         (-114.3, 371.2, "−114 to 371"),
         (2, 2, "2.0 to 2.0"),
+        (0, 0, "0.0 to 0.0"),
     ],
 )
 def test_an_interval_has_the_places_of_its_width(low, high, written):
@@ -35,7 +36,15 @@ def test_an_interval_has_the_places_of_its_width(low, high, written):
         (19.82, 20.18, 0.4, "19.820 to 20.180"),
         (-math.inf, 0.1279, 0.2, "up to 0.127"),
         (4.99996, 5.00004, 0.2, "4.999960 to 5.000040"),
+        (20, 20, 0.2, "20.000 to 20.000"),
     ],
 )
 def test_no_reading_beyond_the_accepted_ones_is_written(low, high, tolerance, written):
     assert accepted_text(low, high, tolerance) == written
+
+
+@pytest.mark.parametrize(
+    ("share", "written"), [(0.99, "99"), (0.995, "> 99"), (0.9999, "> 99"), (1, "100"), (0.0004, "< 0.1"), (0, "0")]
+)
+def test_all_of_it_alone_is_a_hundred_percent(share, written):
+    assert percent(share) == f"{written} %".replace(" ", SPACE)

@@ -92,6 +92,27 @@ def test_it_renders_with_as_many_threads_as_the_environment_asks_for(monkeypatch
         assert backend.dr.thread_count() == asked
 
 
+@pytest.mark.parametrize("said", [False, True])
+def test_a_library_that_a_program_loaded_before_is_told(said):
+    """Dr.Jit takes the library of the system, such as LLVM 15, as soon as it is imported."""
+    if backend.cuda_devices():
+        pytest.skip("a GPU is here: mitsim does not need libLLVM")
+    if sys.platform != "linux":
+        pytest.skip("the library that Dr.Jit takes by itself is known on Linux alone")
+    backend.activate()
+    environment = {name: value for name, value in os.environ.items() if said or name != backend.LLVM_VARIABLE}
+    alone = "import drjit; from mitsim.scene import backend; {}; print(*drjit.detail.llvm_version())"
+    scripts = (alone.format("import mitsuba; mitsuba.set_variant('llvm_ad_mono')"), alone.format("backend.activate()"))
+    taken, done = (
+        subprocess.run([sys.executable, "-c", one], env=environment, capture_output=True, text=True, check=False)
+        for one in scripts
+    )
+    usable = taken.returncode == 0 and int(taken.stdout.split()[0]) >= backend.LLVM_MINIMUM
+    assert usable or not said
+    assert done.returncode == (0 if usable else 1), done.stderr
+    assert usable or "was imported before mitsim chose a library" in done.stderr or "llvm" in taken.stderr.lower()
+
+
 def test_unknown_variants_are_refused():
     with pytest.raises(InputError, match="cuda_ad_mono, llvm_ad_mono"):
         backend.choose_variant("scalar_rgb")

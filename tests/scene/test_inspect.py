@@ -17,6 +17,7 @@ from mitsim.scene.first_hits import first_hits
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
 from mitsim.scene.mesh_facts import mesh_facts
+from mitsim.scene.ray_casting.raycast import PixelRays, cast, shapes_met
 from mitsim.scene.visible_surfaces import visible_surfaces
 from mitsim.sensor.transforms import look_at
 
@@ -73,6 +74,11 @@ def test_an_instance_is_seen_and_its_area_is_not_known(tmp_path, n10):
     down = first_hits(scene.mitsuba, np.array([[0.0, 0, 50], [30, 0, 50], [-30, 0, 50]]), np.tile([0.0, 0, -1], (3, 1)))
     assert [scene.names[number] for number in down.shape] == ["one", "two", "plate"]
     assert np.allclose(down.distance, [40, 40, 50], atol=1e-3)
+    rays = PixelRays(np.zeros(3), np.array([[[0.0, 0, 1]]]))
+    for shift, name in ((0, "one"), (30, "two"), (-30, "plate")):
+        moved = look_at([shift, 0, 50], [shift, 0, 0], [0, 1, 0])
+        for shape in (cast(scene, rays, moved, np.empty((0, 3))).shape, shapes_met(scene, rays, moved)):
+            assert scene.names[shape.item()] == name and shape.item() >= 0
 
 
 def test_curves_are_checked_and_put_on_the_page(tmp_path, n10):

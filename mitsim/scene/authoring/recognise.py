@@ -46,7 +46,6 @@ def _candidates(
     mean = areas @ normals / total
     if np.linalg.norm(mean) > 0.99:
         yield Plane(areas @ middles / total, mean / np.linalg.norm(mean))
-        return
     # the normals of a cylinder lie in the plane perpendicular to its axis
     spread, directions = np.linalg.eigh((normals * areas[:, None]).T @ normals / total)
     axis = directions[:, 0]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from characterisation.files.arrays import Floats
 from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
-from mitsim.scene.first_hits import shape_indices
+from mitsim.scene.first_hits import numbers_met, shape_indices
 from mitsim.scene.light_transport.plain_scene import SceneBsdfs
 from mitsim.scene.light_transport.projector_light import ProjectedPatterns, ProjectorLight
 from mitsim.scene.load import Scene, bounds_of
@@ -138,13 +138,7 @@ def _traced(
     next_ray = surface.spawn_ray(surface.to_world(sampled.wo))
     second = scene.mitsuba.ray_intersect(next_ray, hit & (weight[0] > 0))
     double = dr.select(second.is_valid(), weight[0] * lit(second, next_ray.d, second.is_valid()), 0.0)
-    numbers = [_number(interaction) for interaction in (surface, second)]
+    numbers = [numbers_met(interaction, interaction.is_valid()) for interaction in (surface, second)]
     dr.eval(single, double, numbers)
     first_shape, second_shape = (shape_indices(scene.mitsuba, number) for number in numbers)
     return first_shape, second_shape, np.array(single, float), np.array(double, float)
-
-
-def _number(surface: mi.SurfaceInteraction3f) -> mi.UInt32:
-    """Return Mitsuba's number of the shape, or of its instance, that each lane met; 0 for none."""
-    inside, instance = (dr.reinterpret_array(mi.UInt32, pointer) for pointer in (surface.shape, surface.instance))
-    return dr.select(surface.is_valid(), dr.select(instance != 0, instance, inside), 0)

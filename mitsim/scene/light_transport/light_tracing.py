@@ -42,6 +42,7 @@ from numpy.typing import NDArray
 from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import opaque, opaque_index
+from mitsim.scene.light_transport.kept_walks import value_and_density
 from mitsim.scene.light_transport.low_discrepancy import r3_point, z_order
 from mitsim.scene.light_transport.plain_scene import SceneBsdfs
 from mitsim.scene.light_transport.projector_light import ProjectedLight, ProjectorLight
@@ -210,7 +211,8 @@ def _launch(
         column, row, seen = rays.distortion.image(x, y, in_front)
         column, row = mi.UInt32(dr.select(seen, column + 0.5, 0.0)), mi.UInt32(dr.select(seen, row + 0.5, 0.0))
         seen &= ~scene.mitsuba.ray_test(shadow_ray(surface, toward, distance), seen)
-        value, density = _value_and_density(bsdf, surface, surface.to_local(toward), toward_projector, seen)
+        to_lens = surface.to_local(toward)
+        value, density = value_and_density(bsdf, surface, toward_projector, to_lens, seen, camera=True)
         # density on the surface of the pixel's samples, which are uniform on its area in the plane z = 1 [1/mm^2]
         importance = dr.abs(dr.dot(surface.n, toward)) / (
             pixel_area(*rays.corners(column, row)) * dr.square(cosine) * cosine * dr.square(distance)
@@ -233,7 +235,7 @@ def _launch(
         outgoing = surface.to_world(sampled.wo)
         # as at the end of a camera path: the projector must be on the side that is seen
         continues &= ~at_first | (dr.dot(surface.n, -direction) * dr.dot(surface.n, outgoing) > 0)
-        value, density = _value_and_density(bsdf, surface, sampled.wo, toward_projector, continues)
+        value, density = value_and_density(bsdf, surface, toward_projector, sampled.wo, continues, camera=True)
         continues &= value > 0
         cosine_out = dr.maximum(dr.abs(dr.dot(surface.n, outgoing)), 1e-9)
         weight = weight * value * cosine_out / (sampled.pdf * cosine_in)
@@ -271,17 +273,6 @@ class _PhotonState:
     ratio: Any  # n_C p_C / (n_L p_L) so far
     length: Any  # optical length so far [mm]
     random: Any
-
-
-def _value_and_density(bsdf: Any, surface: Any, outgoing: Any, toward_projector: Any, active: Any) -> tuple[Any, Any]:
-    """Return the BSDF times cosine, and the density with which a camera path continues to the projector.
-
-    The path arrives from ``outgoing``. Directions are in the local frame.
-    """
-    view = mi.SurfaceInteraction3f(surface)
-    view.wi = outgoing
-    value, density = bsdf.eval_pdf(mi.BSDFContext(), view, toward_projector, active)
-    return value[0], density
 
 
 def _in_disc(random: Any) -> Any:

@@ -26,6 +26,7 @@ from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import opaque, opaque_index, to_device
 from mitsim.scene.light_transport.ambient import ALONE, has_emitters, hit_emitter_light, sampled_emitter_light
 from mitsim.scene.light_transport.aperture_samples import aperture_samples
+from mitsim.scene.light_transport.kept_walks import density_to_camera
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.low_discrepancy import r3_point, z_order
 from mitsim.scene.light_transport.plain_scene import SceneBsdfs, intersect_plane, single_bsdf, single_plane
@@ -152,7 +153,7 @@ def launch(
             cosine = dr.dot(direction, camera.axes[2])
             footprint = photons_per_sample * area * dr.square(cosine) * cosine * dr.square(surface.t)
             ratio = dr.select(at_first, footprint, ratio) / dr.maximum(cosine_in, 1e-9)
-            reverse_density = _density_to_camera(
+            reverse_density = density_to_camera(
                 bsdf, surface, surface.to_local(toward), hit & ~at_first & (irradiance > 0)
             )
             reverse_density *= projector.density(toward, distance) * dr.abs(dr.dot(surface.n, toward))
@@ -180,7 +181,7 @@ def launch(
         next_ray = surface.spawn_ray(surface.to_world(sampled.wo))
         if photons:  # photons end at a delta lobe
             reverse_density = dr.select(
-                at_first, 1.0, _density_to_camera(bsdf, surface, sampled.wo, continues & ~at_first)
+                at_first, 1.0, density_to_camera(bsdf, surface, sampled.wo, continues & ~at_first)
             )
             ratio *= dr.select(is_delta, 0.0, reverse_density * dr.abs(dr.dot(surface.n, next_ray.d)) / sampled.pdf)
             ratio = dr.select(continues, dr.minimum(ratio, _LARGEST_RATIO), 0.0)
@@ -221,16 +222,6 @@ class _PathState:
     ratio: Any  # n_L p_L / (n_C p_C) so far, of photons over camera paths
     random: Any
     sums: Any  # light of each code, and of the emitters as the last
-
-
-def _density_to_camera(bsdf: Any, surface: Any, toward_projector: Any, active: Any) -> Any:
-    """Return the density with which a photon continues to the camera [1/sr].
-
-    It arrives from ``toward_projector``, in the local frame.
-    """
-    view = mi.SurfaceInteraction3f(surface)
-    view.wi = toward_projector
-    return bsdf.pdf(mi.BSDFContext(), view, surface.wi, active)
 
 
 class _Pupils:

@@ -19,7 +19,7 @@ from characterisation.point_cloud import ViewGrid
 from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import known_to_device, opaque_index, opaque_point, vectors_to_host
-from mitsim.scene.first_hits import shape_indices
+from mitsim.scene.first_hits import numbers_met, shape_indices
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.eye import Eye, shadow_ray
 from mitsim.sensor.camera import Camera
@@ -105,7 +105,7 @@ def cast(scene: Scene, rays: PixelRays, world_from_sensor: Transform, eyes: NDAr
     two_sided = (surface.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.BackSide))) != 0
     hit = surface.is_valid() & ((facing > 0) | two_sided)
     normal = frame.to_local(surface.n * facing)
-    shape = dr.select(hit, dr.reinterpret_array(mi.UInt32, surface.shape), 0)
+    shape = numbers_met(surface, hit)
     distance = dr.select(hit, surface.t, dr.nan)
     seen = []
     for eye in world_from_sensor.points(np.asarray(eyes, float).reshape(-1, 3)):
@@ -135,7 +135,7 @@ def shapes_met(scene: Scene, rays: PixelRays, world_from_sensor: Transform) -> N
     frame = rays.frame(world_from_sensor)
     ray = mi.Ray3f(frame.position, frame.to_world(rays.directions))
     met = scene.mitsuba.ray_intersect_preliminary(ray, active=rays.active)
-    return shape_indices(scene.mitsuba, dr.reinterpret_array(mi.UInt32, met.shape)).reshape(rays.size)
+    return shape_indices(scene.mitsuba, numbers_met(met, met.is_valid())).reshape(rays.size)
 
 
 def cloud_points(surfaces: Surfaces, grid: ViewGrid) -> NDArray[np.float64]:

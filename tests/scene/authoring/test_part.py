@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import importlib.util
+import math
 import os
 import tempfile
 import tomllib
@@ -15,13 +16,14 @@ import trimesh
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from characterisation.features.surfaces import Cylinder
+from characterisation.features.surfaces import Cylinder, Plane, Sphere
 from characterisation.files.errors import InputError
 from mitsim.scene.authoring.check_task import read_features
 from mitsim.scene.authoring.face import surface_distance
 from mitsim.scene.authoring.part_folder import Finishing, scene_xml, write_part
 from mitsim.scene.authoring.read_mesh import read_mesh
 from mitsim.scene.authoring.read_step import read_step, step_installed
+from mitsim.scene.authoring.recognise import recognised
 from mitsim.scene.authoring.segment_mesh import _joined, segment_mesh
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
@@ -198,6 +200,23 @@ def test_a_sphere_and_a_bore():
     assert (outer.convex, inner.convex) == (True, False)
     assert (outer.corner_normals() * outer.vertices[outer.triangles]).sum(-1).min() > 0
     assert (inner.corner_normals() * inner.vertices[inner.triangles]).sum(-1).max() < 0
+
+
+@pytest.mark.parametrize("reach_deg", [5.0, 8.0, 11.0])
+def test_shallow_caps_and_strips_are_recognised(reach_deg):
+    reach, steps = math.radians(reach_deg), np.linspace(-1, 1, 13)
+    x, y = (a.ravel() for a in np.meshgrid(steps, steps))
+    corners = np.arange(13 * 13).reshape(13, 13)
+    a, b, c, d = (part.ravel() for part in (corners[:-1, :-1], corners[:-1, 1:], corners[1:, 1:], corners[1:, :-1]))
+    triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    strip = np.stack([100 * np.sin(reach * x), 40 * y, 100 * np.cos(reach * x)], axis=1)
+    tilt = reach * np.stack([x, y]) / math.sqrt(2)
+    cap = np.stack([tilt[0], tilt[1], np.sqrt(1 - (tilt**2).sum(axis=0))], axis=1) * 100
+    for vertices, kind in ((strip, Cylinder), (cap, Sphere)):
+        face = recognised(trimesh.Trimesh(vertices, triangles, process=False), np.arange(len(triangles)))
+        assert isinstance(face.surface, kind) and face.surface.radius == pytest.approx(100, rel=1e-3)
+    flat = trimesh.Trimesh(np.stack([x, y, np.zeros_like(x)], axis=1), triangles, process=False)
+    assert isinstance(recognised(flat, np.arange(len(triangles))).surface, Plane)
 
 
 def test_a_chamfer_is_no_sphere_and_a_cone_no_cylinder():
