@@ -99,6 +99,9 @@ def exposure_policy(
         words = f"automatic: {rule.percentile:g} % of the pixels under {100 * rule.level:g} % of full scale"
         return ExposurePolicy(words + several, None, rule, rule.bracket, rule.limits_s)
     if isinstance(rule, FixedExposure):
+        if "limits_s" in rule.model_fields_set and not shortest <= rule.exposure_s <= longest:
+            allowed = f"{shortest:g} to {longest:g} s, exposure.limits_s"
+            raise InputError(path, "exposure.exposure_s", f"{rule.exposure_s:g} s", allowed)
         return ExposurePolicy(
             f"fixed at {rule.exposure_s:g} s{several}", rule.exposure_s, None, rule.bracket, rule.limits_s
         )

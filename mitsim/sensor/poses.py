@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -55,9 +57,14 @@ def look_at(
     [[0. 0. 0.]]
     """
     for name, coordinates in (("position", position), ("target", target), ("up", up)):
-        array = np.asarray(coordinates, float)
+        try:
+            array = np.asarray(coordinates, float)
+        except (TypeError, ValueError):
+            raise InputError("look_at", name, str(coordinates)[:60], "three numbers [mm]") from None
         if array.shape != (3,) or not np.isfinite(array).all():
             raise InputError("look_at", name, array.tolist(), "three numbers [mm]")
+    if not math.isfinite(roll_deg):
+        raise InputError("look_at", "roll_deg", roll_deg, "a finite number [deg]")
     if not np.linalg.norm(np.subtract(position, target)) > 0 or not np.linalg.norm(up) > 0:
         raise InputError("look_at", "position", "the target itself, or no direction up", "two places, and a direction")
     pose = transforms.look_at(position, target, up, roll_deg)
@@ -72,12 +79,10 @@ def as_pose(pose: Transform | ArrayLike, where: str) -> Transform:
     InputError
         If it is not a rigid motion.
     """
-    if isinstance(pose, Transform):
-        return pose
-    matrix = np.asarray(pose, float)
+    matrix = pose.matrix() if isinstance(pose, Transform) else np.asarray(pose, float)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise InputError(where, "pose", f"an array {matrix.shape}", "a Transform, or a (4, 4) matrix [mm]")
     moved = Transform.from_matrix(matrix)
     if not is_rotation(moved.rotation, 1e-4) or not np.allclose(matrix[3], [0, 0, 0, 1]):
         raise InputError(where, "pose", "a matrix that is not a rigid motion", "a rotation and a translation [mm]")
-    return moved
+    return pose if isinstance(pose, Transform) else moved

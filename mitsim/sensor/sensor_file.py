@@ -73,6 +73,10 @@ class OpticsTable(Document):
     def _possible(self) -> OpticsTable:
         if self.width * self.height > MOST_PIXELS:
             raise ValueError(f"at most {MOST_PIXELS:,} pixels, not {self.width} x {self.height}")
+        if self.model == "fisheye" and len(self.distortion) > 4:
+            raise ValueError(
+                f"at most four coefficients of distortion for the model fisheye, not {len(self.distortion)}"
+            )
         if not np.isnan([*self.focal_px, *self.principal_px]).any() and self.width and self.height:
             check_intrinsics(self.focal_px, self.principal_px, self.width, self.height)
         if not all(abs(coordinate) <= 1e5 for coordinate in self.position_mm):
