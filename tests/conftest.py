@@ -119,7 +119,7 @@ def no_other_scenes() -> None:
     """
     from mitsim.study import many_captures as many
 
-    many._scene.cache_clear()
+    many._scenes.clear()
     gc.collect()
 
 

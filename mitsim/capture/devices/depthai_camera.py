@@ -92,11 +92,11 @@ class DepthaiCamera(LiveCamera):
             frames = aligned(self._queues, self.settings.timeout_s, self.where, newest + 2)
             begin = self._dai.CameraExposureOffset.START
             while any(frames[name].getTimestamp(begin) < asked for name in _IMAGES):  # more may be on their way
-                number, left = frames["left"].getSequenceNum(), deadline - time.monotonic()
-                if left <= 0:
+                if time.monotonic() >= deadline:
                     fault = f"no frame exposed after the call within {self.settings.timeout_s:g} s"
                     raise DeviceError(self.where, "capture", fault, "frames", "Close and open the camera again")
-                frames = aligned(self._queues, left, self.where, number + 1)
+                number = frames["left"].getSequenceNum()
+                frames = aligned(self._queues, self.settings.timeout_s, self.where, number + 1)
             self._last = frames["left"].getSequenceNum()
             settings = {
                 "maker": "Luxonis",

@@ -124,7 +124,7 @@ def test_the_chance_of_enough_points_is_that_of_a_binomial_if_losses_are_indepen
     n = len(points.point)
     spread = np.sqrt(n * fraction * (1 - fraction))
     assert expected_fit(surface, points, n * fraction - spread).chance == pytest.approx(norm.cdf(1.0), abs=1e-6)
-    clumped = ExpectedPoints(**{**vars(points), "area": 9 * points.area})
+    clumped = ExpectedPoints(**{**vars(points), "area": points.area + 7 + 1 / fraction})  # 1 / F of random losses
     assert expected_fit(surface, clumped, n * fraction - spread).chance == pytest.approx(norm.cdf(1 / 3), abs=1e-6)
     doubtful = ExpectedPoints(**{**vars(points), "fraction_error": np.full(n, 0.01)})
     assert expected_fit(surface, doubtful, n * fraction - spread).chance == pytest.approx(

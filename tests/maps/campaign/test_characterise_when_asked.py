@@ -50,6 +50,10 @@ def study(tmp_path, monkeypatch):
 
 
 # a tolerance that does not fit ends with 1
+def options_of(command, study):
+    return [str(study.parent / option) if option.endswith(".toml") else option for option in COMMANDS[command]]
+
+
 def invoked(*arguments):
     with without_pictures():
         return mitsim_here(*arguments, code=(0, 1))
@@ -59,7 +63,7 @@ def invoked(*arguments):
 def test_with_yes_the_finish_is_characterised_and_the_command_goes_on(command, study, quick, tmp_path):
     out = tmp_path / "out"
     study.write_text(DRAWN)
-    done = invoked(*command.split(), study, *COMMANDS[command], "--yes", "-o", out)
+    done = invoked(*command.split(), study, *options_of(command, study), "--yes", "-o", out)
     assert len(quick) >= 1
     assert re.search(r"ensenso-n10: characterising .*Ra 3\.2.* in about \d+ (s|min); kept in ", done.stderr)
     where = out / "ensenso-n10" if command == "study choose" else out
@@ -67,7 +71,7 @@ def test_with_yes_the_finish_is_characterised_and_the_command_goes_on(command, s
     assert set(stated["measurements"]) and stated["sensor"] == "ensenso-n10"
     count = len(quick)
     with mock.patch(WORK[command], side_effect=typer.Exit(REACHED)):  # it is kept: the work begins, and nobody is asked
-        mitsim_here(*command.split(), study, *COMMANDS[command], "-o", tmp_path / "again", code=REACHED)
+        mitsim_here(*command.split(), study, *options_of(command, study), "-o", tmp_path / "again", code=REACHED)
     assert len(quick) == count
 
 
@@ -78,7 +82,9 @@ def test_at_a_terminal_the_user_is_asked_and_may_refuse(command, study, tmp_path
     monkeypatch.setenv("COLUMNS", "500")
     study.write_text(DRAWN)
     started = at_a_terminal if command == "run" else here_at_a_terminal
-    told, code = started([*command.split(), str(study), *COMMANDS[command], "-o", str(tmp_path / "out")], "n\n")
+    told, code = started(
+        [*command.split(), str(study), *options_of(command, study), "-o", str(tmp_path / "out")], "n\n"
+    )
     assert re.search(QUESTION, " ".join(told.split())), told
     assert "[y/N]" in told
     assert code == 2

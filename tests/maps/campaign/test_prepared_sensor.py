@@ -30,17 +30,17 @@ def changes(sensor):
 
 @pytest.mark.parametrize("change", ["smoothing", "room", "misalignment", "notes", "last digit"])
 def test_a_sensor_that_differs_anywhere_is_prepared_anew(n10, change):
-    other = replace(n10, **changes(n10)[change])
-    assert prepared_sensor(n10).sensor is n10
-    assert prepared_sensor(other).sensor is other
-    assert render.simulated_sensor(n10).sensor is n10
-    assert render.simulated_sensor(other).sensor is other
+    ((key, value),) = changes(n10)[change].items()
+    other = replace(n10, **{key: value})
+    for prepare in (prepared_sensor, render.simulated_sensor):
+        kept, anew = (getattr(prepare(sensor).sensor, key) for sensor in (n10, other))
+        assert (kept, anew) == (getattr(n10, key), value) and kept != anew
 
 
 def test_an_equal_sensor_is_prepared_once(n10):
     prepared = prepared_sensor(n10)
     assert prepared_sensor(replace(n10)) is prepared
-    assert prepared.simulated is render.simulated_sensor(replace(n10))
+    assert render.simulated_sensor(n10) is render.simulated_sensor(replace(n10))
 
 
 def test_a_worker_loads_a_coupon_again_whose_scene_was_changed(n10, scenes, tmp_path):
