@@ -86,11 +86,17 @@ class Capture:
         if self.source not in SOURCES:
             raise ValueError(f"capture source {self.source!r}: allowed are {', '.join(SOURCES)}")
         for name, stack in self.images.items():
+            if name not in self.rig.cameras:
+                raise ValueError(f"images of {name}: the cameras are {', '.join(self.rig.cameras)}")
             camera = self.rig.cameras[name]
             if stack.ndim != 3 or stack.shape[1:] != (camera.height, camera.width):
                 raise ValueError(
                     f"images of {name}: shape {stack.shape}, but the camera has {camera.height} x {camera.width} pixels"
                 )
+        # decoders take the cameras in the order of the rig
+        object.__setattr__(
+            self, "images", {name: self.images[name] for name in self.rig.cameras if name in self.images}
+        )
         for name, values in self.derived.items():
             if name not in DERIVED_UNITS:
                 raise ValueError(f"map {name!r}: allowed are {', '.join(DERIVED_UNITS)}")

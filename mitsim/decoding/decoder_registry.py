@@ -97,8 +97,33 @@ class Images:
 
     @property
     def reference(self) -> tuple[str, NDArray[np.unsignedinteger[Any]]]:
-        """Name and stack of the reference camera."""
-        return next(iter(self.stacks.items()))
+        """Name and stack of the reference camera.
+
+        Raises
+        ------
+        InputError
+            If it has no images.
+        """
+        (name,) = self._first(1)
+        return name, self.stacks[name]
+
+    def pair(self) -> tuple[str, str]:
+        """Return the names of the two cameras that are matched.
+
+        Raises
+        ------
+        InputError
+            If one of them has no images.
+        """
+        first, second = self._first(2)
+        return first, second
+
+    def _first(self, count: int) -> list[str]:
+        names = list(self.capture.rig.cameras)[:count]
+        if missing := [name for name in names if name not in self.stacks]:
+            found, allowed = f"none of {', '.join(missing)}", f"images of {' and '.join(names)}"
+            raise InputError("capture", "images", found, allowed)
+        return names
 
     def context(self, roi: Roi | None) -> ImageContext:
         """Return the properties of the images for a decoder of a region of the cloud's grid; None for the whole."""
@@ -158,7 +183,7 @@ class Technology:
 def _stereo(images: Images, geometry: StereoGeometry, settings: MatcherSettings, pattern: None) -> PointCloud:
     # the ambient image is the last one; SGBM uses one frame
     ambient = images.capture.decoding.ambient_image
-    left, right = (stack[: len(stack) - ambient] for stack in list(images.stacks.values())[:2])
+    left, right = (images.stacks[name][: len(images.stacks[name]) - ambient] for name in images.pair())
     if settings.method == "sgbm":
         left, right = left[:1], right[:1]
     return decode_stereo(left, right, geometry, settings, images.context(images.roi))
@@ -222,7 +247,7 @@ def _structured_light_cloud(
     size, coordinates = projector_size(images.capture), images.coordinates or {}
     count = len(roles(code, *size))
     if isinstance(geometry, StereoGeometry):
-        names, context = list(images.stacks)[:2], images.context(images.roi)
+        names, context = images.pair(), images.context(images.roi)
         if coordinates:
             return cloud_of_pair(
                 lambda camera, region: coordinates[names[camera]]["columns"].part(region.slices),

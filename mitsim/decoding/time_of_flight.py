@@ -358,7 +358,7 @@ def _longest_path(geometry: TimeOfFlightGeometry, far_mm: float) -> float:
     from_source = np.sqrt(
         np.maximum(distance**2 - 2 * distance * geometry.projection + geometry.light_source @ geometry.light_source, 0)
     )
-    return float((distance + from_source).max())
+    return float(np.nanmax(distance + from_source))  # NaN: a pixel whose ray no lens has
 
 
 def _candidate_count(code: AmplitudeModulation) -> int:

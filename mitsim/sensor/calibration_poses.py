@@ -62,7 +62,8 @@ def pose_in(maps: Sequence[tuple[str, dict[str, Any]]]) -> dict[str, Composed]:
             rotation = R.reshape(3, 3) if len(R) == 9 else R
             if of_librealsense and len(R) == 9 and np.ndim(table[turn]) == 1:
                 rotation, table = rotation.T, {"unit": "m"} | table
-            if shifts is _OF_CAMERA[1] and len(R) == 9:
+            if shifts is _OF_CAMERA[1] and len(R) != 4:
+                rotation = Rotation.from_rotvec(R).as_matrix() if len(R) == 3 else rotation
                 rotation, T = rotation.T, -rotation.T @ T
             return {
                 "rotation": Composed(rotation, (dotted(name, turn),), table),

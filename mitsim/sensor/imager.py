@@ -69,7 +69,9 @@ class Imager:
 
     @model_validator(mode="after")
     def _check_knees(self) -> Imager:
-        """Check the companding curve of a file; code may make any imager."""
+        """Check the levels and the companding curve of a file; code may make any imager."""
+        if self.black_level >= 2**self.bits:
+            raise ValueError(f"black_level_dn under full scale, {2**self.bits} DN")
         if not self.companding:
             return self
         if self.gamma != 1:
@@ -79,8 +81,6 @@ class Imager:
             raise ValueError("companding_dn must rise from knee to knee, in and out")
         if levels[-1].tolist() not in [[2**n, 2**self.bits] for n in range(self.bits, 17)]:
             raise ValueError(f"companding_dn ends with [2^(bits of the converter, up to 16), {2**self.bits}]")
-        if self.black_level >= 2**self.bits:
-            raise ValueError("black_level_dn must be under full scale")
         return self
 
     @property

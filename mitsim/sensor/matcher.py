@@ -22,6 +22,9 @@ def _odd_or_none(size: int) -> int:
     return size
 
 
+#: cost of a pixel of random dots in OpenCV's SGBM over its ``prefilter_cap``: sums overflow from 0.36 to 0.42 of it on
+SGBM_COST_PER_CAP = 0.5
+
 OddSum = Annotated[int, Field(ge=1, le=31), AfterValidator(odd)]
 ContrastWindow = Annotated[int, Field(ge=0, le=101), AfterValidator(_odd_or_none)]
 
@@ -91,6 +94,10 @@ class MatcherSettings(DepthSettings):
         if self.block_size < 3 and self.method != "census":
             raise ValueError(f"block_size from 3 for method {self.method}")
         other = ("equiangular",) if self.method == "sgbm" else ("opencv",)
+        most = self.block_size**2 * (self.p2 + SGBM_COST_PER_CAP * self.prefilter_cap)
+        if self.method == "sgbm" and most > 32767:
+            what = f"block_size^2 (p2 + prefilter_cap / 2) of at most 32767 for method sgbm, not {most:.0f}"
+            raise ValueError(f"{what}: OpenCV's costs have 16 bits")
         if self.sub_pixel in other:
             raise ValueError(f"another sub_pixel than {self.sub_pixel} for method {self.method}")
         return self

@@ -255,6 +255,8 @@ def _check_modulation(file: SensorFile) -> None:
         raise ValueError("time_of_flight needs one camera and [demodulation], and has no [matcher] or [decoder]")
     if file.imager.smoothing_px > 0 or file.room is not None:
         raise ValueError("imager.smoothing_px and [room] are for images of light, not for time_of_flight")
+    if file.imager.black_level <= 0:  # else negative differences would be cut off
+        raise ValueError("time_of_flight needs imager.black_level_dn over 0, the level of a difference of 0")
     bent = file.imager.gamma != 1 or bool(file.imager.companding)
     bracket = file.exposure is not None and file.exposure.bracket is not None
     if file.ambient_image or bracket or bent:

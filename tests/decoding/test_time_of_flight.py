@@ -16,6 +16,7 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
 from mitsim.decoding.image_context import ImageContext
 from mitsim.decoding.time_of_flight import (
+    _longest_path,
     decode_time_of_flight,
     joint_path,
     time_of_flight_geometry,
@@ -347,3 +348,13 @@ def test_pixels_beyond_the_fold_of_the_distortion_are_left_out_with_their_reason
     radius = np.linalg.norm((own.reference.pixel_grid() - [60.3, 44.1]) / [90.0, 91.0], axis=-1)
     assert (cloud.status[radius > 0.3145] == Status.UNCALIBRATED).all()
     assert cloud.valid[radius < 0.314].all()
+
+
+def test_a_pixel_without_a_ray_does_not_end_the_check_of_the_range():
+    """Before, the longest path was NaN, and an ambiguous range was accepted."""
+    geometry = geometry_of()
+    cosine = geometry.cosine.copy()
+    cosine[0, 0] = np.nan
+    assert _longest_path(replace(geometry, cosine=cosine), 3000.0) == pytest.approx(
+        _longest_path(geometry, 3000.0), rel=0.05
+    )

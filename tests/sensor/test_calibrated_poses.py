@@ -290,11 +290,16 @@ def test_a_transform_of_ros_is_in_metres(tmp_path):
     sees_the_points(read_calibration(tmp_path / "a.json", SIZE).rig, BENT)
 
 
-def test_poses_of_ros_are_those_of_the_cameras(tmp_path):
+@pytest.mark.parametrize("vector", [False, True])
+def test_poses_of_ros_are_those_of_the_cameras(tmp_path, vector):
+    """Before, a rotation vector beside a position was that from the common frame, of another pose."""
     cameras, _, _ = posed(QUATERNIONS["quaternion"])
     for camera, pose in zip(cameras.values(), BODY, strict=True):
-        turn = dict(zip("xyzw", Rotation.from_matrix(pose[:3, :3]).as_quat().tolist(), strict=True))
-        camera["pose"] = {"position": xyz(pose[:3, 3].tolist()), "orientation": turn}
+        rotation = Rotation.from_matrix(pose[:3, :3])
+        turn = dict(zip("xyzw", rotation.as_quat().tolist(), strict=True))
+        turn = rotation.as_rotvec().tolist() if vector else turn
+        position = (1000 * pose[:3, 3]).tolist() if vector else xyz(pose[:3, 3].tolist())  # metres by ROS alone
+        camera["pose"] = {"position": position, "orientation": turn}
     (tmp_path / "a.json").write_text(json.dumps(cameras))
     read = read_calibration(tmp_path / "a.json", SIZE)
     sees_the_points(read.rig, BENT)

@@ -189,6 +189,8 @@ def _disparities(
     """
     reference, other = np.ascontiguousarray(reference), np.ascontiguousarray(other)
     height, width = reference.shape
+    if width - count <= settings.block_size // 2:  # OpenCV refuses fewer columns
+        return np.full((height, width), np.nan, np.float32)
     matcher = cv2.StereoSGBM.create(
         minDisparity=0,
         numDisparities=count,

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 from scipy.ndimage import map_coordinates
 
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
 from characterisation.region_of_interest import Roi
 from mitsim.decoding.image_context import ImageContext
-from mitsim.decoding.matching.sgbm import search_range
+from mitsim.decoding.matching.sgbm import match_both_ways, search_range
 from mitsim.decoding.matching.stereo import decode_stereo, stereo_geometry
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
@@ -371,3 +372,31 @@ def test_search_range_holds_near_and_far(near, ratio):
     assert count % 16 == 0
     assert first < rectification.disparity(settings.far_mm) + 1e-9
     assert first + count - 1 >= min(rectification.disparity(settings.near_mm), WIDTH - 1) - 1e-9
+
+
+@pytest.mark.parametrize(
+    "given", [{"block_size": 25}, {"block_size": 11, "p2": 280}, {"block_size": 21, "prefilter_cap": 127}]
+)
+def test_settings_whose_costs_overflow_in_opencv_are_refused(given):
+    """Before, 16 bits overflowed: of random dots half to none had the right disparity."""
+    with pytest.raises(ValidationError, match="OpenCV's costs have 16 bits"):
+        MatcherSettings(near_mm=380, far_mm=600, **given)
+    MatcherSettings(near_mm=380, far_mm=600, method="correlation", **given)
+
+
+@pytest.mark.parametrize("mode", ["hh", "sgbm", "3way"])
+def test_the_largest_block_that_is_allowed_gives_the_right_disparities(mode):
+    """Of the texture with the largest costs, in which every pixel differs."""
+    settings = MatcherSettings(near_mm=380, far_mm=600, block_size=21, mode=mode)
+    noise = np.random.default_rng(1).integers(0, 256, (60, 300)).astype(np.uint8)
+    matched = match_both_ways(noise, np.roll(noise, -40, axis=1), (60, 240), 30, 32, settings).disparity
+    assert (np.abs(matched - 40) < 0.5).mean() > 0.99
+
+
+@pytest.mark.parametrize("columns", [1, 5])
+def test_fewer_columns_than_a_block_have_no_match(columns):
+    """Before, an error of OpenCV."""
+    settings = MatcherSettings(near_mm=380, far_mm=600, block_size=21)
+    noise = np.random.default_rng(1).integers(0, 256, (60, 300)).astype(np.uint8)
+    matched = match_both_ways(noise, np.roll(noise, -40, axis=1), (60, 60 + columns), 30, 16, settings).disparity
+    assert matched.shape == (60, columns) and np.isnan(matched).all()
