@@ -154,8 +154,7 @@ def read_cloud(
         for warning in capture.settings.get("warnings", []):
             say(f"warning: {warning}")
     settings, imager = decoder_settings(capture, sensor)
-    chosen = (settings, imager, topic, frame, sensor, unit)
-    cloud = kept_cloud(path, chosen, lambda: decoded_once(capture, settings, imager)[0])
+    cloud = kept_cloud((capture, settings, imager), lambda: decoded_once(capture, settings, imager)[0])
     return InputCloud(path, cloud, capture, margin_of(settings))
 
 
