@@ -235,7 +235,7 @@ def gamma_corrected(
         gamma = estimate_gamma(last[:, last.max(axis=0) < full_scale], mean, contrast, minimum_modulation)
     else:
         used = (phases.modulation.min(axis=0) > minimum_modulation) & (stack.max(axis=0) < full_scale)
-        used &= white_black[0] < full_scale
+        used &= np.less(white_black[0], full_scale)
         gamma = gamma_from_white(phases.offset, *white_black, mean, contrast, used)
     return np.stack(
         [
