@@ -77,6 +77,8 @@ class OpticsTable(Document):
             check_intrinsics(self.focal_px, self.principal_px, self.width, self.height)
         if not all(abs(coordinate) <= 1e5 for coordinate in self.position_mm):
             raise ValueError("position_mm within 100 m of the sensor's frame")
+        if self.model == "fisheye" and len(self.distortion) > 4:
+            raise ValueError(f"at most 4 coefficients of distortion for model fisheye, not {len(self.distortion)}")
         return self
 
     def camera(self) -> Camera:
