@@ -99,6 +99,9 @@ def exposure_policy(
         words = f"automatic: {rule.percentile:g} % of the pixels under {100 * rule.level:g} % of full scale"
         return ExposurePolicy(words + several, None, rule, rule.bracket, rule.limits_s)
     if isinstance(rule, FixedExposure):
+        if not shortest <= rule.exposure_s <= longest:
+            found, allowed = f"{rule.exposure_s:g} s", f"within exposure.limits_s, {shortest:g} to {longest:g} s"
+            raise InputError(path, "exposure.exposure_s", found, allowed)
         return ExposurePolicy(
             f"fixed at {rule.exposure_s:g} s{several}", rule.exposure_s, None, rule.bracket, rule.limits_s
         )
