@@ -172,8 +172,8 @@ def _of_import(error: InputError) -> InputError:
 
 
 def margin_of(settings: Settings) -> int:
-    """Return the margin beside an edge [px] where points may mix both sides: half a matching block plus 1."""
-    return settings.block_size // 2 + 1 if isinstance(settings, MatcherSettings) else 0
+    """Return the margin beside an edge [px] where points may mix both sides: half the pixels of a match plus 1."""
+    return settings.support_px // 2 + 1 if isinstance(settings, MatcherSettings) else 0
 
 
 def _is_mitsim_ply(path: Path) -> bool:
