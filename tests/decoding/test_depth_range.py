@@ -150,6 +150,7 @@ def test_depth_of_a_camera_with_a_reference_is_along_its_rectified_axis():
     assert depth == pytest.approx(along @ axis / np.linalg.norm(axis))
 
 
+@pytest.mark.parametrize("taken", ["kinect-v2"], indirect=True)
 def test_a_surface_nearer_than_the_range_is_found_where_a_wider_one_were_ambiguous(taken):
     """Before, time of flight refused the wider range, and nothing was said."""
     sensor, capture = taken
