@@ -8,7 +8,7 @@ map, which is converted.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, get_args
 
 import numpy as np
@@ -238,7 +238,10 @@ def _structured_light_geometry(rig: Rig, settings: DecoderSettings, code: LightC
 def _structured_light(
     images: Images, geometry: StereoGeometry | StructuredLightGeometry, settings: DecoderSettings, code: LightCode
 ) -> PointCloud:
-    return smoothed_along_rays(_structured_light_cloud(images, geometry, settings, code), settings.smoothing_px)
+    cloud = smoothed_along_rays(_structured_light_cloud(images, geometry, settings, code), settings.smoothing_px)
+    # neighbours on a rectified grid share raw pixels: their mean has more noise than that of independent ones
+    shared = settings.smoothing_px > 0 and isinstance(geometry, StereoGeometry)
+    return replace(cloud, sigma=None) if shared else cloud
 
 
 def _structured_light_cloud(

@@ -20,6 +20,7 @@ was 41 %.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -33,6 +34,7 @@ from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.decoding.cloud import Settings, capture_cloud
 from mitsim.decoding.decoder_registry import technology_of
+from mitsim.decoding.matching.reference_matching import rectifying_rotation
 from mitsim.sensor.camera import Rig, stereo_rectification
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.matcher import MatcherSettings
@@ -83,8 +85,8 @@ class SurfaceBeyond:
 def depths_of(points: NDArray[np.floating], rig: Rig, settings: Settings) -> NDArray[np.float64]:
     """Return depths (n,) [mm] of points (n, 3) in the sensor frame, along the axis of the decoder's range.
 
-    For a pair that is matched or decoded together it is the axis of the rectified left camera, else that of the first
-    camera.
+    For a pair that is matched or decoded together, or a camera and a reference, it is the axis of the rectified first
+    camera, else that of the first camera.
     """
     left = rig.reference
     axis = left.sensor_from_camera.rotation[:, 2]
@@ -92,6 +94,9 @@ def depths_of(points: NDArray[np.floating], rig: Rig, settings: Settings) -> NDA
         left, right = list(rig.cameras.values())[:2]
         pair = rig.rectification or stereo_rectification(left, right)
         axis = left.sensor_from_camera.rotation @ pair.rotation_left.T[:, 2]
+    elif isinstance(settings, MatcherSettings) and rig.projector is not None:
+        baseline = rig.projector.centre - left.centre
+        axis = rectifying_rotation(baseline / np.linalg.norm(baseline), left.sensor_from_camera.rotation)[:, 2]
     return np.asarray((points - left.centre) @ axis)
 
 
@@ -147,9 +152,15 @@ def surface_beyond(capture: Capture, cloud: PointCloud, settings: Settings) -> S
     step = max(1, round(capture.rig.reference.width / _COARSE_COLUMNS))
     if isinstance(wide, MatcherSettings):
         step = max(2, step)
-    try:
-        wide_cloud = capture_cloud(_coarse_capture(capture, step, binned=isinstance(wide, MatcherSettings)), wide)
-    except InputError:
+    coarse = _coarse_capture(capture, step, binned=isinstance(wide, MatcherSettings))
+    # time of flight is ambiguous beyond some depth, and refuses a range that reaches it
+    reaches = (RANGE_FACTOR, 4, 2, 1) if isinstance(wide, TimeOfFlightSettings) else (RANGE_FACTOR,)
+    wide_cloud = None
+    for reach in reaches:
+        with suppress(InputError):
+            wide_cloud = capture_cloud(coarse, wide.model_copy(update={"far_mm": settings.far_mm * reach}))
+            break
+    if wide_cloud is None:
         return None
     depth = _depth(wide_cloud)
     smooth = (depth > 0) & (

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 from mitsim.sensor.imager import Imager
+from mitsim.sensor.point_spread import point_spread
 
 
 @dataclass(frozen=True)
@@ -45,17 +46,20 @@ def grey_level_variance(level: NDArray[np.float32], imager: Imager | MeasuredNoi
 
     For an imager it follows from the linear camera model of EMVA Standard 1288:
 
-        sigma^2 = K^2 (sigma_read^2 + sigma_row^2) + K (level - black level) + 1/12
+        sigma^2 = s^2 K^2 sigma_read^2 + s K^2 sigma_row^2 + s^2 K (level - black level) + 1/12
 
-    with the gain K [DN/e-]. The formula assumes a linear response (gamma 1) and excludes the shot noise of dark
-    current. Measured noise is interpolated. If ``imager`` is None the variance is that of quantisation, 1/12.
+    with the gain K [DN/e-], and s the sum of the squared weights by which the device smooths along each axis. The
+    formula assumes a linear response (gamma 1) and excludes the shot noise of dark current. Measured noise is
+    interpolated. If ``imager`` is None the variance is that of quantisation, 1/12.
     """
     if imager is None:
         return np.full(level.shape, 1 / 12, np.float32)
     if isinstance(imager, MeasuredNoise):
         return imager.variance(level)
-    dark = np.float32(imager.gain**2 * (imager.read_noise**2 + imager.row_noise**2) + 1 / 12)
-    return np.asarray(np.maximum(level - np.float32(imager.black_level), 0) * np.float32(imager.gain) + dark)
+    kept = float((point_spread(imager.smoothing_px) ** 2).sum())  # 1 without smoothing
+    read, row = kept**2 * imager.read_noise**2, kept * imager.row_noise**2
+    dark = np.float32(imager.gain**2 * (read + row) + 1 / 12)
+    return np.asarray(np.maximum(level - np.float32(imager.black_level), 0) * np.float32(kept**2 * imager.gain) + dark)
 
 
 def check_full_scale(stack: NDArray[np.generic], full_scale: float) -> None:

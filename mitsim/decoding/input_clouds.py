@@ -154,9 +154,7 @@ def read_cloud(
         for warning in capture.settings.get("warnings", []):
             say(f"warning: {warning}")
     settings, imager = decoder_settings(capture, sensor)
-    # the rig may come from files elsewhere
-    chosen = (settings, imager, capture.rig, capture.decoding, topic, frame, sensor, unit)
-    cloud = kept_cloud(path, chosen, lambda: decoded_once(capture, settings, imager)[0])
+    cloud = kept_cloud((capture, settings, imager), lambda: decoded_once(capture, settings, imager)[0])
     return InputCloud(path, cloud, capture, margin_of(settings))
 
 
@@ -174,8 +172,8 @@ def _of_import(error: InputError) -> InputError:
 
 
 def margin_of(settings: Settings) -> int:
-    """Return the margin beside an edge [px] where points may mix both sides: half a matching block plus 1."""
-    return settings.block_size // 2 + 1 if isinstance(settings, MatcherSettings) else 0
+    """Return the margin beside an edge [px] where points may mix both sides: half the pixels of a match plus 1."""
+    return settings.support_px // 2 + 1 if isinstance(settings, MatcherSettings) else 0
 
 
 def _is_mitsim_ply(path: Path) -> bool:

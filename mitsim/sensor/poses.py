@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from characterisation.files.errors import InputError
 from mitsim.sensor import transforms
@@ -57,13 +55,11 @@ def look_at(
     [[0. 0. 0.]]
     """
     for name, coordinates in (("position", position), ("target", target), ("up", up)):
-        try:
-            array = np.asarray(coordinates, float)
-        except (TypeError, ValueError):
-            raise InputError("look_at", name, str(coordinates)[:60], "three numbers [mm]") from None
-        if array.shape != (3,) or not np.isfinite(array).all():
-            raise InputError("look_at", name, array.tolist(), "three numbers [mm]")
-    if not math.isfinite(roll_deg):
+        array = _numbers(coordinates)
+        if array is None or array.shape != (3,) or not np.isfinite(array).all():
+            raise InputError("look_at", name, coordinates, "three numbers [mm]")
+    turn = _numbers(roll_deg)
+    if turn is None or turn.shape != () or not np.isfinite(turn):
         raise InputError("look_at", "roll_deg", roll_deg, "a finite number [deg]")
     if not np.linalg.norm(np.subtract(position, target)) > 0 or not np.linalg.norm(up) > 0:
         raise InputError("look_at", "position", "the target itself, or no direction up", "two places, and a direction")
@@ -79,10 +75,19 @@ def as_pose(pose: Transform | ArrayLike, where: str) -> Transform:
     InputError
         If it is not a rigid motion.
     """
-    matrix = pose.matrix() if isinstance(pose, Transform) else np.asarray(pose, float)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise InputError(where, "pose", f"an array {matrix.shape}", "a Transform, or a (4, 4) matrix [mm]")
-    moved = Transform.from_matrix(matrix)
+    matrix = pose.matrix() if isinstance(pose, Transform) else _numbers(pose)
+    if matrix is None or matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        found = "no array of numbers" if matrix is None else f"an array {matrix.shape}"
+        raise InputError(where, "pose", found, "a Transform, or a (4, 4) matrix [mm], of finite numbers")
+    moved = pose if isinstance(pose, Transform) else Transform.from_matrix(matrix)
     if not is_rotation(moved.rotation, 1e-4) or not np.allclose(matrix[3], [0, 0, 0, 1]):
         raise InputError(where, "pose", "a matrix that is not a rigid motion", "a rotation and a translation [mm]")
-    return pose if isinstance(pose, Transform) else moved
+    return moved
+
+
+def _numbers(values: ArrayLike) -> NDArray[np.float64] | None:
+    """Return values as an array of numbers, None if they are not."""
+    try:
+        return np.asarray(values, float)
+    except (TypeError, ValueError):
+        return None

@@ -22,6 +22,7 @@ from mitsim.maps.campaign.plan import coupon_pose
 from mitsim.scene.test_targets import plate
 from mitsim.sensor.camera import stereo_rectification
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.transforms import Transform
 from tests.smaller_sensors import middle_part
 
 NAMES = ["ensenso-n10", "david-sls-3", "kinect-v2"]
@@ -134,6 +135,28 @@ def test_depth_is_along_the_axis_of_the_rectified_pair(n10):
     assert depth[0] == pytest.approx(float((pair.rotation_left @ point[0])[2]))  # the left camera is the sensor's frame
     one = load_sensor("david-sls-3")
     assert depths_of(point, one.rig, one.settings)[0] == pytest.approx(600.0)
+
+
+def test_depth_of_a_camera_with_a_reference_is_along_its_rectified_axis():
+    """Before, it was along the axis of the camera, which may be turned from the baseline."""
+    carmine = load_sensor("primesense-carmine-1.09")
+    camera = replace(carmine.rig.reference, sensor_from_camera=Transform.from_degrees([0, 15, 0], [0, 0, 0]))
+    rig = replace(carmine.rig, cameras={"camera": camera})
+    depth = depths_of(np.array([[30.0, -20.0, 600.0]]), rig, carmine.settings)[0]
+    baseline = rig.projector.centre / np.linalg.norm(rig.projector.centre)
+    along = np.array([30.0, -20.0, 600.0]) - np.dot([30.0, -20.0, 600.0], baseline) * baseline
+    axis = camera.sensor_from_camera.rotation[:, 2]
+    axis = axis - (axis @ baseline) * baseline
+    assert depth == pytest.approx(along @ axis / np.linalg.norm(axis))
+
+
+@pytest.mark.parametrize("taken", ["kinect-v2"], indirect=True)
+def test_a_surface_nearer_than_the_range_is_found_where_a_wider_one_were_ambiguous(taken):
+    """Before, time of flight refused the wider range, and nothing was said."""
+    sensor, capture = taken
+    settings = sensor.settings.model_copy(update={"near_mm": 1.5 * middle_of(sensor)})
+    found = surface_beyond(capture, capture_cloud(capture, settings), settings)
+    assert found is not None and found.depths[1] < settings.near_mm
 
 
 def test_decode_warns_in_one_line(strip, tmp_path):

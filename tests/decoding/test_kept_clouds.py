@@ -7,8 +7,9 @@ import pytest
 
 from mitsim.decoding import kept_clouds
 from mitsim.decoding.kept_clouds import kept_cloud
+from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.matcher import MatcherSettings
-from mitsim.sensor.preset import load_sensor
+from tests.capture.test_capture import two_cameras
 from tests.seen_shapes import cloud_of, plane
 
 
@@ -23,56 +24,67 @@ def decoder(tmp_path, monkeypatch):
         calls.append(1)
         return cloud_of(plane([0, 0, 500], [0, 0.1, -1]))
 
-    (tmp_path / "capture").mkdir()
-    (tmp_path / "capture" / "image.png").write_bytes(b"image")
-    return tmp_path / "capture", decode, calls
+    return two_cameras(["left", "right"]), decode, calls
 
 
 def test_the_second_call_has_the_same_cloud_without_decoding(decoder):
-    path, decode, calls = decoder
-    first, second = (kept_cloud(path, ("settings", 3), decode) for _ in range(2))
+    _, decode, calls = decoder  # captures that were read twice are equal, not the same
+    first, second = (kept_cloud((two_cameras(["left", "right"]), 3), decode) for _ in range(2))
     assert len(calls) == 1
     assert np.array_equal(first.points, second.points)
     assert np.array_equal(first.status, second.status)
 
 
-def test_a_change_of_files_or_settings_decodes_again(decoder):
-    path, decode, calls = decoder
-    kept_cloud(path, (3,), decode)
-    kept_cloud(path, (4,), decode)
-    (path / "image.png").write_bytes(b"other")
-    kept_cloud(path, (3,), decode)
-    assert len(calls) == 3
+def test_a_change_of_images_rig_or_pattern_decodes_again(decoder):
+    """Before, a calibration outside the capture's folder or in a sensor file did not count."""
+    capture, decode, calls = decoder
+    images = {name: stack.copy() for name, stack in capture.images.items()}
+    images["right"][0, 40, 60] += 1
+    left = capture.rig.cameras["left"]
+    longer = replace(left, matrix=left.matrix * [[1 + 1e-12, 1, 1], [1, 1, 1], [1, 1, 1]])
+    rig = replace(capture.rig, cameras=capture.rig.cameras | {"left": longer})
+    others = [replace(capture, images=images), replace(capture, rig=rig), replace(capture, bits=7)]
+    for other in (capture, *others):
+        kept_cloud((other, 3), decode)
+    assert len(calls) == 4
 
 
-def test_a_change_that_no_representation_shows_decodes_again(decoder):
-    """Before, another filter of the matcher, or another calibration file, gave the kept cloud."""
-    path, decode, calls = decoder
-    rig = load_sensor("ensenso-n10").rig
-    matcher = MatcherSettings(near_mm=300, far_mm=900)
-    longer = replace(rig.reference, matrix=rig.reference.matrix * [[1 + 1e-10], [1], [1]])
-    for count in (3, 3):
-        kept_cloud(path, (matcher, rig), decode)
-        kept_cloud(path, (matcher.model_copy(update={"median_px": 5}), rig), decode)
-        kept_cloud(path, (matcher, replace(rig, cameras=rig.cameras | {"left": longer})), decode)
-        assert len(calls) == count
+@pytest.mark.parametrize(
+    ("kind", "change"),
+    [
+        (DecoderSettings, {"smoothing_px": 2.0}),
+        (MatcherSettings, {"median_px": 5}),
+        (MatcherSettings, {"speckle_px": 100}),
+        (MatcherSettings, {"speckle_range_px": 3.0}),
+        (MatcherSettings, {"census_window_px": 9}),
+        (MatcherSettings, {"sub_pixel": "parabola"}),
+    ],
+)
+def test_a_change_of_any_setting_decodes_again(decoder, kind, change):
+    """Before, settings that are not in the repr did not count."""
+    capture, decode, calls = decoder
+    settings = kind(near_mm=100, far_mm=900)
+    for chosen in (settings, settings.model_copy(update=change)):
+        kept_cloud((capture, chosen), decode)
+    assert len(calls) == 2
 
 
 def test_a_damaged_cache_or_none_decodes(decoder, tmp_path, monkeypatch):
-    path, decode, calls = decoder
-    kept_cloud(path, (), decode)
+    _, decode, calls = decoder
+    kept_cloud((), decode)
     next((tmp_path / "cache" / "clouds").glob("*.ply")).write_bytes(b"ply\n")
-    kept_cloud(path, (), decode)
+    kept_cloud((), decode)
+    (tmp_path / "file").write_bytes(b"")
     monkeypatch.setenv("MITSIM_CACHE", "")
-    kept_cloud(path, (), decode)
-    monkeypatch.setenv("MITSIM_CACHE", str(path / "image.png"))  # no folder
-    kept_cloud(path, (), decode)
+    kept_cloud((), decode)
+    monkeypatch.setenv("MITSIM_CACHE", str(tmp_path / "file"))  # no folder
+    kept_cloud((), decode)
     assert len(calls) == 4
 
 
 def test_old_clouds_are_removed(decoder, tmp_path, monkeypatch):
-    path, decode, _ = decoder
+    _, decode, _ = decoder
     monkeypatch.setattr(kept_clouds, "MOST_CLOUDS", 2)
     for number in range(4):
-        kept_cloud(path, (number,), decode)
+        kept_cloud(number, decode)
     assert len(list((tmp_path / "cache" / "clouds").glob("*.ply"))) == 2

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Camera, Rectification, Rig, stereo_rectification
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.sensor_file import OpticsTable
 from mitsim.sensor.transforms import Transform
 
 K = np.array([[626.18, 0, 372.16], [0, 626.13, 240.86], [0, 0, 1.0]])
@@ -136,3 +138,14 @@ def test_a_pair_in_one_place_is_refused():
     camera = Camera(np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]), np.zeros(5), 640, 480)
     with pytest.raises(InputError, match="both cameras of the pair in the same place"):
         stereo_rectification(camera, camera)
+
+
+@pytest.mark.parametrize(("count", "fits"), [(4, True), (5, False), (14, False)])
+def test_a_fisheye_lens_has_up_to_four_coefficients(count, fits):
+    """Before, more were accepted, and projecting was an error of OpenCV."""
+    optics = {"width": 64, "height": 48, "focal_px": [60, 60], "principal_px": [32, 24], "model": "fisheye"}
+    if fits:
+        assert np.isfinite(OpticsTable(**optics, distortion=[0.01] * count).camera().project(np.ones(3))).all()
+    else:
+        with pytest.raises(ValidationError, match=f"at most 4 coefficients of distortion .*, not {count}"):
+            OpticsTable(**optics, distortion=[0.01] * count)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from characterisation.files.errors import InputError
+from mitsim.sensor import poses
 from mitsim.sensor.transforms import Transform, is_rotation, look_at
 
 degrees = st.tuples(*[st.floats(-180, 180)] * 3)
@@ -60,3 +63,30 @@ def test_a_rotation_is_one_up_to_a_tolerance(turn):
     assert not is_rotation(-rotation, 1e-12)  # a mirror
     assert is_rotation(1.0004 * rotation, 1e-3) and not is_rotation(1.0006 * rotation, 1e-3)
     assert not is_rotation(np.full((3, 3), np.nan), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("given", "field"),
+    [
+        ({"position": (0, 0, "a")}, "position"),
+        ({"position": ((1, 2), 3, 4)}, "position"),
+        ({"position": (0, 0, 9), "up": (0, float("nan"), 1)}, "up"),
+        ({"position": (0, 0, 9), "roll_deg": float("nan")}, "roll_deg"),
+        ({"position": (0, 0, 9), "roll_deg": "much"}, "roll_deg"),
+    ],
+)
+def test_what_is_no_place_or_angle_is_refused(given, field):
+    """Before, a ValueError, or a pose of NaN."""
+    with pytest.raises(InputError) as caught:
+        poses.look_at(**given)
+    assert caught.value.field == field
+
+
+def test_only_rigid_motions_are_poses():
+    """Before, a transform that scales passed, and text was a ValueError."""
+    still = Transform.identity()
+    assert poses.as_pose(still, "here") is still
+    scaled, lost = Transform(2 * np.eye(3), np.zeros(3)), Transform(np.eye(3), np.full(3, np.nan))
+    for wrong in (scaled, lost, scaled.matrix(), "text", [[1, 2], [3]]):
+        with pytest.raises(InputError, match="here"):
+            poses.as_pose(wrong, "here")

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mitsim.decoding.grey_levels import grey_level_variance
 from mitsim.sensor.image_formation import expose
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.noise_sources import Noise
@@ -42,6 +43,18 @@ def test_smoothed_noise_has_the_variance_and_the_correlation_of_the_weights(smoo
     found = float((off[:, 1:] * off[:, :-1]).mean()) / (white * gain**2)
     assert found == pytest.approx(lag, abs=spread)
     assert abs(image.mean() - (64 + 4000 * IMAGER.gain)) < 0.05
+
+
+@pytest.mark.parametrize("row_noise", [0.0, 50.0])
+@pytest.mark.parametrize("smoothing", [0.0, 0.7, 1.2])
+def test_the_decoder_expects_the_noise_of_smoothed_images(smoothing, row_noise, rng):
+    """Before, 26 DN were expected where 0.7 px left 12."""
+    chip = replace(IMAGER, smoothing_px=smoothing, row_noise=row_noise)
+    image = expose(np.full((6000, 50), 4000.0), chip, None, Noise(), rng).astype(float)
+    level = np.array([image.mean()], np.float32)
+    # 6000 rows, of which 1 in sqrt(4 pi) s is independent: five standard deviations of the standard deviation
+    spread = 2.5 * np.sqrt(2 * max(np.sqrt(4 * np.pi) * smoothing, 1) / len(image))
+    assert np.sqrt(grey_level_variance(level, chip)[0]) == pytest.approx(image.std(), rel=spread)
 
 
 def test_a_device_that_does_not_smooth_gives_the_bytes_it_gave(rng):

@@ -141,7 +141,7 @@ def reference_geometry(rig: Rig, pattern: Mask, reference_mm: float, blur_px: fl
             f"at {np.round(baseline, 1).tolist()} mm from the camera",
             "a position to the right (+x) of the camera",
         )
-    rotation = _rectifying_rotation(baseline / baseline_mm, camera.sensor_from_camera.rotation)
+    rotation = rectifying_rotation(baseline / baseline_mm, camera.sensor_from_camera.rotation)
     f = float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
     matrix = np.array([[f, 0.0, camera.matrix[0, 2]], [0.0, f, camera.matrix[1, 2]], [0.0, 0.0, 1.0]])
     reference_matrix = matrix.copy()
@@ -247,7 +247,7 @@ def decode_reference(
     return cloud
 
 
-def _rectifying_rotation(direction: NDArray[np.float64], camera: NDArray[np.float64]) -> NDArray[np.float64]:
+def rectifying_rotation(direction: NDArray[np.float64], camera: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the rotation (3, 3) from rectified to sensor frame: x along a direction, z close to a camera's axis."""
     z = camera[:, 2] - (camera[:, 2] @ direction) * direction
     z /= np.linalg.norm(z)

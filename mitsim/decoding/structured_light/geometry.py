@@ -175,8 +175,8 @@ def _prepared(
         usable = seen[sample] & monotony(nodes, MINIMUM_CHANGE_PX)[0]
         tested = low[sample] + (high - low)[sample] * np.linspace(0.02, 0.98, 2 * count + 1)[:, None, None]
         exact = np.stack([coordinate(w, ray[sample]) for w in tested])
-        fitted, slope = zip(*(evaluate(nodes, differences, u) for u in exact), strict=True)
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(all="ignore"):  # pixels that are not usable
+            fitted, slope = zip(*(evaluate(nodes, differences, u) for u in exact), strict=True)
             error = np.abs((np.stack(fitted) - tested) / np.stack(slope))[:, usable]
         iterated = not float(error.max(initial=0.0)) < TARGET_ERROR_PX
         if not iterated:

@@ -205,7 +205,10 @@ def stripe_coordinate(
     outside = stripes_outside(decoded.number, coded)
     rejected = decoded.undecided | outside
     status = rejection_status(saturated & (low_modulation | rejected), low_modulation, rejected)
-    value = _centre(decoded, coded)
+    # less what a stripe that is cut has beyond the projector's edges; edges between stripes lie inside
+    start = decoded.number * float(coded.stripe) - coded.offset
+    beyond = np.maximum(start + coded.stripe - coded.extent, 0) - np.maximum(-start, 0)
+    value = _centre(decoded, coded) - np.where(decoded.neighbour == decoded.number, beyond / 2, 0)
     value[status != Status.VALID] = np.nan
     sigma = np.full(value.shape, coded.stripe / np.sqrt(12), np.float32)
     return ProjectorCoordinate(value, sigma, modulation, status)
@@ -268,7 +271,7 @@ def decode_gray_fringes(
     }
     if settings.correct_gamma:
         levels = (plain["white"], plain["black"]) if len(plain) == 2 else None
-        phase = gamma_corrected(phases, images, fringes, threshold, levels)
+        phase = gamma_corrected(phases, images, fringes, threshold, full_scale, levels)
     scale = np.float32(1 / fringes.contrast)  # ratio of white minus black to the amplitude of the fringes
     middle = phases.offset + np.float32(0.5 - fringes.mean) * scale * modulation
     decoded = decode_stripes(stack, image_roles, axis, settings.bit_share, (middle, scale * modulation))

@@ -139,10 +139,13 @@ def _without_harmonics(residuals: Floats, phase: Floats, modulation: Floats) -> 
 
     ``phase`` (k, n) [rad] and ``modulation`` (k, n) [DN] of k periods.
     """
+    # the constant terms have one amplitude: shot noise changes an offset with the modulation of its own period, and a
+    # difference of modulations would describe it
+    common = modulation.mean(axis=0)
     order = np.arange(_HARMONICS + 1)
     terms = np.concatenate(
         [
-            size * wave(order[:, None] * angle)
+            np.where(order[:, None] == 0, common, size) * wave(order[:, None] * angle)
             for angle, size in zip(phase, modulation, strict=True)
             for wave in (np.cos, np.sin)
         ]

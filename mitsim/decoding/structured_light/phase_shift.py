@@ -178,7 +178,7 @@ def decode_fringes(
     phase = phases.phase
     weakest = phases.modulation.min(axis=0)
     if settings.correct_gamma:
-        phase = gamma_corrected(phases, stack, fringes, _threshold(settings, full_scale), white_black)
+        phase = gamma_corrected(phases, stack, fringes, _threshold(settings, full_scale), full_scale, white_black)
     variance = grey_level_variance(phases.offset, imager)
     relative_variance = variance / np.maximum(weakest, np.float32(1e-3)) ** 2
     value, inconsistent = unwrap(
@@ -197,6 +197,7 @@ def gamma_corrected(
     stack: NDArray[np.generic],
     fringes: Fringes,
     minimum_modulation: float,
+    full_scale: float,
     white_black: tuple[NDArray[np.generic], NDArray[np.generic]] | None = None,
 ) -> NDArray[np.float32]:
     """Return phases (n, H, W) [rad] without the error of the projector's gamma, which is estimated from the images.
@@ -213,6 +214,8 @@ def gamma_corrected(
         Periods and shifts.
     minimum_modulation
         Least modulation of the pixels that the estimate uses [DN].
+    full_scale
+        Value of a saturated pixel [DN]; the estimate uses none that has it in any image.
     white_black
         (H, W) images of full light and of no light [DN].
 
@@ -229,9 +232,10 @@ def gamma_corrected(
     orders = [equidistant_order(shifts) for shifts in fringes.shifts]
     if steps[-1] >= 5 or white_black is None:
         last = stack[len(stack) - steps[-1] :][orders[-1]]
-        gamma = estimate_gamma(last, mean, contrast, minimum_modulation)
+        gamma = estimate_gamma(last[:, last.max(axis=0) < full_scale], mean, contrast, minimum_modulation)
     else:
-        used = phases.modulation.min(axis=0) > minimum_modulation
+        used = (phases.modulation.min(axis=0) > minimum_modulation) & (stack.max(axis=0) < full_scale)
+        used &= np.less(white_black[0], full_scale)
         gamma = gamma_from_white(phases.offset, *white_black, mean, contrast, used)
     return np.stack(
         [

@@ -303,8 +303,8 @@ def find_coordinates(
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Find the columns of a row that have given coordinates.
 
-    The row is linear between neighbouring pixels with increasing coordinates. They increase wherever camera and
-    projector see a surface from the same side.
+    The row is linear between neighbouring pixels whose coordinates change as most of the row do. They increase wherever
+    camera and projector see a surface from the same side, and fall if the projector is turned by 180 degrees.
 
     Parameters
     ----------
@@ -322,6 +322,9 @@ def find_coordinates(
     """
     columns = np.flatnonzero(np.isfinite(row[:-1]) & np.isfinite(row[1:]))
     step = row[columns + 1] - row[columns]
+    near = np.abs(step) <= LARGEST_STEP_PX
+    if np.sum(near & (step < 0)) > np.sum(near & (step > 0)):
+        coordinates, row, step = -coordinates, -row, -step
     columns = columns[(step > 0) & (step <= LARGEST_STEP_PX)]
     found_columns, ambiguous = np.full(coordinates.shape, np.nan), np.zeros(coordinates.shape, bool)
     finite = np.flatnonzero(np.isfinite(coordinates))

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from mitsim.decoding.input_clouds import margin_of
 from mitsim.decoding.matching.disparity_filters import median_of_neighbours, without_speckles
 from mitsim.decoding.structured_light.smoothing import smoothed_along_rays
+from mitsim.sensor.matcher import MatcherSettings
 from tests.decoding.matching.test_stereo import SETTINGS, decode, ideal_rig, pair, plane
 
 
@@ -110,3 +112,10 @@ def test_surfaces_a_step_apart_do_not_mix():
     heights = smooth.points @ n
     np.testing.assert_allclose(heights[30:50, 10:40], c, atol=2e-3)
     np.testing.assert_allclose(heights[30:50, 40:70], 1.03 * c, atol=2e-3)
+
+
+def test_the_margin_beside_an_edge_holds_the_window_of_a_census_code():
+    """Before, 3 px for codes of 9 x 9 px summed over 5 x 5 px."""
+    census = MatcherSettings(near_mm=300, far_mm=900, method="census", block_size=5, census_window_px=9)
+    assert margin_of(census) == 4 + 2 + 1
+    assert margin_of(MatcherSettings(near_mm=300, far_mm=900, block_size=5)) == 2 + 1

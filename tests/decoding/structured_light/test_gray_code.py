@@ -71,8 +71,21 @@ def test_every_threshold_and_depth_gives_the_stripe(thresholds, dtype, scale, rn
 def test_coarse_stripes_are_found_by_their_middle(rng):
     code, (u, v) = GrayCode(bits=6), coordinates(rng)  # 9 bits would be needed: stripes of 8 px
     found = decode(draw(code, u, v), code)["columns"]
-    np.testing.assert_array_equal(found.value, np.floor((u + 0.5) / 8) * 8 + 3.5)
+    first = np.floor((u + 0.5) / 8) * 8
+    np.testing.assert_array_equal(found.value, (first + np.minimum(first + 8, WIDTH) - 1) / 2)  # 300 px cut the last
     assert np.isclose((found.value - u).std(), found.sigma[0, 0], rtol=0.05)
+
+
+@pytest.mark.parametrize("offset", [0.0, 10.0])
+def test_the_centre_of_a_stripe_that_the_projector_cuts_is_that_of_its_part_inside(offset, rng):
+    """Before, columns 1136 to 1139 of 1140 gave 1143.5."""
+    code, width = GrayCode(bits=7, offset_px=offset), 1140  # stripes of 16 px
+    u = np.tile(np.arange(width, dtype=float), (2, 1))
+    stack = np.stack([20 + 200 * value(code, role, u) for role in roles(code, width, 2)]).astype(np.uint8)
+    found = decode_coordinates(stack, code, (width, 2), SETTINGS, full_scale=255)["columns"].value
+    first = np.floor((u + offset) / 16) * 16 - offset
+    inside = np.maximum(first, 0), np.minimum(first + 16, width)
+    np.testing.assert_array_equal(found, (inside[0] + inside[1] - 1) / 2)
 
 
 def test_a_pixel_on_an_edge_gets_the_edge(rng):

@@ -78,6 +78,15 @@ def test_shot_noise_grows_with_the_level(rng):
     np.testing.assert_array_equal(found.variance(np.array([0.0, 1e5])), found.variances[[0, -1]].astype(np.float32))
 
 
+@pytest.mark.parametrize("steps", [4, 5])
+def test_the_noise_of_shots_is_whole_at_full_contrast(steps, rng):
+    """Before, differences of the modulations of three periods described 8 % of it."""
+    code = PhaseShift(periods_px=[260, 40, 16], steps=steps)
+    stack = taken(code, lambda level: np.sqrt(4 + 0.5 * level), rng, full=4095)
+    found = measured_noise([stack], roles(code, WIDTH, HEIGHT), 4095)
+    assert np.sqrt(found.variances / (4 + 0.5 * found.levels + 1 / 12)).mean() == pytest.approx(1, abs=0.02)
+
+
 @pytest.mark.parametrize(
     "code",
     [PhaseShift(periods_px=[260], steps=3), GrayCode(), GrayCodePhaseShift(period_px=16, steps=3)],

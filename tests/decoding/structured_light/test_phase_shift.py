@@ -14,7 +14,7 @@ from scipy.stats import norm
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
 from mitsim.decoding.structured_light.decoder import decode_coordinates
-from mitsim.decoding.structured_light.phase_shift import fit_phases
+from mitsim.decoding.structured_light.phase_shift import Fringes, decode_fringes, fit_phases
 from mitsim.decoding.structured_light.projector_gamma import correct_phase, estimate_gamma, harmonic_ratio
 from mitsim.decoding.structured_light.unwrapping import unwrap, unwrapping_path
 from mitsim.sensor.decoder_settings import DecoderSettings
@@ -236,6 +236,30 @@ def test_gamma_is_found_and_taken_out(gamma, steps, rng):
     before = np.abs(wrapped(phase - phi)).max()
     after = np.abs(wrapped(correct_phase(phase, gamma, steps, 0.5, 0.5) - phi)).max()
     assert after < 2e-5 + 1e-3 * before
+
+
+@pytest.mark.parametrize("white", [False, True])
+def test_saturated_pixels_do_not_count_for_gamma(white):
+    """Before, gamma 3 with 20 % of the pixels clipped was estimated as less, and bent what it should straighten."""
+    asked = SETTINGS.model_copy(update={"correct_gamma": True})
+    steps = 4 if white else 5
+    code, width = PhaseShift(periods_px=[1290, 60], steps=steps), 1280
+    u = np.tile(np.linspace(0, width - 1, 3840), (20, 1))
+    albedo = np.where(np.arange(20) % 5 == 0, 1.6, 0.8)[:, None]  # every fifth row is clipped
+    images = 10 + 240 * albedo * np.stack([value(code, role, u) for role in roles(code, width, 20)]) ** 3.0
+    fringes = Fringes.of([role for role in roles(code, width, 20) if role.kind == "phase"], 0.5, 0.5)
+    black, full = np.full(u.shape, 10.0), 10 + 240 * albedo + 0 * u
+    found = decode_fringes(
+        np.clip(images, 0, 255),
+        fringes,
+        width,
+        asked,
+        full_scale=255,
+        white_black=(np.minimum(full, 255), black) if white else None,
+    )
+    unclipped = found.status == Status.VALID
+    assert unclipped.mean() > 0.75
+    assert np.abs(found.value - u)[unclipped].max() < 0.05
 
 
 def test_the_ratio_of_the_harmonics_is_pans():
