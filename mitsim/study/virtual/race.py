@@ -94,6 +94,8 @@ def complete(
         Returns whether to stop after the trial at hand.
     """
     missing = [job for job in jobs if job.trial not in trials.known(job.view.number)]
+    if not missing:
+        return
     for job, outcome in track(runner.run(runner.in_order(missing)), label, len(missing)):
         trials.add(job.view.number, job.trial, outcome)
         if over():
