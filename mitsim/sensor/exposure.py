@@ -87,7 +87,8 @@ def exposure_policy(
     Raises
     ------
     InputError
-        If the rule asks for an exposure beyond its limits.
+        If a rule that refers to a plate asks for an exposure beyond its limits. A stated exposure counts as it is: a
+        recording may have another device's.
     """
     if rule is None:
         return ExposurePolicy("unknown", None, None, None, (math.nan, math.nan))
@@ -99,9 +100,6 @@ def exposure_policy(
         words = f"automatic: {rule.percentile:g} % of the pixels under {100 * rule.level:g} % of full scale"
         return ExposurePolicy(words + several, None, rule, rule.bracket, rule.limits_s)
     if isinstance(rule, FixedExposure):
-        if "limits_s" in rule.model_fields_set and not shortest <= rule.exposure_s <= longest:
-            allowed = f"{shortest:g} to {longest:g} s, exposure.limits_s"
-            raise InputError(path, "exposure.exposure_s", f"{rule.exposure_s:g} s", allowed)
         return ExposurePolicy(
             f"fixed at {rule.exposure_s:g} s{several}", rule.exposure_s, None, rule.bracket, rule.limits_s
         )

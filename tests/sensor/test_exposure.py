@@ -1,16 +1,11 @@
 """Exposure rules."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from characterisation.files.errors import InputError
-from mitsim.sensor.exposure import automatic, bracket, exposure_policy
-from mitsim.sensor.preset import load_sensor
-from mitsim.sensor.sensor_file import FixedExposure
+from mitsim.sensor.exposure import automatic, bracket
 
 LIMITS = (1e-5, 1e-2)
 positive = st.floats(1e-6, 1e3)
@@ -56,10 +51,3 @@ def test_a_bracket_rises_within_the_limits(base, count, factor, one, other):
 @given(st.lists(st.floats(0, 1e12), min_size=1), st.floats(0.01, 1), st.floats(0, 100))
 def test_automatic_exposure_is_always_within_the_limits(rates, level, percentile):
     assert LIMITS[0] <= automatic(np.array(rates), 20000, level, percentile, LIMITS) <= LIMITS[1]
-
-
-def test_a_fixed_exposure_beyond_its_own_limits_is_refused():
-    rule = FixedExposure(rule="fixed", exposure_s=1.0, limits_s=LIMITS)
-    sensor = load_sensor("ensenso-n10")
-    with pytest.raises(InputError, match=r"found 1 s; allowed: within exposure.limits_s, 1e-05 to 0.01 s"):
-        exposure_policy(Path("a.toml"), rule, sensor.projector, sensor.imager, 850.0)

@@ -372,11 +372,6 @@ def test_a_campaign_takes_its_clouds(kinect, simulated, tmp_path):
         ("near_mm = 400", "near_mm = 6000", "near_mm under far_mm"),
         ("black_level_dn = 16384", "black_level_dn = 0", "black_level_dn over 0, the level of a difference of 0"),
         ("black_level_dn = 16384", "black_level_dn = 70000", "black_level_dn under full scale, 32768 DN"),
-        (
-            "exposure_s = 0.003",
-            "exposure_s = 0.003\nlimits_s = [1e-5, 1e-3]",
-            "exposure_s: found 0.003 s; allowed: 1e-05 to",
-        ),
         ("prnu = 0.01", "gamma = 2.2", "no ambient_image, bracket, gamma, companding"),
         ('kind = "amplitude_modulation"', 'kind = "amplitude_modulatoin"', "amplitude_modulation"),
         ('technology = "time_of_flight"', 'technology = "structured_light"', "are for time_of_flight"),
