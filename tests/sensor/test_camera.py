@@ -147,5 +147,5 @@ def test_a_fisheye_lens_has_up_to_four_coefficients(count, fits):
     if fits:
         assert np.isfinite(OpticsTable(**optics, distortion=[0.01] * count).camera().project(np.ones(3))).all()
     else:
-        with pytest.raises(ValidationError, match=f"at most 4 coefficients of distortion .*, not {count}"):
+        with pytest.raises(ValidationError, match=f"at most four coefficients of distortion .*, not {count}"):
             OpticsTable(**optics, distortion=[0.01] * count)

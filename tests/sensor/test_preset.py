@@ -7,12 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 from characterisation.files.errors import InputError
 from mitsim.sensor.imager import electrons_per_radiance
 from mitsim.sensor.preset import load_sensor, presets
-from mitsim.sensor.sensor_file import OpticsTable
 from mitsim.sensor.transforms import Transform
 
 PRESET = Path(__file__).parents[2] / "mitsim/sensor/presets/ensenso-n10.toml"
@@ -69,20 +67,6 @@ def test_what_is_wrong_is_told(tmp_path, old, new, field, hint):
     assert caught.value.field == field
     assert hint in str(caught.value)
     assert str(file) in str(caught.value)
-
-
-def test_a_fisheye_has_four_coefficients():
-    """Before, a fifth one was an error of OpenCV when points were projected."""
-    given = {
-        "width": 640,
-        "height": 480,
-        "focal_px": (300.0, 300.0),
-        "principal_px": (320.0, 240.0),
-        "model": "fisheye",
-    }
-    assert OpticsTable(**given, distortion=[0.1, 0, 0, 0]).camera().model == "fisheye"
-    with pytest.raises(ValidationError, match="at most four coefficients"):
-        OpticsTable(**given, distortion=[0.1, 0, 0, 0, 0])
 
 
 @pytest.mark.parametrize("name", presets())
