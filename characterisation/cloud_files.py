@@ -31,7 +31,7 @@ _BENT_PIXEL = np.dtype([("status", "u1"), ("ray_x", "<f4"), ("ray_y", "<f4")])
 _NAMES = {"<f4": "float", "<u2": "ushort", "<i2": "short", "|u1": "uchar"}
 _KEY = "mitsim"
 
-#: rows or columns that ``row`` and ``col`` can tell apart
+#: rows or columns that ``row`` and ``col``, of 16 bits, can tell apart
 _MOST_LINES = 1 << 16
 
 #: largest file that is read [bytes]: 35 million points

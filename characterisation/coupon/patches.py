@@ -265,7 +265,7 @@ def patch_residuals(cloud: PointCloud, coupon: Coupon, radius_px: float = 6.0, m
     return ray_noise_std(np.where(true[..., None], points, np.nan)).inlier_residual
 
 
-#: largest radius, margin and step [px]
+#: largest radius, margin and step [px]; chosen: more than any image has
 _MOST_PX = 10_000
 
 #: what measures patches, in messages

@@ -58,7 +58,7 @@ VALUE_BITS = 10
 #: bits of the mantissa of errors that a compact file keeps: relative errors of at most 2^-6
 ERROR_BITS = 5
 
-#: largest difference from 1 of the length of a normal
+#: largest difference from 1 of the length of a normal; chosen: rounding to four digits stays below
 UNIT_TOLERANCE = 1e-3
 
 _NODES = ("sample", "distance", "b", "a")

@@ -24,7 +24,7 @@ Row6 = tuple[Number, Number, Number, Number, Number, Number]
 Side = Annotated[int, Field(ge=1, le=LONGEST_SIDE_PX)]
 
 
-#: largest element of R R^T - I of a rotation in the files of mitsim
+#: largest element of R R^T - I of a rotation in the files of mitsim; chosen: they have more than six digits
 EXACT = 1e-6
 
 

@@ -71,7 +71,7 @@ AZIMUTH_DEG = 45.0
 #: largest angle between normal and view ray on a ball; points beyond it belong to the limb and bias the radius
 _EDGE_DEG = 60.0
 
-#: fewest points of a plate or ball that are measured, less one
+#: a plate or ball is measured with more points than this; chosen
 _LEAST_POINTS = 100
 
 #: excluded border of a plate, as a fraction of its size

@@ -17,7 +17,7 @@ from mitsim.talk.judged_views import QUANTITIES, SCORES, JudgedViews, true_error
 from mitsim.talk.make import trials_name
 from mitsim.talk.results import Results
 from mitsim.talk.slides import Claim, Slide, collected, largest_of, mean_of, verdict
-from mitsim.talk.talk_file import ExampleEntry, Talk
+from mitsim.talk.talk_file import ExampleEntry, Talk, sample_key
 
 #: mean rank correlation of bins down to which agreement is very good; chosen
 _VERY_GOOD = -0.8
@@ -223,7 +223,7 @@ def _nothing_possible(judged: JudgedViews, example: ExampleEntry, measurable: in
 
 
 def _picture(example: ExampleEntry) -> str:
-    return f"example_{example.measurement}_{example.sample.replace(' ', '_')}"
+    return f"example_{example.measurement}_{sample_key(example.sample)}"
 
 
 def _mean_share(cell: xr.Dataset) -> float:

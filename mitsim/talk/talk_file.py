@@ -40,7 +40,7 @@ class ArtefactEntry(Document):
     @property
     def key(self) -> str:
         """Return the name as part of a file name."""
-        return self.name.replace(" ", "_")
+        return sample_key(self.name)
 
 
 class ExampleEntry(Document):
@@ -171,6 +171,11 @@ def read_talk(path: str | Path) -> Talk:
             allowed = [str(one) for one in known]
             raise InputError(path, where, repr(value), ", ".join(allowed), nearest(str(value), allowed))
     return Talk(path, file)
+
+
+def sample_key(name: str) -> str:
+    """Return the name of a sample or finish as part of a file name."""
+    return name.replace(" ", "_")
 
 
 def sensor_key(name: str) -> str:

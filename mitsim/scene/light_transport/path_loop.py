@@ -217,7 +217,7 @@ class _PathState:
     origin: Any
     direction: Any
     weight: Any  # of the light of the next ray
-    pdf: Any  # density of its direction [1/sr], as good as infinite after a delta lobe
+    pdf: Any  # density of its direction [1/sr]; with emitters, ALONE after a delta lobe
     length: Any  # optical length so far [mm]
     ratio: Any  # n_L p_L / (n_C p_C) so far, of photons over camera paths
     random: Any
