@@ -10,19 +10,15 @@ used.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import fields, is_dataclass
 from pathlib import Path
-
-import numpy as np
-from pydantic import BaseModel
 
 from characterisation.cloud_files import read_cloud, write_cloud
 from characterisation.files.errors import InputError
+from characterisation.files.value_digest import value_digest
 from characterisation.point_cloud import PointCloud
 from mitsim.running.build import own_build
 
@@ -36,11 +32,10 @@ SLOW_S = 1.0
 def kept_cloud(contents: object, decode: Callable[[], PointCloud]) -> PointCloud:
     """Return the cloud of a capture: the kept one, or that of ``decode``, which is kept if it took long.
 
-    ``contents``: everything that determines the cloud, by value: models, dataclasses, mappings, sequences and arrays
-    with all that they hold, anything else by its ``repr``.
+    ``contents``: everything that determines the cloud, by its :func:`~characterisation.files.value_digest.value_digest`.
     """
     folder = _folder()
-    file = None if folder is None else folder / f"{_digest(contents)}.ply"
+    file = None if folder is None else folder / f"{value_digest((own_build(), contents))}.ply"
     if file is not None and file.is_file():
         with suppress(InputError, OSError):
             cloud = read_cloud(file)
@@ -63,32 +58,6 @@ def _folder() -> Path | None:
     with suppress(RuntimeError):  # no home
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mitsim" / "clouds"
     return None
-
-
-def _digest(contents: object) -> str:
-    """Return the SHA-256 of everything that determines a cloud."""
-    sha = hashlib.sha256(repr(own_build()).encode())
-
-    def add(value: object) -> None:
-        parts: list[object] = []
-        if isinstance(value, np.ndarray):
-            sha.update(f"{value.dtype} {value.shape}".encode() + value.tobytes())
-        elif isinstance(value, BaseModel):  # not its repr, which some fields are left out of
-            parts = [(name, getattr(value, name)) for name in type(value).model_fields]
-        elif is_dataclass(value):
-            parts = [(field.name, getattr(value, field.name)) for field in fields(value)]
-        elif isinstance(value, Mapping):
-            parts = list(value.items())
-        elif isinstance(value, list | tuple):
-            parts = list(value)
-        else:
-            sha.update(repr(value).encode())
-        sha.update(f"{type(value).__name__} {len(parts)};".encode())
-        for part in parts:
-            add(part)
-
-    add(contents)
-    return sha.hexdigest()
 
 
 def _remove_oldest(folder: Path) -> None:

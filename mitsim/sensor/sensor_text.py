@@ -1,4 +1,4 @@
-"""Write a sensor as text that tells it from every other: for the checksum of its maps, and to prepare it once.
+"""Write a sensor as text that tells it from every other: for the checksum of its maps; and prepare it once.
 
 The representation of a sensor leaves out values that came later, of which older maps know nothing, and numpy shortens
 its numbers.
@@ -9,12 +9,12 @@ from __future__ import annotations
 import hashlib
 import sys
 from collections.abc import Callable
-from dataclasses import fields
 from functools import wraps
 from typing import Any, TypeVar
 
 import numpy as np
 
+from characterisation.files.value_digest import value_digest
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.sensor_file import MisalignmentTable
 
@@ -59,12 +59,11 @@ def written(sensor: Sensor) -> str:
 
 def once_for_sensor(make: Callable[[Sensor], Made]) -> Callable[[Sensor], Made]:
     """Return a function that keeps what ``make`` made of the last sensor, while the sensors that follow are equal."""
-    kept: dict[tuple[str, ...], Made] = {}
+    kept: dict[str, Made] = {}
 
     @wraps(make, updated=())
     def once(sensor: Sensor) -> Made:
-        others = (repr(getattr(sensor, one.name)) for one in fields(sensor) if not one.repr)
-        key = (written(sensor), *others)
+        key = value_digest(sensor)
         if key not in kept:
             kept.clear()
             kept[key] = make(sensor)
