@@ -32,7 +32,7 @@ SLOW_S = 1.0
 def kept_cloud(contents: object, decode: Callable[[], PointCloud]) -> PointCloud:
     """Return the cloud of a capture: the kept one, or that of ``decode``, which is kept if it took long.
 
-    ``contents``: everything that determines the cloud, by its :func:`~characterisation.files.value_digest.value_digest`.
+    ``contents`` is everything that determines the cloud (:func:`~characterisation.files.value_digest.value_digest`).
     """
     folder = _folder()
     file = None if folder is None else folder / f"{value_digest((own_build(), contents))}.ply"

@@ -1,4 +1,4 @@
-"""Write a sensor as text that tells it from every other: for the checksum of its maps; and prepare it once.
+"""Write a sensor as text for the checksum of its maps, and prepare a sensor once.
 
 The representation of a sensor leaves out values that came later, of which older maps know nothing, and numpy shortens
 its numbers.
