@@ -22,7 +22,8 @@ def _odd_or_none(size: int) -> int:
     return size
 
 
-#: cost of a pixel of random dots in OpenCV's SGBM over its ``prefilter_cap``: sums overflow from 0.36 to 0.42 of it on
+#: cost of a pixel in OpenCV's SGBM over its ``prefilter_cap`` up to which sums must fit; of random grey levels, those
+#: that overflow have up to 0.49 (tests/benchmarks/sgbm_overflow.py)
 SGBM_COST_PER_CAP = 0.5
 
 OddSum = Annotated[int, Field(ge=1, le=31), AfterValidator(odd)]
