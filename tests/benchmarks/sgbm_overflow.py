@@ -2,10 +2,11 @@
 
     python tests/benchmarks/sgbm_overflow.py
 
-Two images of random grey levels, one shifted by 20 px, with and without a blur of 1.5 px, are matched with blocks of 5
-to 31 px, penalties p2 of 8 to 280 and caps of 15 to 127. A setting fails if less than 97 % of the disparities are within
-1 px. Sums overflow at a cost of (32767 / block^2 - p2) / cap of a pixel over the cap: printed for the smallest block that
-fails, and for the largest before it. `SGBM_COST_PER_CAP` refuses what fails if it exceeds the first number of every row.
+Two images of random grey levels, one shifted by 20 px, with and without a blur of 1.5 px, are matched with blocks of
+5 to 31 px, penalties p2 of 8 to 280 and caps of 15 to 127. A setting fails if less than 97 % of the disparities are
+within 1 px. Sums overflow at a cost of (32767 / block^2 - p2) / cap of a pixel over the cap: printed for the smallest
+block that fails, and for the largest before it. `SGBM_COST_PER_CAP` refuses what fails if it exceeds the first number
+of every row.
 """
 
 from __future__ import annotations
