@@ -107,6 +107,10 @@ def import_(
         int | None,
         typer.Option(min=0, max=65535, help="For a depth image: grey level of pixels without depth; default 0."),
     ] = None,
+    along: Annotated[
+        str | None,
+        typer.Option(help="For a depth image: its numbers are distances along the axis of the camera, or the ray."),
+    ] = None,
     unit: Annotated[
         str | None,
         typer.Option(
@@ -160,7 +164,7 @@ def import_(
     ]
     if other_eyes and imported.kind in ("stereo-pair", "images"):
         baseline = math.dist(other_eyes[0].centre, reference.centre)
-        say(f"  baseline: {baseline:.4g} mm; lengths of a calibration without a unit count as mm")
+        say(f"  baseline: {baseline:.4g} mm")
     if coupon is not None and capture.world_from_sensor is not None:
         position = capture.world_from_sensor.translation
         distance = math.hypot(*position)

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from characterisation.plots.style import FIELD, drawing
-from mitsim.running.numbers import two_digits
+from mitsim.running.numbers import percent, two_digits
 from mitsim.twin.finish.run import CouponFit
 
 #: least range of the residual's colours, in standard deviations
@@ -25,7 +25,7 @@ def fit_table(coupon_fit: CouponFit) -> str:
     """Return the fitted quantities, one line for each, then one line for each view, with cells separated by tabs."""
     fit, lines = coupon_fit.fit, []
     if fit.log_alpha is not None:
-        spread = f"covariance {_percent(fit.log_alpha.by_covariance)}, jackknife {_percent(fit.log_alpha.by_jackknife)}"
+        spread = f"covariance {percent(fit.log_alpha.by_covariance)}, jackknife {percent(fit.log_alpha.by_jackknife)}"
         lines += [("alpha", _with(*coupon_fit.alpha), spread)]
         lines += [("Ra-equivalent [um]", _with(*coupon_fit.roughness), coupon_fit.finish)]
     relative = coupon_fit.power[0] / coupon_fit.sensor.projector.flux
@@ -137,7 +137,3 @@ def _with(value: float, uncertainty: float) -> str:
     spread = two_digits(uncertainty)
     decimals = len(spread.partition(".")[2])
     return f"{value:.{decimals}f} +- {spread}"
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.2g} %" if math.isfinite(share) else "none"

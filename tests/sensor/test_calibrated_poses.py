@@ -236,7 +236,7 @@ def test_an_import_says_the_baseline_and_the_unit_that_it_assumed(tmp_path):
         cv2.imwrite(str(tmp_path / f"{side}.png"), np.full((480, 752), 90, np.uint8))
     calibration = mc_calib(tmp_path, 0, [[*each, 0.01] for each in BENT])
     done = mitsim_here("import", tmp_path, "--calibration", calibration, "-o", tmp_path / "capture")
-    assert "baseline: 110 mm; lengths of a calibration without a unit count as mm" in done.stderr
+    assert "baseline: 110 mm\n" in done.stderr
     assert "if the square of MC-Calib's board was given in mm" in done.stderr
 
 

@@ -17,6 +17,7 @@ from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError, nearest
 from mitsim.capture.capture import Capture
 from mitsim.capture.grey_image import channel_of
+from mitsim.capture.recordings.along_ray import depths_of_ranges, reads_as_ranges
 from mitsim.capture.recordings.array_file import map_in
 from mitsim.capture.recordings.depth_image import read_depth_image
 from mitsim.capture.recordings.depthai_recording import calibration_beside, read_depthai_recording, recorded_streams
@@ -33,6 +34,9 @@ from mitsim.sensor.preset import load_sensor, named_sensor
 
 AXES: tuple[Axes, ...] = ("opencv", "opengl")
 
+#: what the numbers of a depth image are distances along
+ALONG = ("axis", "ray")
+
 #: options for recordings of every kind
 FOR_ALL = ("range_mm", "exposure_s", "pose", "sample", "projector")
 
@@ -45,7 +49,7 @@ class ReadOptions:
     - ``calibration``: see :mod:`mitsim.capture.recordings.calibration_file`; ``camera`` of it.
     - ``frame``: which of several.
     - ``range_mm``: depths to decode.
-    - ``scale_mm`` of a depth image's grey level, and its ``invalid`` level.
+    - ``scale_mm`` of a depth image's grey level, its ``invalid`` level, and ``along`` the ``axis`` or the ``ray``.
     - ``unit`` and ``axes`` of a cloud; ``link``: an Ensenso's node that transformed it.
     - ``subpixel_bits`` of disparities.
     - ``topic`` of a bag of ROS: one, or those of a left and a right camera.
@@ -62,6 +66,7 @@ class ReadOptions:
     range_mm: tuple[float, float] | None = None
     scale_mm: float | None = None
     invalid: int | None = None
+    along: str | None = None
     unit: str | None = None
     axes: str | None = None
     link: str | None = None
@@ -161,13 +166,12 @@ def _read_cloud(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, by
 def _read_array(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
     """Read an array of rows x columns as depths, and one of rows x columns x 3 as points."""
     is_depth = map_in(read_bounded(path), path, frame_of(options.frame, path)).ndim == 2
-    unused = ("unit", "axes", "link") if is_depth else ("scale_mm", "invalid", "frame")
+    unused = ("unit", "axes", "link") if is_depth else ("scale_mm", "invalid", "along", "frame")
     for name in unused:
         if getattr(options, name) is not None:
             found = f"{_option(name)} for an array of {'depths' if is_depth else 'points'}"
-            raise InputError(
-                path, "", found, "--scale, --invalid and --frame of depths; --unit, --axes and --link of points"
-            )
+            allowed = "--scale, --invalid, --along and --frame of depths; --unit, --axes and --link of points"
+            raise InputError(path, "", found, allowed)
     return _read_depth(path, options) if is_depth else _read_cloud(path, options)
 
 
@@ -246,15 +250,15 @@ _OF_CLOUDS = frozenset({"calibration", "sensor", "camera", "unit", "axes", "link
 KINDS: dict[str, Kind] = {
     "ensenso": Kind(_read_ensenso, frozenset({"frame"})),
     "depthai": Kind(_read_depthai, frozenset({"calibration", "frame", "subpixel_bits", "sensor"})),
-    "ros": Kind(_read_ros, frozenset({*_OF_CLOUDS, "topic", "frame", "scale_mm", "invalid", "channel"})),
+    "ros": Kind(_read_ros, frozenset({*_OF_CLOUDS, "topic", "frame", "scale_mm", "invalid", "along", "channel"})),
     "stereo-pair": Kind(_read_pair, frozenset({"calibration", "sensor", "frame", "images", "channel"})),
     "robi": Kind(_read_robi, frozenset({"calibration", "frame", "sensor"})),
     "images": Kind(_read_images, frozenset({"sensor", "images", "channel"})),
-    "depth": Kind(_read_depth, frozenset({"calibration", "sensor", "camera", "scale_mm", "invalid"})),
+    "depth": Kind(_read_depth, frozenset({"calibration", "sensor", "camera", "scale_mm", "invalid", "along"})),
     "ply": Kind(_read_cloud, _OF_CLOUDS),
     "pcd": Kind(_read_cloud, _OF_CLOUDS),
     "zdf": Kind(_read_cloud, _OF_CLOUDS),
-    "npy": Kind(_read_array, _OF_CLOUDS | {"scale_mm", "invalid", "frame"}),
+    "npy": Kind(_read_array, _OF_CLOUDS | {"scale_mm", "invalid", "along", "frame"}),
 }
 
 
@@ -277,7 +281,11 @@ def read_recording(path: str | Path, options: ReadOptions, kind: str | None = No
             used = ", ".join(_option(option) for option in (*sorted(KINDS[kind].options), *FOR_ALL))
             raise InputError(path, "", f"{_option(name)} for {NAMES[kind]}", used)
     decoding, records = _options_for_all(options)
+    if options.along not in (None, *ALONG):
+        raise InputError("--along", "", repr(options.along), " | ".join(ALONG))
     capture, originals = KINDS[kind].read(path, options)
+    if "along" in KINDS[kind].options:
+        capture = _along_axis(capture, path, options.along)
     for name in (options.images or {}) if kind in ("images", "stereo-pair") else ():
         if name not in capture.rig.cameras:
             raise InputError("--images", "", repr(name), ", ".join(capture.rig.cameras))
@@ -290,6 +298,24 @@ def read_recording(path: str | Path, options: ReadOptions, kind: str | None = No
         pose_covariance=covariance if pose is not None else capture.pose_covariance,
     )
     return Imported(capture, kind, originals)
+
+
+def _along_axis(capture: Capture, path: Path, along: str | None) -> Capture:
+    """Return a capture with depths along the axis of its camera, and a warning if planes show that it had none."""
+    depth = capture.derived.get("depth")
+    if depth is None:
+        if along is not None:
+            raise InputError(path, "", f"--along of a recording as {capture.technology}", "--along of depths alone")
+        return capture
+    camera = next(iter(capture.rig.cameras.values()))
+    if along == "ray":
+        derived = capture.derived | {"depth": depths_of_ranges(depth, camera)}
+        return replace(capture, derived=derived, settings=capture.settings | {"along": along})
+    if along is None and reads_as_ranges(depth, camera):
+        note = "planes are flat only if the numbers are distances along the rays: say --along ray, or axis"
+        warnings = [*capture.settings.get("warnings", []), note]
+        return replace(capture, settings=capture.settings | {"warnings": warnings})
+    return capture
 
 
 def _option(name: str) -> str:

@@ -1,7 +1,7 @@
 """Read a 16-bit depth image, or depths in an ``.npy``, and its camera as a capture.
 
-Signal chain: PNG or TIFF of 16 bits, or an array -> levels, one of which marks missing depths -> times ``scale_mm`` ->
-depth along the camera's axis [mm].
+Signal chain: PNG or TIFF of 16 bits, floating point of TIFF, PFM or EXR, or an array -> levels, one of which marks
+missing depths -> times ``scale_mm`` -> depth along the camera's axis [mm].
 
 The image uses the camera's own pixels: if the calibration has lens distortion, the image has it too.
 """
@@ -18,6 +18,7 @@ from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
+from mitsim.capture.exr import EXR_MAGIC, exr_depths
 from mitsim.capture.grey_image import read_depths
 from mitsim.capture.npy import NPY_MAGIC
 from mitsim.capture.recordings.array_file import disparities, is_disparity, map_in
@@ -148,7 +149,10 @@ def _levels(path: Path, frame: int | None) -> NDArray[Any]:
     """Return the numbers (H, W) of an image or a file of NumPy; integers of any size as floating point."""
     data = read_bounded(path, "a depth image")
     of_numpy = data.startswith(NPY_MAGIC) or path.suffix.lower() == ".npz"
-    values = map_in(data, path, frame) if of_numpy else read_depths(path)
+    if of_numpy:
+        values: NDArray[Any] = map_in(data, path, frame)
+    else:
+        values = exr_depths(path) if data.startswith(EXR_MAGIC) else read_depths(path)
     if values.ndim != 2 or not all(1 <= side <= LONGEST_SIDE_PX for side in values.shape):
         raise InputError(path, "shape", " x ".join(map(str, values.shape)), "depths of rows x columns")
     if values.dtype.kind == "f" or values.dtype in (np.uint8, np.uint16):

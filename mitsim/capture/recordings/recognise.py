@@ -8,6 +8,7 @@ from typing import Any
 
 from characterisation.files.documents import read_toml_table
 from characterisation.files.errors import InputError
+from mitsim.capture.exr import EXR_MAGIC
 from mitsim.capture.npy import NPY_MAGIC
 from mitsim.capture.recordings.recording_files import BAG_MAGIC, MCAP_MAGIC, SQLITE_MAGIC
 from mitsim.capture.recordings.robi import is_robi
@@ -48,6 +49,7 @@ _MARKS = {
     b"II+\x00": "depth",
     b"MM\x00+": "depth",
     b"P5": "depth",
+    EXR_MAGIC: "depth",
     b"Pf\n": "depth",
 }
 
@@ -60,6 +62,7 @@ _SUFFIXES = {
     ".png": "depth",
     ".pgm": "depth",
     ".pfm": "depth",
+    ".exr": "depth",
     ".bmp": "depth",
     ".jpg": "depth",
     ".jpeg": "depth",
@@ -74,7 +77,6 @@ _RECORDED_ALONE = frozenset({".zip", ".enscam", ".ply", ".pcd", ".mcap", ".bag",
 
 #: files that are not read: what they are, what is read instead, and how to make it
 _NOT_READ = {
-    ".exr": ("an EXR image", "depths as a TIFF of floating point, a 16-bit PNG or an .npy", "convert it"),
     ".raw": ("bytes without their size", "a 16-bit PNG, or an .npy: np.fromfile(...).reshape(rows, columns)", ""),
     ".bin": ("bytes without their size", "a 16-bit PNG, or an .npy: np.fromfile(...).reshape(rows, columns)", ""),
     ".praw": (

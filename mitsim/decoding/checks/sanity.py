@@ -21,6 +21,7 @@ from mitsim.decoding.checks.row_texture import measured_row_error
 from mitsim.decoding.cloud import decoder_settings
 from mitsim.decoding.coded_images import CodedImages
 from mitsim.decoding.matching.stereo import StereoGeometry, stereo_geometry
+from mitsim.running.numbers import percent
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 
@@ -134,7 +135,7 @@ def uncalibrated_in_words(cloud: PointCloud) -> str:
     if not share:
         return ""
     return (
-        f"{100 * share:.2g} % of the pixels are left out (uncalibrated): the lens distortion of the calibration folds "
+        f"{percent(share)} of the pixels are left out (uncalibrated): the lens distortion of the calibration folds "
         "over there, so that they have no unique ray or depth. Calibrate with boards that reach the corners, and with "
         "fewer distortion coefficients"
     )

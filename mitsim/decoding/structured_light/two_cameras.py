@@ -44,8 +44,12 @@ from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.light_code import LightCode, axes, has_fringes
 
-#: largest difference of the coordinates of neighbouring pixels on one surface [projector px]
+#: largest difference of the coordinates of neighbouring pixels on one surface [projector px], chosen; larger in rows
+#: of a camera that has few pixels for those of the projector
 LARGEST_STEP_PX = 8.0
+
+#: largest difference in steps of the row's median, where this is more; chosen
+LARGEST_STEP = 4.0
 
 
 def decode_structured_light_stereo(
@@ -322,10 +326,11 @@ def find_coordinates(
     """
     columns = np.flatnonzero(np.isfinite(row[:-1]) & np.isfinite(row[1:]))
     step = row[columns + 1] - row[columns]
-    near = np.abs(step) <= LARGEST_STEP_PX
+    largest = max(LARGEST_STEP_PX, LARGEST_STEP * float(np.median(np.abs(step)))) if step.size else LARGEST_STEP_PX
+    near = np.abs(step) <= largest
     if np.sum(near & (step < 0)) > np.sum(near & (step > 0)):
         coordinates, row, step = -coordinates, -row, -step
-    columns = columns[(step > 0) & (step <= LARGEST_STEP_PX)]
+    columns = columns[(step > 0) & (step <= largest)]
     found_columns, ambiguous = np.full(coordinates.shape, np.nan), np.zeros(coordinates.shape, bool)
     finite = np.flatnonzero(np.isfinite(coordinates))
     if columns.size == 0 or finite.size == 0:

@@ -1,8 +1,8 @@
 """Fit the light of the room to captures with the projector off.
 
 Signal chain: grey levels of a uniform sheet -> electrons -> divided by those of 1 W/mm^2 from all sides on the model's
-sheet, including the loss of the lens -> medians of patches -> least squares on 1, x, y, xx, xy, yy of the view ray's
-slopes -> irradiance.
+sheet, including the loss of the lens -> trimmed means of patches -> least squares on 1, x, y, xx, xy, yy of the slopes
+of the view ray -> irradiance.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import trim_mean
 
 from characterisation.files.arrays import Floats
 from mitsim.sensor.imager import electrons_per_radiance
@@ -25,8 +26,12 @@ from mitsim.twin.sensor.figures import SpecimenField
 from mitsim.twin.sensor.input_captures import InputCapture
 from mitsim.twin.sensor.parameters import ROOM_KEYS
 
-#: side of a patch, whose median is one value of the light [px]; chosen
+#: side of a patch, which gives one value of the light [px]; chosen
 _PATCH_PX = 20
+
+#: share of a patch's pixels left out at either end of their values, for specks; chosen. A median of whole grey levels
+#: is off by up to half a level
+_TRIMMED = 0.1
 
 #: least number of patches for all six terms: four for each; fewer give a constant
 _FEWEST_FOR_TERMS = 24
@@ -69,10 +74,11 @@ def fit_room(input_captures: list[InputCapture], sensor: Sensor, specimens: dict
         rays = camera.rays(middles)
         x, y = (rays[:, :2] / rays[:, 2:]).T
         rows.append(np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1))
-        values.append([float(np.median(irradiance[r : r + _PATCH_PX, c : c + _PATCH_PX])) for r, c in corners])
+        patches = [irradiance[r : r + _PATCH_PX, c : c + _PATCH_PX] for r, c in corners]
+        values.append([trim_mean(patch, _TRIMMED, axis=None) for patch in patches])
     if not rows:
         return None
-    design, seen = np.concatenate(rows), np.concatenate([np.array(medians) for medians in values])
+    design, seen = np.concatenate(rows), np.concatenate([np.array(means) for means in values])
     if len(seen) < _FEWEST_FOR_TERMS:
         design = design[:, :1]
     solution, covariance = _fitted(design, seen)
