@@ -78,8 +78,9 @@ def with_samples(performance_map: PerformanceMap, other_maps: Sequence[Performan
 def mean_over(maps: Sequence[PerformanceMap]) -> PerformanceMap:
     """Return the mean of maps of one sample that differ in a property that a query does not contain: the lay direction.
 
-    F is the plain mean. Sigma^2 is the mean weighted by recovered points. The standard deviations between the maps are
-    the spreads.
+    F is the plain mean. Sigma^2, the bias and the second moment of what persists, p^2 + beta^2 [mm^2], are means
+    weighted by recovered points: a bias that differs between the maps persists. The standard deviations between the
+    maps are the spreads.
     """
     data = maps[0].data.copy(deep=True)
     fraction, sigma, fraction_error, sigma_error = (
@@ -102,7 +103,9 @@ def mean_over(maps: Sequence[PerformanceMap]) -> PerformanceMap:
         "recovered_fraction_spread": fraction.std(axis=0),
         "ray_noise_std_spread": np.where(weighted, spread, np.nan),
     }
-    for name in ("false_fraction", "noise_area", "persistent_share", "bias_share", "patches"):
+    if "persistent_share" in data and "bias_share" in data:
+        fields |= _persistent_and_bias(maps, share, mean)
+    for name in ("false_fraction", "noise_area", "patches"):
         if name not in data:
             continue
         values = np.stack([performance_map.data[name].values.astype(float) for performance_map in maps])
@@ -114,6 +117,26 @@ def mean_over(maps: Sequence[PerformanceMap]) -> PerformanceMap:
     for name, values in fields.items():
         data[name] = (_NODES, values.astype(np.float32), data[name].attrs)
     return PerformanceMap(data)
+
+
+def _persistent_and_bias(maps: Sequence[PerformanceMap], share: np.ndarray, mean: np.ndarray) -> dict[str, np.ndarray]:
+    """Return p / sigma and beta / sigma of the mean over maps, NaN where no map has them.
+
+    ``share`` (maps, nodes) of the recovered points [1]; ``mean`` (nodes): sigma [mm] of the mean.
+    """
+    persistent, bias = (
+        np.stack([(one.data[name] * one.data["ray_noise_std"]).values.astype(float) for one in maps])
+        for name in ("persistent_share", "bias_share")
+    )
+    weight = np.where(np.isfinite(persistent) & np.isfinite(bias), np.nan_to_num(share), 0.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        weight = weight / weight.sum(axis=0)
+        common = (weight * np.nan_to_num(bias)).sum(axis=0)
+        second_moment = (weight * np.nan_to_num(bias**2 + persistent**2)).sum(axis=0)
+        return {
+            "persistent_share": np.sqrt(np.maximum(second_moment - common**2, 0.0)) / mean,
+            "bias_share": common / mean,
+        }
 
 
 def with_directions(

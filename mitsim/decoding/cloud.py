@@ -31,9 +31,10 @@ from mitsim.decoding.decoder_registry import (
     technology_of,
 )
 from mitsim.decoding.device_maps import DeviceMapGeometry, roi_of_other_grid
-from mitsim.decoding.exposures import MERGED_FULL_SCALE, merge_exposures
+from mitsim.decoding.exposures import MERGED_FULL_SCALE, companded, merge_exposures
 from mitsim.decoding.grey_levels import MeasuredNoise
 from mitsim.decoding.grid_cloud import empty_cloud
+from mitsim.decoding.matching.stereo import StereoGeometry
 from mitsim.sensor.decoder_settings import DecoderSettings, DeviceMapSettings
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.matcher import MatcherSettings
@@ -298,8 +299,12 @@ def capture_cloud(
     images, full_scale = capture.images, 2.0**capture.bits - 1
     if exposures is not None and not isinstance(settings, DeviceMapSettings):
         images, full_scale = _merged_exposures(capture, exposures, read_out)
-        # levels refer to the shortest exposure, and the noise limits of the settings to the longest
-        settings, imager = settings.at_exposure(min(exposures) / max(exposures)), None
+        share, imager = min(exposures) / max(exposures), None
+        if isinstance(geometry, StereoGeometry):
+            black = capture.decoding.black_level_dn * full_scale / (2.0**capture.bits - 1)
+            images = {name: companded(stack, black, share) for name, stack in images.items()}
+        else:  # levels refer to the shortest exposure, and the noise limits of the settings to the longest
+            settings = settings.at_exposure(share)
     shown = Images(capture, images, full_scale, imager, roi, read_out, coordinates)
     return technology.decode(shown, geometry, settings, pattern)
 
@@ -319,10 +324,10 @@ def _device_cloud(
 
 def _merged_exposures(
     capture: Capture, exposures: tuple[float, ...], read_out: dict[str, Roi]
-) -> tuple[dict[str, NDArray[np.unsignedinteger[Any]]], float]:
+) -> tuple[dict[str, NDArray[np.uint16]], float]:
     """Return merged images of each camera, 0 where they were not read out, and their full scale [DN]."""
     full_scale = 2**capture.bits - 1
-    merged: dict[str, NDArray[np.unsignedinteger[Any]]] = {}
+    merged: dict[str, NDArray[np.uint16]] = {}
     for name, stack in capture.images.items():
         if len(stack) % len(exposures):
             where = f"capture of {capture.sensor}"

@@ -46,7 +46,7 @@ from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis
 from mitsim.sensor.imager import Imager
-from mitsim.sensor.light_code import LightCode, roles
+from mitsim.sensor.light_code import LightCode, axes, has_fringes, roles
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.pattern import DotPattern
@@ -238,10 +238,16 @@ def _structured_light_geometry(rig: Rig, settings: DecoderSettings, code: LightC
 def _structured_light(
     images: Images, geometry: StereoGeometry | StructuredLightGeometry, settings: DecoderSettings, code: LightCode
 ) -> PointCloud:
-    cloud = smoothed_along_rays(_structured_light_cloud(images, geometry, settings, code), settings.smoothing_px)
-    # neighbours on a rectified grid share raw pixels: their mean has more noise than that of independent ones
-    shared = settings.smoothing_px > 0 and isinstance(geometry, StereoGeometry)
-    return replace(cloud, sigma=None) if shared else cloud
+    unsmoothed = _structured_light_cloud(images, geometry, settings, code)
+    cloud = smoothed_along_rays(unsmoothed, settings.smoothing_px)
+    # neighbours that share raw pixels, on a rectified grid or in the imager: their mean has more noise than that of
+    # independent ones; the errors of a Gray code are those of whole stripes
+    in_imager = isinstance(images.imager, Imager) and images.imager.smoothing_px > 0
+    shared = isinstance(geometry, StereoGeometry) or in_imager
+    if settings.smoothing_px == 0 or cloud.sigma is None:
+        return cloud
+    fringes = any(has_fringes(code, axis) for axis in axes(code))
+    return replace(cloud, sigma=(None if shared else cloud.sigma) if fringes else unsmoothed.sigma)
 
 
 def _structured_light_cloud(

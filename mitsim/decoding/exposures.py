@@ -1,7 +1,7 @@
 """Merge a bracket of exposures into images with a high dynamic range.
 
 Signal chain: grey levels of each exposure -> linear response without black level -> weighted mean rate of the
-unsaturated exposures -> grey levels of the shortest exposure -> 16 bits.
+unsaturated exposures -> grey levels of the shortest exposure -> 16 bits -> for matchers their logarithm.
 
 Let x_e be the signal of exposure t_e, and R the rate to estimate. The mean of x_e is R t_e, and its variance by shot
 noise is proportional to R t_e. The unbiased average of the x_e / t_e with the least variance has the weights 1 / var,
@@ -31,6 +31,10 @@ from characterisation.files.errors import InputError
 #: 0
 _FADE = (0.8, 0.95)
 
+
+#: signal under which a companded level is nearly linear, relative to full scale of the longest exposure; chosen: the
+#: 8 bits of a matcher then resolve faint pixels as finely as those of the longest exposure, and bright ones by ratios
+_COMPANDED_LINEAR = 1 / 16
 
 #: level of saturation of merged images [merged DN]
 MERGED_FULL_SCALE = 65535
@@ -98,6 +102,32 @@ def merge_exposures(
         levels[image] = weighted_sum
         levels[image][stack[shortest, image] >= full_scale] = MERGED_FULL_SCALE
     return levels
+
+
+def companded(levels: NDArray[np.uint16], black_level: float, share: float) -> NDArray[np.uint16]:
+    """Return merged images [merged DN] with the logarithm of the signal, for matchers of 8 bits.
+
+    Merged levels are those of the shortest exposure. In 8 bits the faint pixels, for which the longest is taken, would
+    have a few levels. A match needs no absolute levels: both cameras have the same curve.
+
+    Parameters
+    ----------
+    levels
+        Merged images.
+    black_level
+        Level without light [merged DN].
+    share
+        Shortest over longest exposure [1].
+
+    See Also
+    --------
+    merge_exposures : linear images
+    """
+    signal = (np.arange(MERGED_FULL_SCALE + 1) - black_level) / (MERGED_FULL_SCALE - black_level) / share
+    logarithm = np.log1p(np.maximum(signal / _COMPANDED_LINEAR, -0.5))
+    relative = (logarithm - logarithm[0]) / (logarithm[-1] - logarithm[0])
+    table = np.rint(MERGED_FULL_SCALE * relative).astype(np.uint16)
+    return np.asarray(table[levels])
 
 
 def _tables(

@@ -52,6 +52,8 @@ def sigma_source(capture: Capture, cloud: PointCloud, noise: Imager | MeasuredNo
     if cloud.sigma is None or not np.isfinite(cloud.sigma[cloud.valid]).any():
         if not fringes:
             reason = "the errors of a Gray code between two cameras are not independent between pixels"
+        elif noise is not None and capture.decoding.bracket_s is None:
+            reason = "neighbours share pixels, so that the noise of their mean is not that of independent ones"
         elif capture.decoding.bracket_s is not None:
             reason = "it is not propagated through merged exposures"
         else:

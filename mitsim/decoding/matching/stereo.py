@@ -331,7 +331,7 @@ def _rectified(
 ) -> tuple[Strips, list[NDArray[np.uint8]]]:
     """Return the rectified strip (h, w) of each frame [DN of 8 bit], and of its saturation.
 
-    The saturation is 255 at a saturated raw pixel, else 0. Levels are rounded to integers for SGBM only.
+    The saturation is 255 at a saturated raw pixel, else 0. Levels are rounded to 8 bits, but for correlation.
     """
     strips: Strips = []
     saturation = []

@@ -278,7 +278,7 @@ def _disparity_sigma(
     )
     share_right += 2 * t * (1 - t) * _shared_weight(position_left, position_right)
     variance = share_left * left.sigma**2 + share_right * value_at(right.sigma, 0) ** 2
-    slope = value_at(u_right, 1) - value_at(u_right, 0)
+    slope = np.abs(value_at(u_right, 1) - value_at(u_right, 0))  # it falls if the projector is turned by 180 degrees
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(matched, np.sqrt(variance) / slope, np.nan)
 

@@ -218,7 +218,8 @@ def coupon_cloud(capture: Capture, coupon: Coupon, geometry: Geometry, sensor: S
     corners = np.nan_to_num(seen) if len(seen) else np.zeros((1, 2))
     low = np.clip(np.floor(corners.min(axis=0)).astype(int) - 2, 0, [grid.width - 1, grid.height - 1])
     high = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 3, low + 1, [grid.width, grid.height])
-    imager = capture.decoding.imager or sensor.imager
+    known = capture.decoding.imager or sensor.imager
+    imager = known if known.bits == capture.bits else None
     return capture_cloud(capture, sensor.settings, geometry, Roi.between(*low, *high), imager)
 
 

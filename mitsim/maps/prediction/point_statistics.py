@@ -118,6 +118,8 @@ def expected_points(
         area, persistent = structure.area, structure.persistent_share * sigma
         displaced = np.nan_to_num(structure.bias_share * sigma)
         if perturbation is not None:
+            with np.errstate(divide="ignore", invalid="ignore"):  # further losses are random: more noise of means
+                area = area + (1 / perturbation.kept[mask] - 1) / fraction
             fraction, fraction_error = (value * perturbation.kept[mask] for value in (fraction, fraction_error))
             sigma = np.hypot(sigma * perturbation.noisier[mask], perturbation.scattered[mask])
             displaced = displaced + perturbation.displaced[mask]

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
+from characterisation.maps.lay import LAY_FIELDS, LAY_NODES
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud
 from characterisation.tasks.evaluation import measure
@@ -156,7 +157,7 @@ def drawn_map(performance_map: PerformanceMap, unknowns: Unknowns, finish: int) 
     """Return the map with random errors and spread of finishes; -1 returns the map unchanged.
 
     The spread is one draw for a whole sample, scaled like the finishes of rendered measurements. Errors of the map are
-    drawn for every node.
+    drawn for every node, and for every node of each direction of a lay, of which a face with a known lay has no spread.
     """
     if finish < 0:
         return performance_map
@@ -168,6 +169,15 @@ def drawn_map(performance_map: PerformanceMap, unknowns: Unknowns, finish: int) 
             if f"{name}_{suffix}" in data:
                 moved = moved + np.nan_to_num(data[f"{name}_{suffix}"].transpose(*_NODES).values) * draw
         data[name] = (_NODES, np.clip(moved, *_LIMITS[name]))
+    rng = np.random.default_rng(np.random.SeedSequence([unknowns.seed, 102, finish]))
+    for name, limits in _LIMITS.items():
+        stored = LAY_FIELDS[name]
+        if stored in data:
+            values, error = (data[one].transpose(*LAY_NODES).values for one in (stored, LAY_FIELDS[f"{name}_error"]))
+            data[stored] = (
+                LAY_NODES,
+                np.clip(values + np.nan_to_num(error) * rng.standard_normal(error.shape), *limits),
+            )
     return PerformanceMap(data)
 
 

@@ -9,7 +9,7 @@ given (:mod:`mitsim.twin.compare.rebuild`) -> rows with verdicts (:mod:`mitsim.t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -26,6 +26,7 @@ from mitsim.decoding.cloud import decoder_settings
 from mitsim.running.numbers import NONE, rounded, two_digits
 from mitsim.running.progress import say
 from mitsim.sensor.fitted_to import recorded_in, shows_the_fit
+from mitsim.sensor.imager import Imager
 from mitsim.twin.compare.compare_captures import ComparedRow, Comparison, compare_captures
 from mitsim.twin.compare.plain_image import plain_image
 from mitsim.twin.compare.rebuild import check_technology, projector_was_on, rebuild
@@ -113,7 +114,8 @@ def validate_captures(
     twin_sensor = None if simulated is not None else sensor_of(recorded, sensor, real)
     if twin_sensor is not None:
         check_technology(recorded, twin_sensor, str(real))  # before the capture is decoded
-    settings, _ = decoder_settings(recorded)
+    settings, imager = decoder_settings(recorded)
+    recorded = _with_imager(recorded, imager)
     specimen = find_specimen(recorded, settings, roi, str(real))
     on = projector_was_on(recorded, cast(Literal["on", "off"] | None, projector), str(real))
     say(f"specimen: a plane at {_distance(specimen):.0f} mm, with {specimen.off_plane:.2g} mm rms deviation")
@@ -127,7 +129,9 @@ def validate_captures(
     else:
         assert simulated is not None
         other, where = read_capture(simulated), str(simulated)
-    comparison = compare_captures(recorded, other, specimen, settings, where, projector_on=on, seed=seed)
+    comparison = compare_captures(
+        recorded, _with_imager(other, imager), specimen, settings, where, projector_on=on, seed=seed
+    )
     table = comparison_table(comparison.rows, _whose(recorded))
     fitted = shows_the_fit(recorded_in(other.settings, where), recorded.images, other.sensor)
     write_json(output / "comparison.json", comparison.numbers() | {"fitted": fitted})
@@ -141,6 +145,12 @@ def validate_captures(
 def rendered_here(capture: Capture) -> bool:
     """Return whether mitsim simulated a capture, as opposed to a maker's virtual camera."""
     return capture.source == "simulated" and {"exposure_rule", "noise", "seed"} <= set(capture.settings)
+
+
+def _with_imager(capture: Capture, imager: Imager | None) -> Capture:
+    """Return a capture that states the imager by which both are judged, as ``mitsim decode`` would the first."""
+    known = imager if imager is not None and imager.bits == capture.bits else None
+    return replace(capture, decoding=capture.decoding.model_copy(update={"imager": known}))
 
 
 def _whose(recorded: Capture) -> str:

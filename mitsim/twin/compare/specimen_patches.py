@@ -197,7 +197,7 @@ def _cloud_patches(
     """Return the cloud of a specimen, its pixels (H, W) on the grid, and the corners of its patches."""
     grid = geometry.grid
     on_grid = on_specimen(specimen, grid.origin, grid.rays(), grid.angular_pitch, MARGIN_PX)
-    cloud = capture_cloud(capture, settings, geometry, roi=Roi.around(on_grid))
+    cloud = capture_cloud(capture, settings, geometry, Roi.around(on_grid), capture.decoding.imager)
     return cloud, on_grid, patch_corners(on_grid, PATCH_PX, LEAST_ON)
 
 

@@ -77,7 +77,7 @@ def find_specimen(capture: Capture, settings: Settings, roi: Roi | None, where: 
     if not capture.images:
         raise InputError(where, "images", "none", "a capture with images, not only a map of the device")
     if roi is None:
-        cloud = capture_cloud(capture, settings)
+        cloud = capture_cloud(capture, settings, imager=capture.decoding.imager)
         flat = specimen_in_cloud(cloud, where)
         return replace(flat, bend=_bend_of(flat, cloud.points[cloud.valid].astype(float)))
     camera, geometry = capture.rig.reference, capture_geometry(capture, settings)
@@ -93,7 +93,7 @@ def find_specimen(capture: Capture, settings: Settings, roi: Roi | None, where: 
         return np.asarray(((pixels >= low) & (pixels < high)).all(axis=-1))
 
     inside = shown(grid.origin + 1000.0 * grid.rays())
-    cloud = capture_cloud(capture, settings, geometry, roi=Roi.around(inside))
+    cloud = capture_cloud(capture, settings, geometry, Roi.around(inside), capture.decoding.imager)
     candidates = cloud.points[inside & cloud.valid].astype(float)
     # outliers of a decoder lie far away along the rays, and a fit that starts with them would follow the rays
     points = candidates[plane_points(candidates)]

@@ -253,8 +253,7 @@ def _from_one_image(
         estimates.append(FittedKey("imager.smoothing_px", smoothing, spread, "px", names, by_neighbours))
     line = one_image_line(image, mask, imager)
     if line is not None:
-        scaled = replace(line, offset=line.offset / gain, slope=line.slope / gain, covariance=line.covariance / gain**2)
-        line = scaled.not_negative()
+        line = line.over(gain).not_negative()
         if line.full_well(imager)[1] < 0.3 * line.full_well(imager)[0] and line.offset >= 0:
             fitted_imager, from_line = _with_line(bare, line, names, method)
             return fitted_imager, [*estimates, *from_line]

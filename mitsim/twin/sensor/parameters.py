@@ -175,7 +175,14 @@ CORNER_BLUR = Parameter(
 )
 
 SMOOTHING = _number(
-    "imager.smoothing_px", "px", "square", spread=0.7, step=0.05, low=0.0, high=4.0, determined_by="repeats of one pose"
+    "imager.smoothing_px",
+    "px",
+    "square",
+    spread=0.7,
+    step=0.05,
+    low=0.0,
+    high=4.0,
+    determined_by="one capture with the projector off",
 )
 
 PROJECTOR_CORNER = _number(

@@ -28,6 +28,7 @@ from scipy.ndimage import uniform_filter
 
 from characterisation.files.arrays import Floats
 from mitsim.sensor.imager import Imager
+from mitsim.sensor.point_spread import point_spread
 from mitsim.twin.finish.electrons import linearised
 from mitsim.twin.finish.fine_detail import FINEST, level_variances
 
@@ -71,6 +72,10 @@ class TransferLine:
         """Return the full well [e-] and its standard uncertainty."""
         value = imager.full_well / self.slope
         return value, value * float(np.sqrt(self.covariance[1, 1])) / self.slope
+
+    def over(self, factor: float) -> TransferLine:
+        """The line of variances that are smaller by a factor."""
+        return TransferLine(self.offset / factor, self.slope / factor, self.covariance / factor**2)
 
     def not_negative(self) -> TransferLine:
         """The line through 0 where its offset is negative by chance: the slope that is expected given an offset of 0.
@@ -119,15 +124,23 @@ class Repeats:
 
 
 def repeated_line(repeats: list[Repeats], chip: Imager) -> TransferLine | None:
-    """Return the photon-transfer line from repeats of one or more lights; None with too few levels."""
-    rows = []
+    """Return the photon-transfer line from repeats of one or more lights; None with too few levels.
+
+    Smoothing by the device, with weights w along each axis, multiplies the variance by (sum w^2)^2, which is undone. It
+    correlates neighbours by rho: n pixels tell as much of a variance as n / (sum rho^2)^2 independent ones.
+    """
+    weights, rows = point_spread(chip.smoothing_px), []
+    kept = float((weights**2).sum())
+    dependent = float(((np.convolve(weights, weights[::-1]) / kept) ** 2).sum()) ** 2
     for group in repeats:
         electrons = linearised(group.levels, chip)
         mean, variance = electrons.mean(axis=0), electrons.var(axis=0, ddof=1)
         clear = _CLEAR_SIGMAS * float(np.sqrt(group.levels.var(axis=0, ddof=1).mean()))
         inside = (group.around > clear) & (group.around < chip.full_scale - clear)
-        rows += _bins(mean[inside], variance[inside], group.around[inside], len(group.levels) - 1, chip)
-    return _line(rows)
+        bins = _bins(mean[inside], variance[inside], group.around[inside], len(group.levels) - 1, chip)
+        rows += [(level, noise, dependent * spread) for level, noise, spread in bins]
+    line = _line(rows)
+    return None if line is None else line.over(kept**2)
 
 
 def one_image_line(

@@ -197,3 +197,22 @@ def test_directions_are_joined_to_a_map_without_them_at_their_distances(rng):
     assert len(more.samples) == 2
     assert np.isfinite(query(more, normals, psi, 400.0).fraction).all()
     assert joined.data[LAY_FIELDS[FIELDS[0]]].dims == ("sample", "lay", "distance", "b", "a")
+
+
+def test_a_bias_that_differs_between_the_directions_persists():
+    """Faces that lie at random have a bias of either sign: the plain mean of both was none, and nothing persisted."""
+    made = []
+    for number, bias in enumerate((-0.8, 0.8, -0.8, 0.8)):
+        one = one_direction(lambda n: 0.5 + 0 * n[..., 0], lambda n, k=number: 0.1 * (1 + k) + 0 * n[..., 0])
+        shape = one.data["recovered_fraction"].shape
+        shares = {"persistent_share": np.full(shape, 0.1), "bias_share": np.full(shape, bias)}
+        made.append(PerformanceMap(one.data.assign({name: (NODES, values) for name, values in shares.items()})))
+    mean = mean_over(made).data
+    sigma, persistent, beta = (
+        mean[name].values.astype(float).ravel() for name in ("ray_noise_std", "persistent_share", "bias_share")
+    )
+    each = np.array([0.1, 0.2, 0.3, 0.4])
+    biases = np.array([-0.8, 0.8, -0.8, 0.8]) * each
+    assert sigma == pytest.approx(np.sqrt((each**2).mean()))
+    assert beta * sigma == pytest.approx(biases.mean())
+    assert (persistent * sigma) ** 2 == pytest.approx(np.var(biases) + ((0.1 * each) ** 2).mean())

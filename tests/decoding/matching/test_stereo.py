@@ -13,6 +13,9 @@ from scipy.ndimage import map_coordinates
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
 from characterisation.region_of_interest import Roi
+from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import Decoding
+from mitsim.decoding.cloud import capture_cloud
 from mitsim.decoding.image_context import ImageContext
 from mitsim.decoding.matching.sgbm import match_both_ways, search_range
 from mitsim.decoding.matching.stereo import decode_stereo, stereo_geometry
@@ -400,3 +403,31 @@ def test_fewer_columns_than_a_block_have_no_match(columns):
     noise = np.random.default_rng(1).integers(0, 256, (60, 300)).astype(np.uint8)
     matched = match_both_ways(noise, np.roll(noise, -40, axis=1), (60, 60 + columns), 30, 16, settings).disparity
     assert matched.shape == (60, columns) and np.isnan(matched).all()
+
+
+@pytest.mark.parametrize("method", ["sgbm", "census", "correlation"])
+def test_faint_texture_of_a_bracket_is_matched_as_in_its_longest_exposure(method):
+    """In 8 bits of the shortest exposure it had three levels: 54, 75 and 32 % of the points were right."""
+    rng, rig, surface = np.random.default_rng(4), ideal_rig(), plane([0.3, 0, 1], 470)
+    settings = SETTINGS.model_copy(update={"method": method, "sub_pixel": "method"})
+    rates = {name: draw(eye, surface) / 230 * 20.0 for name, eye in rig.cameras.items()}  # DN of the longest exposure
+    times = (1 / 16, 1 / 4, 1.0)
+
+    def stack(rate):
+        noisy = [8 + rng.poisson(rate * 30 * t) / 30 + rng.normal(0, 0.3, rate.shape) for t in times]
+        return np.stack(noisy).round().clip(0, 255).astype(np.uint8)
+
+    def share_right(images, **exposure):
+        decoding = Decoding(black_level_dn=8, **exposure)
+        capture = Capture("drawn", "active_stereo", "simulated", rig, images, 8, decoding)
+        cloud = capture_cloud(capture, settings)
+        error = np.full(cloud.status.shape, np.inf)
+        n, c = surface
+        error[cloud.valid] = np.abs(cloud.points[cloud.valid] @ n - c)
+        return float(np.mean(error < 0.01 * 470))
+
+    bracket = {name: stack(rate) for name, rate in rates.items()}
+    alone = share_right({name: images[-1:] for name, images in bracket.items()}, exposure_s=1.0)
+    merged = share_right(bracket, exposure_s=times)
+    print(method, alone, merged)
+    assert alone > 0.7 and merged > alone - 0.02

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -28,6 +30,7 @@ IMAGER = Imager(
     f_number=4,
 )
 CODE = PhaseShift(periods_px=[420, 60, 12], steps=6)
+HALF_TURN = Transform.from_degrees([0, 0, 180], [0, 0, 0])
 
 
 def rig() -> Rig:
@@ -106,3 +109,15 @@ def test_without_an_imager_or_of_stripes_alone_no_noise_is_told():
     for code, imager in ((CODE, None), (GrayCode(bits=5), IMAGER)):
         stacks = [mean_levels(eye, eyes.projector, code).astype(np.float32) for eye in eyes.cameras.values()]
         assert decoded(stacks, code, imager=imager).sigma is None
+
+
+def test_sigma_has_no_sign_if_the_projector_is_turned():
+    """The coordinates of a row fall then, and all standard deviations were negative."""
+    eyes = rig()
+    turned = replace(eyes.projector, sensor_from_camera=eyes.projector.sensor_from_camera @ HALF_TURN)
+    clouds = []
+    for lamp in (eyes.projector, turned):
+        stacks = [mean_levels(eye, lamp, CODE) for eye in eyes.cameras.values()]
+        clouds.append(decoded(stacks, CODE, imager=IMAGER))
+    plain, other = (np.nanmedian(cloud.sigma) for cloud in clouds)
+    assert other == pytest.approx(plain, rel=0.1) and np.nanmin(clouds[1].sigma) > 0

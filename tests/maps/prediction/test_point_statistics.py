@@ -32,6 +32,19 @@ def test_a_perturbation_changes_what_the_map_says(scenes):
     np.testing.assert_array_equal(found.persistent, plain.persistent)
 
 
+@pytest.mark.parametrize("kept", [0.65, 0.1])
+def test_points_that_are_lost_make_means_noisier(scenes, kept):
+    """The variance of the mean of independent points is that of the number that is left; it was kept times as large."""
+    ideal, given, plain = white_view("kinect-v2", scenes, "pillar1")
+    many, none = np.ones(len(ideal.pixel)), np.zeros(len(ideal.pixel))
+    found = expected_points(*given, perturbation=Perturbation(kept * many, many, none, none, np.zeros((len(many), 0))))
+    rng, left = np.random.default_rng(2), 400 * found.fraction.mean()
+    means = [rng.standard_normal(rng.binomial(400, left / 400) or 1).mean() for _ in range(4000)]
+    correlated = plain.area - 1 / plain.fraction  # what neighbours have in common stays
+    of_means = (np.var(means) * 400 + correlated).mean()
+    assert found.area.mean() == pytest.approx(of_means, rel=0.1)
+
+
 def test_two_perturbations_are_one():
     some = np.array([0.5, 1.0])
     first = Perturbation(some, 2 * some, 3 * some, 3 * some, np.zeros((2, 1)))

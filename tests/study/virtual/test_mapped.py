@@ -22,6 +22,7 @@ from mitsim.study.virtual.stated import budget_groups
 from mitsim.study.virtual.study_unknowns import study_unknowns
 from mitsim.study.virtual.world import BEYOND, Trial
 from mitsim.views.view_scores import score_candidates
+from tests.characterisation.maps.test_lay_directions import of_a_lay, query
 from tests.smaller_sensors import coarse_sensor
 
 SCENES = Path(__file__).parents[3] / "scenes" / "two_pillars"
@@ -105,6 +106,20 @@ def test_the_map_is_drawn_within_its_own_errors():
     assert np.nanmin(fraction) >= 0 and np.nanmax(fraction) <= 1
     again = drawn_map(known, unknowns, 0).data["ray_noise_std"].values
     np.testing.assert_array_equal(again, maps[0].data["ray_noise_std"].values)
+
+
+def test_the_directions_of_a_lay_are_drawn_within_their_own_errors():
+    """A face with a known lay had the same F in all trials: errors were drawn for the mean over directions alone."""
+    fraction, sigma = (lambda n, psi: 0.5 + 0.2 * np.cos(2 * psi) + 0 * n[..., 0]), (lambda n, psi: 0.1 + 0 * n[..., 0])
+    known = of_a_lay(fraction, sigma)
+    unknowns = study_unknowns(study_of("ensenso-n10"))
+    maps = [drawn_map(known, unknowns, number) for number in range(8)]
+    for name, error in (("lay_recovered_fraction", 0.01), ("lay_ray_noise_std", 0.002)):
+        moved = np.array([one.data[name].values - known.data[name].values for one in maps])
+        assert np.nanstd(moved) == pytest.approx(error, rel=0.05)
+    normals = np.tile([0.0, 0.0, 1.0], (1, 1))
+    answers = [query(one, normals, 20.0).fraction[0] for one in maps]
+    assert 0.001 < np.std(answers) < 0.01
 
 
 def plain_map(known, sigma):
