@@ -14,7 +14,7 @@ therefore correlated.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -179,7 +179,9 @@ def coordinate_noise(sensor: Sensor, distance_mm: float, square_px: float, seed:
     steps = periods.count(min(periods))
     contrast = getattr(pattern, "contrast", 0.5)
     signal = level * imager.full_well * imager.gain
-    variance = grey_level_variance(np.array([signal / 2 + imager.black_level], np.float32), imager)
+    # a mean over a window has the noise of the pixels before the device smooths them
+    level_dn = np.array([signal / 2 + imager.black_level], np.float32)
+    variance = grey_level_variance(level_dn, replace(imager, smoothing_px=0.0, gamma=1.0))
     sigma = fringe_sigma(min(periods), steps, variance, np.array([signal * contrast], np.float32), imager)
     return float(sigma[0] / np.sqrt(white))
 
