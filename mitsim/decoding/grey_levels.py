@@ -48,9 +48,9 @@ def grey_level_variance(level: NDArray[np.float32], imager: Imager | MeasuredNoi
 
         sigma^2 = s^2 K^2 sigma_read^2 + s K^2 sigma_row^2 + s^2 K (level - black level) + 1/12
 
-    with the gain K [DN/e-], and s the sum of the squared weights by which the device smooths along each axis. The
-    formula assumes a linear response (gamma 1) and excludes the shot noise of dark current. Measured noise is
-    interpolated. If ``imager`` is None the variance is that of quantisation, 1/12.
+    with the gain K [DN/e-], and s the sum of the squared weights by which the device smooths along each axis. A curved
+    response multiplies all but 1/12 by the square of its slope. The shot noise of dark current is excluded. Measured
+    noise is interpolated. If ``imager`` is None the variance is that of quantisation, 1/12.
     """
     if imager is None:
         return np.full(level.shape, 1 / 12, np.float32)
@@ -58,6 +58,12 @@ def grey_level_variance(level: NDArray[np.float32], imager: Imager | MeasuredNoi
         return imager.variance(level)
     kept = float((point_spread(imager.smoothing_px) ** 2).sum())  # 1 without smoothing
     read, row = kept**2 * imager.read_noise**2, kept * imager.row_noise**2
+    if imager.gamma != 1:
+        span = imager.full_scale - imager.black_level
+        share = np.clip((level - imager.black_level) / span, 1 / span, 1)  # from 1 DN on, where its slope is finite
+        variance = imager.gain**2 * (read + row) + kept**2 * imager.gain * span * share**imager.gamma
+        slope = share ** (1 - imager.gamma) / imager.gamma
+        return np.asarray(variance * slope**2 + 1 / 12, np.float32)
     dark = np.float32(imager.gain**2 * (read + row) + 1 / 12)
     return np.asarray(np.maximum(level - np.float32(imager.black_level), 0) * np.float32(kept**2 * imager.gain) + dark)
 
