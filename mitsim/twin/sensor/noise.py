@@ -224,7 +224,8 @@ def _with_fixed(
             undetermined.append(Undetermined(key, before.dsnu if kind == "dark" else before.prnu, determined_by))
             continue
         group = groups[0]
-        level, variance, spread = fixed_variance(_images(group), _specimen_mask(group[0], specimens), imager)
+        mask, gain = _specimen_mask(group[0], specimens), fine_gain(imager.smoothing_px)
+        level, variance, spread = fixed_variance(_images(group), mask, imager, gain)
         if kind == "off":
             variance -= imager.dsnu**2
         root = float(np.sqrt(max(variance, 0.0)))

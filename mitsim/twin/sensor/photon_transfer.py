@@ -170,13 +170,25 @@ def independent_share() -> float:
 
 
 def fixed_variance(
-    images: NDArray[np.unsignedinteger[Any]], mask: NDArray[np.bool_], chip: Imager
+    images: NDArray[np.unsignedinteger[Any]], mask: NDArray[np.bool_], chip: Imager, gain: float = 1.0
 ) -> tuple[float, float, float]:
-    """Return mean level [e-], variance [e-^2] of the fixed pattern in uniform light, and its uncertainty."""
+    """Return mean level [e-], variance [e-^2] of the fixed pattern in uniform light, and its uncertainty.
+
+    Parameters
+    ----------
+    images, mask
+        (n, H, W) repeats [DN], and the pixels (H, W) to use.
+    chip
+        Imager by which grey levels are made electrons; the effect of its smoothing is undone.
+    gain
+        Variance of the finest detail after this smoothing over that before it.
+    """
     electrons = linearised(images, chip)
     mean = electrons.mean(axis=0)
-    temporal = float(electrons.var(axis=0, ddof=1)[mask].mean())
+    kept = float((point_spread(chip.smoothing_px) ** 2).sum())
+    temporal = float(electrons.var(axis=0, ddof=1)[mask].mean()) / kept**2
     levels, variances, counts = level_variances(mean, mask)
+    variances = variances / gain
     weight = counts  # weights by estimated variances would favour bins that are small by chance
     total = float((weight * variances).sum() / weight.sum())
     spread = np.sqrt(2 / (counts.sum() * _MEDIAN_EFFICIENCY * independent_share())) * total

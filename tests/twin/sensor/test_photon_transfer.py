@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ import pytest
 from mitsim.sensor.image_formation import expose, fixed_pattern
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.noise_sources import Noise
-from mitsim.twin.sensor.noise import fine_gain, smoothing_of
+from mitsim.twin.sensor import noise
+from mitsim.twin.sensor.noise import fine_gain, fit_imager, smoothing_of
 from mitsim.twin.sensor.photon_transfer import Repeats, fixed_variance, one_image_line, repeated_line
 
 TRUE = Imager(
@@ -100,6 +102,28 @@ def test_fixed_pattern_comes_out_of_repeats_in_even_light():
         truth.append((variance - (0.012 * level) ** 2) / spread)
     # a dozen units: their mean in standard uncertainties, and the spread of these
     assert abs(np.mean(truth)) < 3 / np.sqrt(12) and 0.4 < np.std(truth) < 1.7
+
+
+@pytest.mark.parametrize("smoothing", [0.0, 0.5, 1.0])
+def test_the_smoothing_of_the_file_is_taken_out_of_repeats(smoothing, monkeypatch):
+    """Before, full wells of 2.4 and 11 times the truth: a simulation with this file smooths its noise once more."""
+    chip = replace(TRUE, bits=14, smoothing_px=smoothing, prnu=0.02)
+    rng, even = np.random.default_rng(11), np.full((200, 200), 9000.0)
+    monkeypatch.setattr(noise, "_specimen_mask", lambda source, _: np.ones(source.image.shape, bool))
+
+    def group(kind, electrons, fixed=None):
+        images = repeats(rng, chip, electrons, 16, fixed)
+        return [SimpleNamespace(kind=kind, name=f"{kind}_{i}", image=image) for i, image in enumerate(images)]
+
+    ramp = np.tile(np.linspace(300, 13000, 320), (240, 1))
+    groups = [group("on", ramp), group("off", even, fixed_pattern(chip, even.shape, rng))]
+    sensor = SimpleNamespace(
+        technology="structured_light", imager=replace(chip, full_well=21000, read_noise=40, prnu=0)
+    )
+    found = fit_imager(groups, sensor, {}).imager
+    assert found.full_well == pytest.approx(TRUE.full_well, rel=0.03)
+    assert found.read_noise == pytest.approx(TRUE.read_noise, rel=0.1)
+    assert found.prnu == pytest.approx(0.02, rel=0.05)
 
 
 def test_one_even_image_gives_the_sum_of_noise_and_fixed_pattern():
