@@ -26,6 +26,10 @@ from characterisation.tasks import evaluation
 from characterisation.tasks.result import Result
 from characterisation.tasks.task_file import Task
 from characterisation.tasks.task_reading import check_features
+from mitsim.capture.calibration import EXACT
+from mitsim.capture.recordings.json_fields import nearest_rotation
+from mitsim.capture.recordings.pose_file import ROUNDED
+from mitsim.capture.recordings.pose_file import read_pose as read_pose_file
 from mitsim.decoding.input_clouds import margin_of
 from mitsim.maps.prediction.predictor import EDGE_MARGIN_PX, Predictor
 from mitsim.scene.load import Scene
@@ -261,13 +265,15 @@ def read_view_statement(path: Path) -> ViewStatement:
 
 
 def read_pose(path: Path, view: int | None = None) -> Transform:
-    """Read ``world_from_sensor`` from a pose.json, a statement.json, or one view of a poses.json.
+    """Read ``world_from_sensor`` from a pose.json, a statement.json, one view of a poses.json, or a text of ``import``.
 
     Raises
     ------
     InputError
         If the file cannot be read, has no pose or no such view, or its matrix is not a rigid motion.
     """
+    if path.suffix.lower() != ".json":
+        return read_pose_file(path)[0]
     table = read_json_object(path, "pose.json of a capture, poses.json of a run, or statement.json")
     key, matrix = "world_from_sensor", table.get("world_from_sensor")
     if "views" in table:
@@ -289,12 +295,13 @@ def read_pose(path: Path, view: int | None = None) -> Transform:
 def _pose(path: Path, key: str, matrix: Any) -> Transform:
     try:
         rows = np.array(matrix, float).reshape(4, 4)
-        pose = Transform.from_matrix(rows)
     except (OverflowError, TypeError, ValueError):
         raise InputError(path, key, repr(matrix)[:60], "a 4 x 4 matrix, rows first [mm]") from None
-    if not is_motion(rows) or not is_rotation(pose.rotation, 1e-4) or not np.isfinite(pose.translation).all():
+    rotation = nearest_rotation(rows[:3, :3], ROUNDED) if np.isfinite(rows).all() else None
+    if not is_motion(rows) or rotation is None:
         raise InputError(path, key, "a matrix that is not a rigid motion", "a rotation, and a translation in mm")
-    return pose
+    exact = is_rotation(rows[:3, :3], EXACT)
+    return Transform(rows[:3, :3] if exact else rotation, rows[:3, 3])
 
 
 def _predictor_of_grid(cloud: PointCloud, margin_px: int) -> Predictor:

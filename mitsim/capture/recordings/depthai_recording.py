@@ -35,6 +35,7 @@ from mitsim.capture.recordings.depth_image import missing_depths
 from mitsim.capture.recordings.depthai_calibration import DepthaiCalibration, read_depthai_calibration
 from mitsim.capture.recordings.recording_files import needs_recordings
 from mitsim.sensor.camera import Camera, Rig, stereo_rectification
+from mitsim.sensor.transforms import Transform
 
 if TYPE_CHECKING:
     from mitsim.capture.recordings.depthai_frames import RecordedFrame
@@ -276,8 +277,9 @@ def _disparity_rig(frame: RecordedFrame, calibration: DepthaiCalibration) -> Rig
 
 
 def _depth_rig(frame: RecordedFrame, calibration: DepthaiCalibration) -> Rig:
-    """Return the rectified camera of the device's depth map; it has no distortion."""
+    """Return the rectified camera of the depth map, which has no distortion, in the frame of the left camera."""
     height, width = frame.image.shape
+    turned = stereo_rectification(*calibration.rig(width, height).cameras.values()).rotation_left
     K = _matrix(frame, calibration).copy()
     K[0, 1] = K[1, 0] = 0.0
-    return Rig({"depth": Camera(K, np.zeros(5), width, height)})
+    return Rig({"depth": Camera(K, np.zeros(5), width, height, Transform(turned.T, np.zeros(3)))})

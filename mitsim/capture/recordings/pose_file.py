@@ -31,7 +31,7 @@ _WANTED = (
 )
 
 #: largest error of a rotation that was rounded, as by a robot or a text of few decimals; chosen
-_ROUNDED = 1e-3
+ROUNDED = 1e-3
 
 #: messages of ROS in which a pose stands
 _MESSAGES = ("pose", "transform")
@@ -75,7 +75,7 @@ def read_pose(file: str | Path) -> tuple[Transform, NDArray[np.float64] | None]:
         raise InputError(file, "world_from_sensor", "nothing", _WANTED)
     with suppress(ValueError, TypeError, OverflowError):  # other values are told below
         rows_given = np.array(table["world_from_sensor"], float)
-        turn = nearest_rotation(rows_given[:3, :3], _ROUNDED) if rows_given.shape == (4, 4) else None
+        turn = nearest_rotation(rows_given[:3, :3], ROUNDED) if rows_given.shape == (4, 4) else None
         if turn is not None and not is_rotation(rows_given[:3, :3], EXACT):
             rows_given[:3, :3] = turn
             table = table | {"world_from_sensor": rows_given.tolist()}

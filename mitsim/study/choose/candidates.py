@@ -4,7 +4,8 @@ Signal chain: list of names and files -> study with each sensor and its map -> s
 with the reason.
 
 A study names one sensor. Part, task, unknowns and views of the study hold for every other sensor too. Each sensor uses
-its own map. Distances of the study are used only if they are possible for the sensor.
+its own map, and its own calibration: the covariance, hand-eye calibration and housing in the study are those of the
+study's sensor. Distances of the study are used only if they are possible for the sensor.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from characterisation.maps.shipped import shipped_maps
 from mitsim.maps.campaign.missing_finishes import Ask
 from mitsim.sensor.preset import presets
 from mitsim.study import CharacterisationTable, Study, StudyFile, open_study
+from mitsim.views.table import SensorBody
 
 #: means every preset
 ALL_PRESETS = "all"
@@ -117,8 +119,9 @@ def open_candidate(path: Path, file: StudyFile, text: str, ask: Ask | None) -> C
     if not own or map_name:
         name = str(Path(sensor).resolve()) if is_file else sensor
         changed = file.model_copy(update={"sensor": name, "characterisation": CharacterisationTable()})
-        free = file.views.model_copy(update={"standoff_mm": None, "standoffs_mm": None})
-        tables = [changed] if free == file.views else [changed, changed.model_copy(update={"views": free})]
+        changed = changed if own else _without_calibration(changed)
+        free = changed.views.model_copy(update={"standoff_mm": None, "standoffs_mm": None})
+        tables = [changed] if free == changed.views else [changed, changed.model_copy(update={"views": free})]
     study, errors = None, list[InputError]()
     for table in tables:
         try:
@@ -134,3 +137,11 @@ def open_candidate(path: Path, file: StudyFile, text: str, ask: Ask | None) -> C
         reason = "its study has a campaign instead of a map: run it, and give its map as SENSOR=MAP"
         return Excluded(study.sensor.name, text, reason)
     return CandidateSensor(study.sensor.name, text, replace(study, path=path))
+
+
+def _without_calibration(file: StudyFile) -> StudyFile:
+    """Return a study without what was calibrated or measured at its own sensor."""
+    views = file.views.model_copy(update={"flange_from_sensor": None, "sensor_body": SensorBody()})
+    calibration = file.unknowns.calibration.model_copy(update={"covariance": None})
+    unknowns = file.unknowns.model_copy(update={"calibration": calibration})
+    return file.model_copy(update={"views": views, "unknowns": unknowns})

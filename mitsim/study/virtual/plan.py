@@ -135,6 +135,14 @@ def map_digest(study: Study) -> str:
     return "" if study.performance_map is None else study.performance_map.digest[:16]
 
 
+def _without_path(unknowns: Unknowns) -> dict[str, Any]:
+    """Return the table of unknowns with the names in the calibration's covariance in place of the path of its file."""
+    table = unknowns.table.model_dump(mode="json")
+    if table["calibration"]["covariance"] is not None:
+        table["calibration"]["covariance"] = list(unknowns.calibration.names)
+    return table
+
+
 def trial_digest(
     study: Study, unknowns: Unknowns, source: str, separate_light: bool = False, rendering: Rendering | None = None
 ) -> str:
@@ -164,7 +172,7 @@ def trial_digest(
         "mitsim": __version__,
         "source": source,
         "sensor": sensor_checksum(study.sensor),
-        "unknowns": unknowns.table.model_dump(mode="json"),
+        "unknowns": _without_path(unknowns),
         # a rendered trial does not depend on effects outside the map
         "varied": [group for group in unknowns.varied if group != BEYOND or source == "map"],
         "seed": unknowns.seed,
