@@ -17,7 +17,8 @@ class Tolerance:
     """Tolerance of a measurement, in its unit.
 
     Values from ``lower`` (-inf for a zone, and where it would be 0 or less) to ``upper`` conform. ``size`` is half the
-    interval between the limits, or the width of the zone. ``rule`` is the decision rule for readings.
+    interval between the limits, the width of the zone, or where values fold the distance of the limit from there.
+    ``rule`` is the decision rule for readings.
     """
 
     lower: float
@@ -28,7 +29,7 @@ class Tolerance:
     @property
     def middle(self) -> float:
         """Return the middle between the limits, the nominal value if both deviations are equal; 0 for a zone."""
-        return self.upper - self.size
+        return 0.0 if math.isinf(self.lower) else (self.lower + self.upper) / 2
 
     @property
     def process(self) -> Any:

@@ -40,14 +40,11 @@ from characterisation.features.pose_fit import Pose
 from characterisation.features.surfaces import Cone, Cylinder, Plane, unit
 from characterisation.tasks.definitions import DEFINITIONS
 from characterisation.tasks.places import between_axes, between_planes, direction, on_axis, place
-from characterisation.tasks.task_file import Measurement
+from characterisation.tasks.task_file import LINE_ANGLES, Measurement
 from characterisation.tasks.zones import datum_motion, feet_on, largest_distance
 
 Array = NDArray[np.float64]
 Size = Callable[[Array], Array]
-
-#: angles that fold at 90 deg
-LINE_ANGLES = ("plane_axis_angle", "axis_angle", "plane_angle")
 
 #: distances and angles that are the length of a vector, where their nominal value is 0
 LENGTHS = (
@@ -81,7 +78,7 @@ def fold_of(asked: Measurement) -> float | None:
     """
     if asked.zone or (asked.kind in LENGTHS and (asked.nominal == 0 or asked.one_sided)):
         return 0.0
-    if asked.kind in LINE_ANGLES and (asked.nominal == 90 or (asked.tolerance is not None and asked.limits[1] >= 90)):
+    if asked.folds_at_90 or (asked.kind in LINE_ANGLES and asked.nominal == 90):
         return 90.0
     return None
 

@@ -25,6 +25,9 @@ from characterisation.tasks.definitions import DEFINITIONS, MeasurementKind
 from characterisation.tasks.places import intersection, mid_plane
 
 Vector = tuple[float, float, float]
+
+#: angles that fold at 90 deg
+LINE_ANGLES = ("plane_axis_angle", "axis_angle", "plane_angle")
 FeatureKind = Literal["plane", "cylinder", "sphere", "cone", "circle", "edge_point", "intersection", "mid_plane"]
 Nominal = Surface | Circle | EdgePoint | Point
 
@@ -181,10 +184,21 @@ class Measurement(Document):
 
     @property
     def tolerance_size(self) -> float | None:
-        """Return half the interval that conforms, or the width of the zone; None without a tolerance."""
-        if isinstance(self.tolerance, tuple):
-            return (self.tolerance[1] - self.tolerance[0]) / 2
-        return self.tolerance
+        """Return half the interval that conforms, or the width of the zone; None without a tolerance.
+
+        Where a limit has no effect, since values fold at 0 or 90 deg, it is the distance of the other from there.
+        """
+        if self.deviations is None:
+            return None
+        (lower, upper), (lowest, highest) = self.deviations, self.limits
+        if self.one_sided and highest > 0:
+            return highest
+        return 90.0 - lowest if self.folds_at_90 and lowest < 90 else (upper - lower) / 2
+
+    @property
+    def folds_at_90(self) -> bool:
+        """Return whether the upper limit has no effect, since the angle of the lines is at most 90 deg."""
+        return self.kind in LINE_ANGLES and self.tolerance is not None and self.limits[1] >= 90
 
     @property
     def one_sided(self) -> bool:

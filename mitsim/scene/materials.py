@@ -52,6 +52,7 @@ class Finish:
     - ``light``: the part of the scattering that a map stores.
     - ``description`` of the BSDF for Mitsuba.
     - ``deviated``: returns the finish for a function from the id of its BSDF to its deviation from the best estimate.
+    - ``under``: the family under a spray; "" without one.
     """
 
     name: str
@@ -60,6 +61,7 @@ class Finish:
     light: Light | None = field(default=None, compare=False, repr=False)
     description: dict[str, Any] | None = field(default=None, compare=False, repr=False)
     deviated: Callable[[Callable[[str], Deviation]], Finish] | None = field(default=None, compare=False, repr=False)
+    under: str = field(default="", compare=False, repr=False)
 
     def __str__(self) -> str:
         return self.name if math.isnan(self.roughness) else f"{self.name} Ra {self.roughness:g} um"
@@ -220,7 +222,8 @@ def _make_bsdf(props: Any, finish_of: Callable[[Deviation], Finish]) -> Any:
     name = props.id()
     while not name or name in _current.finishes:
         name = f"{props.id() or 'finish'}_{next(_current.unnamed)}"
-    if _current.sprayed:
+    under = finish_of(NOMINAL).name if _current.sprayed else ""
+    if under:
         finish_of = partial(_white_finish, USUAL_REFLECTANCE["matt_white"], _current.wavelength_nm)
 
     def deviated(deviation: Callable[[str], Deviation]) -> Finish:
@@ -230,7 +233,7 @@ def _make_bsdf(props: Any, finish_of: Callable[[Deviation], Finish]) -> Any:
     bsdf = mi.load_dict(finish.description, parallel=False)
     bsdf.set_id(name)
     if _current is not _OUTSIDE:
-        _current.finishes[name] = replace(finish, deviated=deviated)
+        _current.finishes[name] = replace(finish, deviated=deviated, under=under)
     return bsdf
 
 

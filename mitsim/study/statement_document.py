@@ -22,6 +22,7 @@ def statement_document(session: Session, stated: StatedView) -> dict[str, Any]:
     declared = influences(
         unknowns.table, session.source, study.file.measure.light_path_depth, "coat" in unknowns.varied
     )
+    used = unknowns.table.temperature.model_copy(update={"expansion_per_kelvin": unknowns.expansion})
     exposed = {} if stated.planned is None else {"exposure": asdict(stated.planned)}
     return exposed | {
         "schema_version": 1,
@@ -35,7 +36,7 @@ def statement_document(session: Session, stated: StatedView) -> dict[str, Any]:
         "world_from_sensor": view.world_from_sensor.matrix().tolist(),
         "coverage_probability": 0.95,
         "calibration": unknowns.calibration.source,
-        "unknowns": unknowns.table.model_dump(mode="json"),
+        "unknowns": unknowns.table.model_copy(update={"temperature": used}).model_dump(mode="json"),
         "measurements": {
             statement.measurement: _measurement(statement)
             | {"maker_sigma": maker_sigma(study.sensor, study.task.measurements[statement.measurement], view.standoff)}

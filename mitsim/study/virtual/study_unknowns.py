@@ -100,11 +100,11 @@ def _unscaled_covariance(sensor: Sensor, table: CalibrationUnknowns, folder: Pat
 
 
 def _expansion(study: Study) -> float:
-    """Return the linear expansion of the part [1/K], the median over the finishes of its features."""
+    """Return the linear expansion of the part [1/K], the median over the finishes of its features, under any spray."""
     expansion = study.unknowns.temperature.expansion_per_kelvin
     if expansion is not None:
         return expansion
     finishes = [study.scene.finishes[study.scene.names.index(name)] for name in study.task.shapes]
-    metals = [finish.name.partition("/")[0] for finish in finishes if finish is not None]
+    metals = [(finish.under or finish.name).partition("/")[0] for finish in finishes if finish is not None]
     expansions = [EXPANSION_PER_KELVIN.get(metal, _USUAL_EXPANSION) for metal in metals] or [_USUAL_EXPANSION]
     return float(np.median(expansions))

@@ -253,7 +253,9 @@ def test_the_rule_of_a_task_and_of_one_measurement():
     assert tolerance_of(both, "m").rule == Decision(guard_share=0.5)
     small = task()
     small["measurements"]["m"] |= {"nominal": 0.1}
-    assert tolerance_of(validate("task.toml", small, Task), "m") == Tolerance(-math.inf, pytest.approx(0.3), 0.2)
+    assert tolerance_of(validate("task.toml", small, Task), "m") == Tolerance(
+        -math.inf, pytest.approx(0.3), pytest.approx(0.3)
+    )
     zone = validate("task.toml", task(kind="cylindricity"), Task)
     assert tolerance_of(zone, "m") == Tolerance(-math.inf, 0.2, 0.2)
 

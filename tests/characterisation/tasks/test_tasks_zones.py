@@ -14,7 +14,7 @@ from characterisation.statements.decision import decide
 from characterisation.statements.tolerance import tolerance_of
 from characterisation.tasks.measurement_model import evaluate, measurement_model
 from characterisation.tasks.places import mid_plane
-from characterisation.tasks.task_file import Task
+from characterisation.tasks.task_file import Measurement, Task
 from characterisation.tasks.task_reading import read_task
 from characterisation.tasks.zones import angularity, coaxiality, datum_motion, perpendicularity, position, symmetry
 
@@ -219,3 +219,19 @@ def test_a_number_keeps_what_a_trial_is_named_by():
     assert told["width"]["tolerance"] == [-0.2, 0.0]
     whole = slot(SLOT.replace("= 0.75", "= 1")).model_dump_json()
     assert '"tolerance":1.0' in whole
+
+
+@pytest.mark.parametrize(
+    ("kind", "unit", "nominal", "tolerances", "size"),
+    [
+        ("axis_distance", "mm", 0, [0.3, (0, 0.3), (-0.5, 0.3)], 0.3),
+        ("plane_axis_angle", "deg", 90, [0.5, (-0.5, 0), (-0.5, 2)], 0.5),
+        ("axis_distance", "mm", 50, [0.3, (-0.4, 0.2)], 0.3),
+        ("plane_axis_angle", "deg", 30, [0.5, (-0.25, 0.75)], 0.5),
+    ],
+)
+def test_tolerances_that_the_same_values_meet_have_one_size(kind, unit, nominal, tolerances, size):
+    """Half the interval was taken where a limit has no effect: [0, 0.3] had 0.15, which asks for twice as much."""
+    table = {"kind": kind, "features": ("a", "b"), "nominal": nominal, "unit": unit}
+    sizes = [Measurement.model_validate(table | {"tolerance": tolerance}).tolerance_size for tolerance in tolerances]
+    assert sizes == pytest.approx([size] * len(tolerances))

@@ -182,6 +182,14 @@ def test_the_expansion_of_every_metal_of_a_finish_is_known():
     assert set(EXPANSION_PER_KELVIN) == set(CONSTANTS)
 
 
+def test_a_sprayed_part_expands_as_its_metal():
+    """It expanded as a part of an unknown metal, by 17e-6 per kelvin, so that spray changed more than the finish."""
+    bare, sprayed = (
+        study_unknowns(study_of("ensenso-n10", scene="two_pillars.xml", sprayed=white)) for white in (False, True)
+    )
+    assert bare.expansion == sprayed.expansion == EXPANSION_PER_KELVIN["aluminium"]
+
+
 def test_finishes_are_loaded_with_the_alpha_that_was_drawn():
     study = study_of("ensenso-n10", scene="two_pillars.xml", parameters={"plane_Ra": 0.37, "pillar_Ra": 0.37})
     unknowns = study_unknowns(study)
