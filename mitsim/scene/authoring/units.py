@@ -19,7 +19,11 @@ from mitsim.sensor.calibration_qualifiers import LENGTHS_MM, UNITS_MM
 _HEAD = 4096
 
 _COMMENT = {".obj": rb"#", ".off": rb"#", ".ply": rb"comment|obj_info", ".stl": rb"solid"}
-_STATEMENT = re.compile(r"\bunits?\b(?:\s*[=:]|\s+(?:in|is|are)\b)?\s*[\"']?([a-z]+)|\b([a-z]+) as units?\b")
+#: a unit after the word ``unit``, or before ``as unit``; ``in`` is the inch only after = or :
+_STATEMENT = re.compile(
+    r"\bunits?\b(?:\s+(?:is|are)\b)?(?:\s+in\b)?(?:\s*[=:]\s*[\"'(\[]*([a-z]+)|\s*[\"'(\[]*(?!in\b)([a-z]+))"
+    r"|\b([a-z]+) as units?\b"
+)
 
 _PREFIX = {
     "EXA": 1e18,
@@ -62,7 +66,7 @@ def commented_unit(suffix: str, data: bytes) -> float | None:
     for line in lines:
         if re.match(mark, line.strip()):
             for statement in _STATEMENT.finditer(line.decode("ascii", "replace").lower()):
-                size = UNITS_MM.get(statement.group(1) or statement.group(2))
+                size = UNITS_MM.get(next(filter(None, statement.groups())))
                 if size is not None:
                     return size
     return None
