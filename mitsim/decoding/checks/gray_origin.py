@@ -192,13 +192,11 @@ def with_origins(code: LightCode, origins: Origins) -> LightCode:
 def other_origins(code: LightCode, size: tuple[int, int]) -> dict[str, Origins]:
     """Return the usual origins that differ from those stated, by what to write in the sensor file.
 
-    ``size`` (width, height) of the projector [px]. All axes have the same origin, as in a program. Gray codes with
-    fringes are left out: the fringes show their origin.
+    ``size`` (width, height) of the projector [px]. All axes have the same origin, as in a program. Fringes contradict
+    another origin only if it is no whole number of their periods away.
     """
-    image_roles = roles(code, *size)
-    fringes = {role.axis for role in image_roles if role.kind == "phase"}
-    stated = {role.axis: role.offset for role in image_roles if role.kind == "gray"}
-    gray_axes: list[Axis] = [axis for axis in axes(code) if axis in stated and axis not in fringes]
+    stated = {role.axis: role.offset for role in roles(code, *size) if role.kind == "gray"}
+    gray_axes: list[Axis] = [axis for axis in axes(code) if axis in stated]
     out: dict[str, Origins] = {}
     for offset in ("centred", 0.0):
         origins: Origins = dict.fromkeys(gray_axes, offset)  # type: ignore[arg-type]
@@ -210,9 +208,9 @@ def other_origins(code: LightCode, size: tuple[int, int]) -> dict[str, Origins]:
 
 
 def _states_origins(code: LightCode) -> bool:
-    """Return whether the sensor file states ``offset_px`` of every Gray code without fringes."""
+    """Return whether the sensor file states ``offset_px`` of every Gray code."""
     if isinstance(code, ImageSequence):
-        groups = [code.gray(axis) for axis in code.axes if not code.fringes(axis)]
+        groups = [code.gray(axis) for axis in code.axes]
         return all(group.offset_px is not None for axis_groups in groups for group in axis_groups)
     return not isinstance(code, GrayCode) or code.offset_px is not None
 

@@ -249,3 +249,13 @@ def test_a_code_that_fills_its_bits_has_one_origin():
     capture = taken(GrayCode(axis="columns"))
     assert said(capture) == ""
     assert (capture_cloud(capture, SETTINGS).status == Status.VALID).mean() > 0.95
+
+
+def test_an_origin_that_is_whole_periods_away_is_stated_beside_the_other():
+    """The fringes agree with either: a rig of 1920 columns was 50 mm off, another 280 mm, without a word."""
+    capture = taken(coded(fringes(period=8), offset_px="centred"), beamer=wide(240, 192, 253))
+    words = said(stated(capture, coded(fringes(period=8))))
+    assert "the images do not tell where the Gray code begins" in words and 'offset_px = "centred"' in words
+    depths = [float(each) for each in re.findall(r"at (\d+) mm", words)]
+    assert abs(depths[1] - 498) < 5 and depths[0] > 530
+    assert said(stated(capture, coded(fringes(period=8), offset_px="centred"))) == ""
