@@ -44,7 +44,9 @@ def test_keys_of_a_statement(stated):
         task=SimpleNamespace(measurements={"radius": SimpleNamespace(unit="deg")}),
     )
     view = SimpleNamespace(number=3, standoff=500.0, world_from_sensor=Transform.from_matrix(np.eye(4)))
-    unknowns = SimpleNamespace(table=UnknownsTable(), calibration=SimpleNamespace(source="a calibration"), varied=())
+    unknowns = SimpleNamespace(
+        table=UnknownsTable(), calibration=SimpleNamespace(source="a calibration"), varied=(), expansion=17e-6
+    )
     session = SimpleNamespace(study=study, unknowns=unknowns, source="render")
     written = statement_document(session, StatedView(view, [stated], PlannedExposure((1e-3,))))
     assert first_column("columns: statement.json") == set(written)

@@ -24,7 +24,7 @@ from tests.smaller_sensors import coarse_sensor
 #: ground aluminium of Ra 0.37: from the side the N10's own exposure, 1.15 ms, is too short
 FINISHES = "{ plane_Ra = 0.37, pillar_Ra = 0.37 }"
 OWN_S = 0.00115
-SAID = r"view {view}: expose (.* ms, at full power): every (other )?feature is at its limit with 1 exposure"
+SAID = r"view {view}: expose (.* ms, (merged, )?at full power): every (other )?feature is at its limit with \d exposure"
 
 
 # a tolerance that does not fit ends with 1
@@ -95,7 +95,7 @@ def test_run_states_its_view_with_the_planned_exposure(chosen):
     stated = statement_in(folder / "run")
     plan = json.loads((folder / f"run/exposures/view_{view:04d}.json").read_text())
     assert stated["exposure"] == {"exposures_s": plan["exposures_s"], "power": plan["power"]}
-    assert stated["exposure"]["exposures_s"][0] > 1.3 * OWN_S
+    assert max(stated["exposure"]["exposures_s"]) > 1.3 * OWN_S
 
 
 @pytest.mark.parametrize("command", ["state", "choose"])
