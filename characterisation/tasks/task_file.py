@@ -184,16 +184,8 @@ class Measurement(Document):
 
     @property
     def tolerance_size(self) -> float | None:
-        """Return half the interval that conforms, or the width of the zone; None without a tolerance.
-
-        Where a limit has no effect, since values fold at 0 or 90 deg, it is the distance of the other from there.
-        """
-        if self.deviations is None:
-            return None
-        (lower, upper), (lowest, highest) = self.deviations, self.limits
-        if self.one_sided and highest > 0:
-            return highest
-        return 90.0 - lowest if self.folds_at_90 and lowest < 90 else (upper - lower) / 2
+        """Return the size of the tolerance (:func:`tolerance_size`); None without one."""
+        return tolerance_size(self.kind, self.nominal, self.tolerance)
 
     @property
     def folds_at_90(self) -> bool:
@@ -225,6 +217,20 @@ def effective_deviations(
         return None
     lower, upper = tolerance if isinstance(tolerance, tuple) else (-tolerance, tolerance)
     return (lower if nominal + lower > 0 else None), upper
+
+
+def tolerance_size(kind: str, nominal: float, tolerance: float | tuple[float, float] | None) -> float | None:
+    """Return half the interval that conforms, or the width of the zone; None without a tolerance.
+
+    Where a limit has no effect, since values fold at 0 or 90 deg, it is the distance of the other from there.
+    """
+    if tolerance is None:
+        return None
+    lower, upper = tolerance if isinstance(tolerance, tuple) else (-tolerance, tolerance)
+    lowest, highest = nominal + lower, nominal + upper
+    if lowest <= 0 < highest:
+        return highest
+    return 90.0 - lowest if kind in LINE_ANGLES and lowest < 90 <= highest else (upper - lower) / 2
 
 
 class Task(Document):

@@ -84,8 +84,12 @@ def decoder_settings(
     if range_mm is None and sensor is None:
         range_mm = capture.decoding.range_mm
     settings, imager = _settings(capture, sensor)
-    imager = imager if imager is not None and imager.bits == capture.bits else None
-    return in_range(settings, range_mm, _where(capture)), imager
+    return in_range(settings, range_mm, _where(capture)), imager_of_bits(capture, imager)
+
+
+def imager_of_bits(capture: Capture, imager: Imager | None) -> Imager | None:
+    """Return the imager whose noise a capture has, None if its grey levels have other bits."""
+    return imager if imager is not None and imager.bits == capture.bits else None
 
 
 def _where(capture: Capture) -> str:

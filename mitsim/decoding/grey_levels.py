@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 from mitsim.sensor.imager import Imager
-from mitsim.sensor.point_spread import point_spread
+from mitsim.sensor.point_spread import kept_variance
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def grey_level_variance(level: NDArray[np.float32], imager: Imager | MeasuredNoi
         return np.full(level.shape, 1 / 12, np.float32)
     if isinstance(imager, MeasuredNoise):
         return imager.variance(level)
-    kept = float((point_spread(imager.smoothing_px) ** 2).sum())  # 1 without smoothing
+    kept = kept_variance(imager.smoothing_px)  # 1 without smoothing
     read, row = kept**2 * imager.read_noise**2, kept * imager.row_noise**2
     if imager.gamma != 1:
         span = imager.full_scale - imager.black_level

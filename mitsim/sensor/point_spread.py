@@ -24,3 +24,8 @@ def point_spread(sigma: float) -> NDArray[np.float64]:
     reach = max(int(4.0 * sigma + 0.5) + 1, 2)
     weights = ive(np.abs(np.arange(-reach, reach + 1)), sigma**2)
     return np.asarray(weights / weights.sum(), np.float64)
+
+
+def kept_variance(sigma: float) -> float:
+    """Return the share [1] of the variance of white noise that a point spread along one axis leaves: sum of w^2."""
+    return float((point_spread(sigma) ** 2).sum())

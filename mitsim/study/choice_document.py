@@ -17,6 +17,7 @@ from characterisation.files.checked_files import read_json_object
 from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
 from characterisation.statements.verdict_words import Judged
+from characterisation.tasks.task_file import tolerance_size
 from mitsim.running.numbers import or_nan, two_digits
 from mitsim.study.statement_file import PartialDocument, StatementDocument, read_statement
 
@@ -36,10 +37,8 @@ class ComparedMeasurement(PartialDocument):
 
     @property
     def tolerance_size(self) -> float | None:
-        """Return half the interval that conforms, or the width of the zone; None without a tolerance."""
-        if isinstance(self.tolerance, tuple):
-            return (self.tolerance[1] - self.tolerance[0]) / 2
-        return self.tolerance
+        """Return the size of the tolerance, as in the task; None without one."""
+        return tolerance_size(self.kind, self.nominal, self.tolerance)
 
 
 class CellEntry(PartialDocument):

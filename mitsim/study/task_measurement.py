@@ -27,9 +27,8 @@ from characterisation.tasks.result import Result
 from characterisation.tasks.task_file import Task
 from characterisation.tasks.task_reading import check_features
 from mitsim.capture.calibration import EXACT
-from mitsim.capture.recordings.json_fields import nearest_rotation
-from mitsim.capture.recordings.pose_file import ROUNDED
 from mitsim.capture.recordings.pose_file import read_pose as read_pose_file
+from mitsim.capture.recordings.pose_file import with_exact_rotation
 from mitsim.decoding.input_clouds import margin_of
 from mitsim.maps.prediction.predictor import EDGE_MARGIN_PX, Predictor
 from mitsim.scene.load import Scene
@@ -297,11 +296,10 @@ def _pose(path: Path, key: str, matrix: Any) -> Transform:
         rows = np.array(matrix, float).reshape(4, 4)
     except (OverflowError, TypeError, ValueError):
         raise InputError(path, key, repr(matrix)[:60], "a 4 x 4 matrix, rows first [mm]") from None
-    rotation = nearest_rotation(rows[:3, :3], ROUNDED) if np.isfinite(rows).all() else None
-    if not is_motion(rows) or rotation is None:
+    rows = with_exact_rotation(rows)
+    if not is_motion(rows) or not is_rotation(rows[:3, :3], EXACT) or not np.isfinite(rows).all():
         raise InputError(path, key, "a matrix that is not a rigid motion", "a rotation, and a translation in mm")
-    exact = is_rotation(rows[:3, :3], EXACT)
-    return Transform(rows[:3, :3] if exact else rotation, rows[:3, 3])
+    return Transform(rows[:3, :3], rows[:3, 3])
 
 
 def _predictor_of_grid(cloud: PointCloud, margin_px: int) -> Predictor:

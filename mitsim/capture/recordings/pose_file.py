@@ -31,7 +31,7 @@ _WANTED = (
 )
 
 #: largest error of a rotation that was rounded, as by a robot or a text of few decimals; chosen
-ROUNDED = 1e-3
+_ROUNDED = 1e-3
 
 #: messages of ROS in which a pose stands
 _MESSAGES = ("pose", "transform")
@@ -75,14 +75,22 @@ def read_pose(file: str | Path) -> tuple[Transform, NDArray[np.float64] | None]:
         raise InputError(file, "world_from_sensor", "nothing", _WANTED)
     with suppress(ValueError, TypeError, OverflowError):  # other values are told below
         rows_given = np.array(table["world_from_sensor"], float)
-        turn = nearest_rotation(rows_given[:3, :3], ROUNDED) if rows_given.shape == (4, 4) else None
-        if turn is not None and not is_rotation(rows_given[:3, :3], EXACT):
-            rows_given[:3, :3] = turn
-            table = table | {"world_from_sensor": rows_given.tolist()}
+        if rows_given.shape == (4, 4):
+            table = table | {"world_from_sensor": with_exact_rotation(rows_given).tolist()}
     document = validate(file, table, PoseDocument)
     pose = document.transform()
     assert pose is not None  # checked above
     return pose, None if document.covariance is None else np.array(document.covariance)
+
+
+def with_exact_rotation(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return rows (4, 4) with the nearest rotation in place of one that was rounded; others as they are."""
+    turn = None if is_rotation(rows[:3, :3], EXACT) else nearest_rotation(rows[:3, :3], _ROUNDED)
+    if turn is None:
+        return rows
+    out = rows.copy()
+    out[:3, :3] = turn
+    return out
 
 
 def _rows_of(file: Path, table: dict[str, Any]) -> list[list[float]]:

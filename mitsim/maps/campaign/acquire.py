@@ -31,7 +31,7 @@ from mitsim.capture.folder import read_capture, read_settings_and_pose
 from mitsim.capture.simulated.render_residual import RenderResidual, render_residual, warn_above_limit
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decoding.cloud import Geometry, capture_cloud, capture_geometry, sensor_geometry
+from mitsim.decoding.cloud import Geometry, capture_cloud, capture_geometry, imager_of_bits, sensor_geometry
 from mitsim.decoding.depth_range import depths_of, range_warning
 from mitsim.maps.campaign.plan import Campaign, Shot, view_axes
 from mitsim.maps.campaign.pose_doubt import DIRECTION, fits, fits_inverted, may_be_inverted, pose_doubt
@@ -218,8 +218,7 @@ def coupon_cloud(capture: Capture, coupon: Coupon, geometry: Geometry, sensor: S
     corners = np.nan_to_num(seen) if len(seen) else np.zeros((1, 2))
     low = np.clip(np.floor(corners.min(axis=0)).astype(int) - 2, 0, [grid.width - 1, grid.height - 1])
     high = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 3, low + 1, [grid.width, grid.height])
-    known = capture.decoding.imager or sensor.imager
-    imager = known if known.bits == capture.bits else None
+    imager = imager_of_bits(capture, capture.decoding.imager or sensor.imager)
     return capture_cloud(capture, sensor.settings, geometry, Roi.between(*low, *high), imager)
 
 

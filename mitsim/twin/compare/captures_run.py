@@ -22,7 +22,7 @@ from characterisation.point_cloud import Status
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.decoding.cloud import decoder_settings
+from mitsim.decoding.cloud import decoder_settings, imager_of_bits
 from mitsim.running.numbers import NONE, rounded, two_digits
 from mitsim.running.progress import say
 from mitsim.sensor.fitted_to import recorded_in, shows_the_fit
@@ -149,7 +149,7 @@ def rendered_here(capture: Capture) -> bool:
 
 def _with_imager(capture: Capture, imager: Imager | None) -> Capture:
     """Return a capture that states the imager by which both are judged, as ``mitsim decode`` would the first."""
-    known = imager if imager is not None and imager.bits == capture.bits else None
+    known = imager_of_bits(capture, imager)
     return replace(capture, decoding=capture.decoding.model_copy(update={"imager": known}))
 
 

@@ -28,7 +28,7 @@ from scipy.ndimage import uniform_filter
 
 from characterisation.files.arrays import Floats
 from mitsim.sensor.imager import Imager
-from mitsim.sensor.point_spread import point_spread
+from mitsim.sensor.point_spread import kept_variance, point_spread
 from mitsim.twin.finish.electrons import linearised
 from mitsim.twin.finish.fine_detail import FINEST, level_variances
 
@@ -130,7 +130,7 @@ def repeated_line(repeats: list[Repeats], chip: Imager) -> TransferLine | None:
     correlates neighbours by rho: n pixels tell as much of a variance as n / (sum rho^2)^2 independent ones.
     """
     weights, rows = point_spread(chip.smoothing_px), []
-    kept = float((weights**2).sum())
+    kept = kept_variance(chip.smoothing_px)
     dependent = float(((np.convolve(weights, weights[::-1]) / kept) ** 2).sum()) ** 2
     for group in repeats:
         electrons = linearised(group.levels, chip)
@@ -185,8 +185,7 @@ def fixed_variance(
     """
     electrons = linearised(images, chip)
     mean = electrons.mean(axis=0)
-    kept = float((point_spread(chip.smoothing_px) ** 2).sum())
-    temporal = float(electrons.var(axis=0, ddof=1)[mask].mean()) / kept**2
+    temporal = float(electrons.var(axis=0, ddof=1)[mask].mean()) / kept_variance(chip.smoothing_px) ** 2
     levels, variances, counts = level_variances(mean, mask)
     variances = variances / gain
     weight = counts  # weights by estimated variances would favour bins that are small by chance
