@@ -80,8 +80,7 @@ def result_reasons(judged: Sequence[Judged]) -> list[Reason]:
         reverse=True,
     )
     unsure = [measurement for measurement in asked if measurement.verdict == "not decided"]
-    undecided = f", {len(unsure)} not decided" if unsure else ""
-    reasons = [Reason(f"fits {len(fitting)} of {len(asked)} tolerances{undecided}"), *_reasons(failing)]
+    reasons = [Reason(fits_in_words(len(fitting), len(unsure), len(asked), " tolerances")), *_reasons(failing)]
     valued = [measurement.name for measurement in unsure if math.isfinite(measurement.uncertainty)]
     single = [
         measurement.name
@@ -104,6 +103,21 @@ def result_reasons(judged: Sequence[Judged]) -> list[Reason]:
         if measurement.without_value >= OFTEN
     ]
     return reasons
+
+
+def fits_in_words(fitting: int, unsure: int, of: int, what: str = "") -> str:
+    """Return how many tolerances fit, and how many are open: ``fits 3 of 7, 2 open``, or ``7 of 7 open`` of none known.
+
+    Parameters
+    ----------
+    fitting, unsure, of
+        Number of tolerances that fit, that are not decided, and of all.
+    what
+        Words after the number of all.
+    """
+    if unsure and unsure == of:
+        return f"{unsure} of {of}{what} open"
+    return f"fits {fitting} of {of}{what}" + f", {unsure} open" * bool(unsure)
 
 
 def in_words(reasons: Sequence[Reason], kept: int | None = None) -> str:

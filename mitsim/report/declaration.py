@@ -261,12 +261,8 @@ def _others(choice: ChoiceDocument, best: SensorEntry) -> list[tuple[str, str]]:
         if sensor is best or sensor.status == "excluded":
             continue
         by = "" if sensor.status == "stated" else ", by screening alone"
-        fits = (
-            f"fits {sensor.fits} of {asked}"
-            if sensor.status == "stated"
-            else f"{sensor.expected_fits} of {asked} expected to fit"
-        )
-        words.append(f"{sensor.name} ({fits if asked else sensor.possible_in_words or 'all possible'}{by})")
+        fits = sensor.fits_in_words(asked) if asked else sensor.possible_in_words or "all possible"
+        words.append(f"{sensor.name} ({fits}{by})")
     return [("Also compared", ", ".join(words))] if words else []
 
 

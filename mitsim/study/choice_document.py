@@ -16,7 +16,7 @@ from scipy.stats import chi2
 from characterisation.files.checked_files import read_json_object
 from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
-from characterisation.statements.verdict_words import Judged
+from characterisation.statements.verdict_words import Judged, fits_in_words
 from characterisation.tasks.task_file import tolerance_size
 from mitsim.running.numbers import or_nan, two_digits
 from mitsim.study.statement_file import PartialDocument, StatementDocument, read_statement
@@ -156,9 +156,9 @@ class SensorEntry(PartialDocument):
     def fits_in_words(self, toleranced: int) -> str:
         """Return how many of the tolerances fit, or are expected to, and how many of a measured sensor are open."""
         if self.status != "stated":
-            return f"{self.expected_fits} of {toleranced}"
-        open_ones = sum(cell.verdict == "not decided" for cell in self.measurements.values())
-        return f"{self.fits} of {toleranced}" + (f", {open_ones} open" if open_ones else "")
+            return f"{self.expected_fits} of {toleranced} expected to fit"
+        unsure = sum(cell.verdict == "not decided" for cell in self.measurements.values())
+        return fits_in_words(self.fits, unsure, toleranced)
 
     @property
     def fits_all(self) -> bool:
@@ -205,7 +205,7 @@ class ChoiceDocument(PartialDocument):
                 mine, other = (two_digits(or_nan(entry.ratio)) for entry in (best, sensor))
                 ratios = f"{mine} times its limit, that of {sensor.name} at {other}"
                 why = f"its worst measurement is at {ratios} times"
-            fits = f"{sensor.name} fits {sensor.fits} of {self.toleranced} tolerances, {best.name} {best.fits}"
+            fits = "; ".join(f"{entry.name} {entry.fits_in_words(self.toleranced)}" for entry in (sensor, best))
             out.append(f"{fits}. {best.name} leads, since {why}")
         return out
 

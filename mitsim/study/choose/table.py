@@ -200,8 +200,9 @@ _SIGNS = {"fits": "fits", "does not fit": "no", "undecidable": "undecidable", "n
 def _fits(sensor_entry: SensorEntry, toleranced: int) -> str:
     if not toleranced:
         return "-"
-    known = sensor_entry.status == "stated"
-    return sensor_entry.fits_in_words(toleranced) if known else f"({sensor_entry.expected_fits} of {toleranced})"
+    if sensor_entry.status == "stated":
+        return sensor_entry.fits_in_words(toleranced).removeprefix("fits ")
+    return f"({sensor_entry.expected_fits} of {toleranced})"
 
 
 def _cell(cell: CellEntry, measurement: ComparedMeasurement) -> str:

@@ -19,7 +19,7 @@ def test_what_fits_is_counted_and_the_worst_is_named_first():
         Judged("note", "mm", "no tolerance", 0.02, math.nan),
     ]
     assert words_of(judged) == (
-        "fits 1 of 4 tolerances, 1 not decided; seat_radius is undecidable: standard uncertainty 0.12 mm, 0.030 mm "
+        "fits 1 of 4 tolerances, 1 open; seat_radius is undecidable: standard uncertainty 0.12 mm, 0.030 mm "
         "needed; angle does not fit: standard uncertainty 0.20 deg, 0.10 deg needed; width: not decided, more virtual "
         "measurements are needed"
     )
@@ -50,7 +50,7 @@ def test_measurements_left_out_of_a_summary_are_counted_one_by_one():
     judged = [Judged("top", "mm", "does not fit", 0.2, 0.1), *many]
     words = words_of(judged)
     assert words_of(judged, 1).endswith("0.10 mm needed; and 11 more, see the table")
-    assert words_of(judged, 0) == "fits 0 of 12 tolerances, 11 not decided; see the table"
+    assert words_of(judged, 0) == "fits 0 of 12 tolerances, 11 open; see the table"
     assert words_of(judged, 2) == words
     assert "; a, b, c and 8 more: not decided, no value" in words
 
@@ -70,9 +70,7 @@ def test_measurements_without_a_value_are_one_reason():
 
 def test_a_single_value_is_not_told_as_none():
     single = Judged("b", "mm", "not decided", math.nan, math.nan, without_value=0.5, trials=2)
-    assert words_of([single]) == (
-        "fits 0 of 1 tolerances, 1 not decided; b: not decided, a single virtual measurement gave a value"
-    )
+    assert words_of([single]) == ("1 of 1 tolerances open; b: not decided, a single virtual measurement gave a value")
 
 
 def test_without_tolerances_the_losses_are_told():

@@ -11,16 +11,19 @@ import xarray as xr
 
 from characterisation.statements.statement import statement
 from characterisation.statements.tolerance import plus_minus
+from characterisation.statements.verdict_words import in_words
 from mitsim.report.choice_page import page_content, write_choice_page
+from mitsim.report.declaration import read_declaration
 from mitsim.report.first_screen import of_choice
 from mitsim.study.choice_document import ChoiceDocument
 from mitsim.study.choose import read_candidates, rounds, selection
 from mitsim.study.choose.ranking import rank_key, rank_keys, relative_to_least, unpromising
 from mitsim.study.choose.sensor_result import SensorResult, ordered
-from mitsim.study.choose.table import as_text, best_reasons, document
+from mitsim.study.choose.table import as_text, best_reasons, document, reasons_of
 from mitsim.study.virtual.race import combined_cost, first_of_each, possible_measurements
 from mitsim.study.virtual.stated import StatedView
 from tests.report.choice_run import choice as made_choice
+from tests.report.choice_run import write_choice
 from tests.small_study import MEASUREMENTS, few_measurements, small_study
 
 INF = math.inf
@@ -244,17 +247,37 @@ def test_a_later_sensor_that_fits_more_is_named_with_the_reason(candidates, tmp_
     )
     assert [(each.name, each.fits) for each in choice.sensors] == [(other.name, 1), (one.name, 2)]
     (words,) = choice.fit_more
-    assert words.startswith(f"{one.name} fits 2 of 3 tolerances, {other.name} 1. {other.name} leads, since its worst ")
+    assert words.startswith(f"{one.name} fits 2 of 3; {other.name} fits 1 of 3. {other.name} leads, since its worst ")
     assert f"at {choice.sensors[0].ratio:.2g} times" in words and words.endswith(f"{choice.sensors[1].ratio:.2g} times")
     assert words in as_text(choice) and of_choice(choice, None).doubts == (words,)
     (tmp_path / "choice.json").write_text(choice.model_dump_json())
     page = write_choice_page(tmp_path).read_text()
-    assert "Order: sensors with virtual measurements first" in page and f"{one.name} fits 2 of 3 tolerances" in page
+    assert "Order: sensors with virtual measurements first" in page and f"{one.name} fits 2 of 3" in page
     fewer = documented(
         [measured(one, (INF, 0.01, 0.01), tolerance=1.0), measured(other, (2.0, 2.0, 2.0), tolerance=1.0)]
     )
     assert fewer.fit_more[0].endswith(f"{other.name} leads, since it can make more measurements")
     assert documented([measured(each, (0.01, 0.01, 0.01), tolerance=1.0) for each in (one, other)]).fit_more == []
+
+
+def test_a_sensor_of_which_nothing_is_decided_is_open_wherever_it_is_named(tmp_path):
+    """Sheet and page said "fits 0 of 3" of three verdicts that were not decided, as if the sensor missed all."""
+    folder = write_choice(tmp_path / "choice")
+    made = json.loads((folder / "choice.json").read_text())
+    for entry in made["sensors"][1:2]:
+        entry["fits"] = 0
+        for cell in entry["measurements"].values():
+            cell |= {"by": "statement", "verdict": "not decided", "uncertainty": 0.02}
+    (folder / "choice.json").write_text(json.dumps(made))
+    choice = ChoiceDocument.model_validate(made)
+    open_one = choice.sensors[1]
+    facts = dict(read_declaration(folder, None).facts)
+    assert f"{open_one.name} (3 of 3 open)" in facts["Also compared"]
+    row = page_content(choice, folder)["rows"][1]
+    line = in_words(reasons_of(open_one, choice.measurements))
+    (of_table,) = [line for line in as_text(choice).splitlines() if line.startswith(open_one.name)]
+    for words in (row["fits"], line, of_table):
+        assert "open" in words and "0 of" not in words
 
 
 def test_views_are_raced_for_the_measurements_that_are_possible():
