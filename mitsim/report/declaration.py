@@ -101,7 +101,7 @@ def _of_run(run: Run, geometry: SceneGeometry | None) -> Declaration:
     if document is not None:
         facts.append(("Pose of the sensor", pose_in_full(pose_of_view(run, document.view))))
         facts += _of_statement(document, "" if document.exposure else run.about.exposure_rule)
-        facts += _influences(document, "round" in run.about.lay.values())
+        facts += _influences(document, bool(run.about.lay))
         facts += _rules(
             measurement.decision.rule for measurement in document.measurements.values() if measurement.decision
         )
@@ -130,7 +130,7 @@ def _of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None, folder: P
         exposures = f"{best.capture.images} images of {times} ms each"
     if document is not None:
         facts += _of_statement(document, exposures)
-        facts += _influences(document, about is not None and "round" in about.lay.values())
+        facts += _influences(document, about is not None and bool(about.lay))
     else:
         facts.append(("Made by", "screening alone, from a performance map: no virtual measurement, no statement"))
     facts += _rules(measurement.rule for measurement in choice.measurements.values())
@@ -230,17 +230,24 @@ def _of_statement(document: StatementDocument, exposures: str) -> list[tuple[str
     ]
 
 
-def _influences(document: StatementDocument, lay_left_out: bool) -> list[tuple[str, str]]:
-    """Return the influences that are varied, fixed and left out (ISO/TS 15530-4)."""
+def _influences(document: StatementDocument, lay_open: bool) -> list[tuple[str, str]]:
+    """Return the influences that are varied, fixed and left out (ISO/TS 15530-4).
+
+    With ``lay_open``, the scene does not give the direction of the marks of a face.
+    """
     varied = [influence for influence in document.influences if influence.included]
     fixed = [influence for influence in document.influences if not influence.included and influence.simulated]
     left_out = [influence for influence in document.influences if not influence.included and not influence.simulated]
-    missing = _names(left_out) + (["direction of machining marks"] if lay_left_out else [])
+    marks = ["direction of machining marks"] * lay_open
+    missing = _names(left_out) + marks * (not document.draws_lay)
     # a map has its own finish, light and decoder; another unit has no size
     idle = {"unit", "finish", "light", "decoder"} if document.measured_by == "map" else {"unit"}
     idle |= set() if any("spray" in name for name in _names(varied)) else {"coat"}
     drawn = {group: table for group, table in document.unknowns.items() if group not in idle}
-    out = [("Varied", ", ".join(_names(varied))), ("with sizes of", unknowns_in_words(drawn))]
+    out = [
+        ("Varied", ", ".join(_names(varied) + marks * document.draws_lay)),
+        ("with sizes of", unknowns_in_words(drawn)),
+    ]
     out += [("Fixed", ", ".join(_names(fixed)))] if fixed else []
     return [*out, ("Left out", ", ".join(missing))]
 

@@ -81,6 +81,7 @@ def page_content(run: Run) -> dict[str, Any]:
         "part": Path(about.scene).stem,
         "about": about,
         "features": _by_finish(about.features),
+        "draws_lay": run.statement is not None and run.statement.draws_lay,
         "standoff": _standoffs(run),
         "views": count(scores.sizes["view"]),
         "rolls": _rolls(run),

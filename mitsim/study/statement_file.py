@@ -125,6 +125,11 @@ class StatementDocument(PartialDocument):
     exposure: ExposureEntry | None = None
     sensor: str = ""
 
+    @property
+    def draws_lay(self) -> bool:
+        """Return whether the virtual measurements draw the direction of marks that a scene does not give."""
+        return self.measured_by == "render" and self.unknowns.get("finish", {}).get("lay", 0) > 0
+
     def doubts(self, left_out: str = "") -> list[str]:
         """Return a sentence on measurements that are stated far below the accuracy of the maker, if there are any.
 

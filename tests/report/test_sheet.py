@@ -15,6 +15,7 @@ from characterisation.files.atomic_io import write_netcdf
 from characterisation.statements.statement import AT_THE_LIMIT
 from mitsim.report.choice_page import write_choice_page
 from mitsim.report.declaration import pose_in_full, read_declaration
+from mitsim.report.page import write_report
 from mitsim.report.sheet import sheet_figures, write_sheet
 from mitsim.report.sheet_layout import text_width, wrapped
 from mitsim.report.unknowns_words import unknowns_in_words
@@ -22,6 +23,7 @@ from mitsim.study.choice_document import PoseEntry
 from mitsim.study.scene_geometry import read_scene_geometry
 from mitsim.study.statement_file import read_statement
 from tests.report.choice_run import write_choice
+from tests.report.conftest import FEATURES
 
 
 def figures_of(folder):
@@ -158,6 +160,26 @@ def test_a_sheet_has_what_iso_ts_15530_4_and_jcgm_101_ask_for(run_folder, tmp_pa
     assert row.expanded == "0.50\N{NO-BREAK SPACE}mm" and row.factor == "2.00" and row.trials == "200"
     assert row.interval == "−0.52 to 0.47 mm" and row.bias == "−0.03\N{NO-BREAK SPACE}mm"
     assert re.fullmatch(r"\d{4}-\d\d-\d\d", declaration.date) and declaration.number in facts["Made with"]
+
+
+@pytest.mark.parametrize(
+    ("measured_by", "lay", "drawn"), [("render", 1.0, True), ("render", 0.0, False), ("map", 1.0, False)]
+)
+def test_a_direction_of_marks_that_is_drawn_is_not_left_out(run_folder, tmp_path, measured_by, lay, drawn):
+    """Sheet and report named it as left out beside the "lay" whose size the sheet gives as drawn."""
+    folder = shutil.copytree(run_folder, tmp_path / "run")
+    for name, more in (
+        ("run.json", {"lay": {FEATURES[0]: "round"}}),
+        ("statement.json", {"measured_by": measured_by, "unknowns": {"finish": {"lay": lay}}}),
+    ):
+        document = json.loads((folder / name).read_text(encoding="utf-8")) | more
+        (folder / name).write_text(json.dumps(document), encoding="utf-8")
+    facts = dict(read_declaration(folder, None).facts)
+    assert ("direction of machining marks" in facts["Varied"]) is drawn
+    assert ("direction of machining marks" in facts["Left out"]) is not drawn
+    page = write_report(folder).read_text(encoding="utf-8")
+    assert ("virtual measurements draw a direction" in page) is drawn
+    assert ("Prediction and virtual measurements treat the faces" in page) is not drawn
 
 
 def test_the_date_is_that_of_the_run(run_folder, tmp_path):
