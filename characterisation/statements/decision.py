@@ -58,12 +58,6 @@ from characterisation.statements.tolerance import Tolerance
 #: errors (n,) of trials, or those of a value that folds
 Errors = Floats | OneSidedErrors
 
-#: default for the largest share of the tolerance for the guard band: the 4 : 1 of ANSI/NCSL Z540.3
-GUARD_SHARE = 0.25
-
-#: default for the least test uncertainty ratio: the same 4 : 1
-UNCERTAINTY_RATIO = 4.0
-
 #: least number of trials whose order statistics give the coverage interval
 FEW = round(2 / (1 - COVERAGE)) - 1
 
@@ -216,11 +210,9 @@ def demand(errors: Errors, tolerance: Tolerance) -> float:
     """Return the demand of the rule, at most 1 where the measurement fits; see :class:`Decided`."""
     rule = tolerance.rule
     if rule.rule == "iso_14253_1":
-        return expanded_uncertainty(stated_errors(errors)) / tolerance.size / (rule.guard_share or GUARD_SHARE)
+        return expanded_uncertainty(stated_errors(errors)) / tolerance.size / rule.largest_share
     if rule.rule == "simple_acceptance":
-        return (
-            expanded_uncertainty(stated_errors(errors)) / tolerance.size * (rule.uncertainty_ratio or UNCERTAINTY_RATIO)
-        )
+        return expanded_uncertainty(stated_errors(errors)) / tolerance.size * rule.least_ratio
     assert rule.producer_risk is not None
     return global_risks(errors, tolerance, acceptance(errors, tolerance))[1] / rule.producer_risk
 

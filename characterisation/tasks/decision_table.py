@@ -27,14 +27,20 @@ _OWN = {
     "simple_acceptance": ("uncertainty_ratio",),
 }
 
+#: default for the largest share of the tolerance for the guard band: the 4 : 1 of ANSI/NCSL Z540.3
+GUARD_SHARE = 0.25
+
+#: default for the least test uncertainty ratio: the same 4 : 1
+UNCERTAINTY_RATIO = 4.0
+
 Risk = Annotated[float, Field(gt=0, lt=0.5)]
 Positive = Annotated[float, Field(gt=0)]
 
-#: description of each rule in a decision
+#: description of each rule in a decision, with the limits that it sets
 WORDS = {
-    "iso_14253_1": "ISO 14253-1, guard band of the expanded uncertainty (95 %)",
-    "jcgm_106": "JCGM 106, guard band for a stated consumer's risk",
-    "simple_acceptance": "simple acceptance, JCGM 106, 8.2",
+    "iso_14253_1": "ISO 14253-1, guard band of the expanded uncertainty (95 %), at most {share:.3g} % of the tolerance",
+    "jcgm_106": "JCGM 106, guard band, consumer's risk up to {consumer:.3g} %, producer's risk up to {producer:.3g} %",
+    "simple_acceptance": "simple acceptance, JCGM 106, 8.2, tolerance at least {ratio:g} times expanded uncertainty",
 }
 
 #: end of the description of a rule for readings from which the bias is subtracted
@@ -88,4 +94,20 @@ class Decision(Document):
     @property
     def in_words(self) -> str:
         """Return a description of the rule, which says at its end if the bias is subtracted from the readings."""
-        return WORDS[self.rule] + (BIAS_SUBTRACTED if self.subtract_bias else "")
+        words = WORDS[self.rule].format(
+            share=100 * self.largest_share,
+            ratio=self.least_ratio,
+            consumer=100 * (self.consumer_risk or 0.0),
+            producer=100 * (self.producer_risk or 0.0),
+        )
+        return words + (BIAS_SUBTRACTED if self.subtract_bias else "")
+
+    @property
+    def largest_share(self) -> float:
+        """Return the largest share of the tolerance that the guard band of ISO 14253-1 takes."""
+        return self.guard_share or GUARD_SHARE
+
+    @property
+    def least_ratio(self) -> float:
+        """Return the least ratio of the tolerance to the expanded uncertainty by simple acceptance."""
+        return self.uncertainty_ratio or UNCERTAINTY_RATIO

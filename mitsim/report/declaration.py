@@ -9,7 +9,7 @@ uncertainty u, 95 % interval, number of trials; and U and k = U / u of JCGM 100:
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,7 +20,13 @@ from characterisation.statements.statement import AT_THE_LIMIT, FAR_FROM_NOMINAL
 from mitsim.report.first_rows import ResultRow, bias_words
 from mitsim.report.first_screen import FirstScreen, of_choice, of_run
 from mitsim.report.pose_texts import angles_in_words, origin_text, pose_of_view
-from mitsim.report.statement_section import exposed_in_words, interval_words
+from mitsim.report.statement_section import (
+    calibration_in_words,
+    exposed_in_words,
+    interval_words,
+    rules_in_words,
+    stated_rules,
+)
 from mitsim.report.unknowns_words import unknowns_in_words
 from mitsim.running.numbers import NONE, count, listed, quantity, rounded, signed, two_digits
 from mitsim.study.choice_document import CHOICE, ChoiceDocument, PoseEntry, SensorEntry, best_statement, read_choice
@@ -102,9 +108,7 @@ def _of_run(run: Run, geometry: SceneGeometry | None) -> Declaration:
         facts.append(("Pose of the sensor", pose_in_full(pose_of_view(run, document.view))))
         facts += _of_statement(document, "" if document.exposure else run.about.exposure_rule)
         facts += _influences(document, bool(run.about.lay))
-        facts += _rules(
-            measurement.decision.rule for measurement in document.measurements.values() if measurement.decision
-        )
+        facts += _rules(stated_rules(document))
     digests = _digests(run.folder, ("statement.json", "task.json", "part.ply", "map.nc"))
     facts.append(("Made with", f"mitsim {run.about.mitsim}, seed {run.about.seed}; SHA-256 of {digests}"))
     date = run.about.date or _day(run.folder / "run.json")
@@ -133,7 +137,7 @@ def _of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None, folder: P
         facts += _influences(document, about is not None and bool(about.lay))
     else:
         facts.append(("Made by", "screening alone, from a performance map: no virtual measurement, no statement"))
-    facts += _rules(measurement.rule for measurement in choice.measurements.values())
+    facts += _rules({name: measurement.rule for name, measurement in choice.measurements.items()})
     facts += _others(choice, best)
     digests = _digests(folder, (CHOICE,), own, ("statement.json",))
     maps = f"; map {best.map_digest}" if best.map_digest else ""
@@ -224,7 +228,7 @@ def _of_statement(document: StatementDocument, exposures: str) -> list[tuple[str
     made = f"{count(trials)} virtual measurement{'' if trials == 1 else 's'}"
     return [
         ("Method", f"{made}, {how}: a virtual experiment, “simulate and analyse”"),
-        ("Calibration", document.calibration.split("; drift:")[0]),
+        ("Calibration", calibration_in_words(document, sizes=False)),
         ("Exposure", exposed or exposures),
         ("Verified by", VERIFIED),
     ]
@@ -256,9 +260,9 @@ def _names(influences: Sequence[InfluenceEntry]) -> list[str]:
     return [influence.name for influence in influences]
 
 
-def _rules(rules: Iterable[str]) -> list[tuple[str, str]]:
-    some = sorted({rule for rule in rules if rule})
-    return [("Decision rule", "; ".join(some))] if some else []
+def _rules(rules: Mapping[str, str]) -> list[tuple[str, str]]:
+    words = rules_in_words(rules)
+    return [("Decision rule", words)] if words else []
 
 
 def _others(choice: ChoiceDocument, best: SensorEntry) -> list[tuple[str, str]]:

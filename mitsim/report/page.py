@@ -29,7 +29,7 @@ from mitsim.report.first_rows import exact
 from mitsim.report.first_screen import of_run
 from mitsim.report.page_pictures import camera_view, cloud_picture, map_pictures, measurement_pictures
 from mitsim.report.pose_texts import expected_texts, pose_of_view, pose_texts
-from mitsim.report.statement_section import statement_section
+from mitsim.report.statement_section import rules_in_words, stated_rules, statement_section
 from mitsim.report.templates import write_page
 from mitsim.report.view_sphere import view_sphere
 from mitsim.running.numbers import NONE, count, listed, percent, quantity, rounded, two_digits
@@ -82,6 +82,7 @@ def page_content(run: Run) -> dict[str, Any]:
         "about": about,
         "features": _by_finish(about.features),
         "draws_lay": run.statement is not None and run.statement.draws_lay,
+        "rules": "" if run.statement is None else rules_in_words(stated_rules(run.statement)),
         "standoff": _standoffs(run),
         "views": count(scores.sizes["view"]),
         "rolls": _rolls(run),

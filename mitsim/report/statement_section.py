@@ -7,6 +7,7 @@ of unknowns. All bars are as long: the lines of a budget add up to the variance.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 from characterisation.plots.statements import GROUPS
@@ -31,7 +32,7 @@ def statement_section(document: StatementDocument) -> dict[str, Any]:
         "view": document.view,
         "rendered": document.measured_by == "render",
         "trials": max((measurement.trials for measurement in document.measurements.values()), default=0),
-        "calibration": _calibration(document),
+        "calibration": calibration_in_words(document),
         "exposure": exposed_in_words(document.exposure),
         "rows": rows,
         "tolerances": any(measurement.tolerance is not None for measurement in document.measurements.values()),
@@ -81,11 +82,29 @@ def statement_section(document: StatementDocument) -> dict[str, Any]:
     }
 
 
-def _calibration(document: StatementDocument) -> str:
-    """Return the calibration and its drift in words; the file has the drift by the keys of the unknowns."""
+def rules_in_words(rules: Mapping[str, str]) -> str:
+    """Return the decision rules of measurements, each with the names that it is for where there are several."""
+    by_rule = dict[str, list[str]]()
+    for name, rule in rules.items():
+        by_rule.setdefault(rule, []).append(name)
+    by_rule.pop("", None)
+    if len(by_rule) == 1:
+        return next(iter(by_rule))
+    return "; ".join(f"{listed(names)}: {rule}" for rule, names in by_rule.items())
+
+
+def stated_rules(document: StatementDocument) -> dict[str, str]:
+    """Return the decision rule of each measurement of a statement; empty without a tolerance."""
+    return {name: "" if one.decision is None else one.decision.rule for name, one in document.measurements.items()}
+
+
+def calibration_in_words(document: StatementDocument, sizes: bool = True) -> str:
+    """Return the calibration and, with ``sizes``, its drift; the file has the drift by the keys of the unknowns."""
     calibration, _, _ = document.calibration.partition("; drift:")
-    sizes = unknowns_in_words({"drift": document.unknowns.get("calibration", {})})
-    return "; ".join(filter(None, [calibration, sizes]))
+    if any(one.name.startswith("drift") and not one.included for one in document.influences):
+        return f"{calibration}; used where and just after it was calibrated: no drift"
+    drift = unknowns_in_words({"drift": document.unknowns.get("calibration", {})}) if sizes else ""
+    return "; ".join(filter(None, [calibration, drift]))
 
 
 def exposed_in_words(exposure_entry: ExposureEntry | None) -> str:

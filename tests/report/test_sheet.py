@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.files.atomic_io import write_netcdf
 from characterisation.statements.statement import AT_THE_LIMIT
+from characterisation.tasks.decision_table import Decision as TaskDecision
 from mitsim.report.choice_page import write_choice_page
 from mitsim.report.declaration import pose_in_full, read_declaration
 from mitsim.report.page import write_report
@@ -23,7 +24,7 @@ from mitsim.study.choice_document import PoseEntry
 from mitsim.study.scene_geometry import read_scene_geometry
 from mitsim.study.statement_file import read_statement
 from tests.report.choice_run import write_choice
-from tests.report.conftest import FEATURES
+from tests.report.conftest import DECISION, FEATURES
 
 
 def figures_of(folder):
@@ -180,6 +181,26 @@ def test_a_direction_of_marks_that_is_drawn_is_not_left_out(run_folder, tmp_path
     page = write_report(folder).read_text(encoding="utf-8")
     assert ("virtual measurements draw a direction" in page) is drawn
     assert ("Prediction and virtual measurements treat the faces" in page) is not drawn
+
+
+def test_a_sheet_says_which_decision_rule_holds_for_which_row_and_with_which_limits(run_folder, tmp_path):
+    """It listed the rules of all rows without a name, and without the ratio or the share that they ask for."""
+    folder = shutil.copytree(run_folder, tmp_path / "run")
+    with_rows(folder, 3)
+    strict = TaskDecision(guard_share=0.1, subtract_bias=True).in_words
+    simple = TaskDecision(rule="simple_acceptance", uncertainty_ratio=3).in_words
+    statement = json.loads((folder / "statement.json").read_text(encoding="utf-8"))
+    for name, rule in zip(statement["measurements"], (strict, simple, strict), strict=True):
+        statement["measurements"][name] = statement["measurements"][name] | {"decision": DECISION | {"rule": rule}}
+    statement["influences"] = [{"name": "drift since the calibration", "included": False, "how": "", "simulated": True}]
+    (folder / "statement.json").write_text(json.dumps(statement), encoding="utf-8")
+    facts = dict(read_declaration(folder, None).facts)
+    one, other = facts["Decision rule"].split("; ")
+    assert one.startswith("distance_0 and distance_2: ISO 14253-1") and "at most 10 % of the tolerance" in one
+    assert one.endswith("readings minus the bias")
+    assert other.startswith("distance_1: simple acceptance") and "at least 3 times" in other
+    assert facts["Calibration"].endswith("no drift")
+    assert f"{one}; {other}" in write_report(folder).read_text(encoding="utf-8")
 
 
 def test_the_date_is_that_of_the_run(run_folder, tmp_path):
