@@ -36,7 +36,7 @@ from mitsim.report.pose_texts import pose_of_view, pose_words
 from mitsim.report.set_words import with_sets
 from mitsim.report.style import Picture, as_svg
 from mitsim.running.numbers import NONE, count, how_many, or_nan, with_degree_signs
-from mitsim.study.choice_document import ChoiceDocument, SensorEntry, judged
+from mitsim.study.choice_document import TIME_OVER, ChoiceDocument, SensorEntry, judged
 from mitsim.study.choose.table import best_reasons
 from mitsim.study.remedies.entries import remedies_in_words
 from mitsim.study.run_folder import Run
@@ -259,9 +259,10 @@ def _others_fit_more(choice: ChoiceDocument, best: SensorEntry) -> Iterator[str]
     yield from choice.fit_more
     for sensor in choice.sensors:
         if best.status == "stated" and sensor.status == "screened" and sensor.expected_fits > best.fits:
+            advice = "allow more minutes" if sensor.why == TIME_OVER else f"to measure it, compare {sensor.name} alone"
             yield (
                 f"{sensor.name} was not measured ({sensor.why}), but is expected to fit {sensor.expected_fits} of "
-                f"{choice.toleranced} tolerances: allow more minutes"
+                f"{choice.toleranced} tolerances: {advice}"
             )
 
 

@@ -80,6 +80,9 @@ class CellEntry(PartialDocument):
 #: fewer is called rough; chosen
 FEW_TRIALS = 24
 
+#: reason why a sensor that may win has no virtual measurements
+TIME_OVER = "time was over"
+
 _Row = tuple[float, float, float, float]
 
 

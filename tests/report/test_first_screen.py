@@ -15,6 +15,7 @@ from mitsim.report.first_screen import FirstScreen, of_choice, of_run, sensor_ro
 from mitsim.report.page import write_report
 from mitsim.running.numbers import with_degree_signs
 from mitsim.study.choice_document import read_choice
+from mitsim.study.choose.ranking import OUT_BY_FAR
 from mitsim.study.run_folder import read_run
 from mitsim.study.scene_geometry import read_scene_geometry
 from tests.plain_pages import without_pictures
@@ -249,7 +250,11 @@ def test_a_sensor_that_was_not_measured_and_may_fit_more_is_named(tmp_path):
         cell |= {"demand": 0.5, "accepted": None}
     (folder / "choice.json").write_text(json.dumps(document), encoding="utf-8")
     choice = read_choice(folder)
+    best_one, left_out = choice.sensors[0], choice.sensors[1].model_copy(update={"why": OUT_BY_FAR})
     (words,) = of_choice(choice, None).doubts
     assert words.startswith("sensor-c was not measured (time was over), but is expected to fit 3 of 3 tolerances")
+    assert words.endswith("allow more minutes")
+    (far,) = of_choice(choice.model_copy(update={"sensors": [best_one, left_out]}), None).doubts
+    assert "minutes" not in far and far.endswith("to measure it, compare sensor-c alone")
     accepted = [{row.accepted for row in sensor_rows(choice, one)} for one in choice.sensors]
     assert accepted[1] == {"–"} and "–" not in accepted[0]

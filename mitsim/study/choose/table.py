@@ -24,6 +24,7 @@ from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.sensor import Sensor
 from mitsim.study import Study
 from mitsim.study.choice_document import (
+    TIME_OVER,
     CaptureEntry,
     CellEntry,
     ChoiceDocument,
@@ -222,7 +223,7 @@ def _sensor(result: SensorResult) -> SensorEntry:
         name=result.candidate.name,
         given=result.candidate.given,
         status="stated" if result.stated else "screened",
-        why="" if result.stated else result.unpromising or "time was over",
+        why="" if result.stated else result.unpromising or TIME_OVER,
         ratio=json_values(result.ratio),
         words="",
         fits=sum(cell.verdict == "fits" and cell.by == "statement" for cell in cells.values()),
