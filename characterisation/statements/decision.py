@@ -54,6 +54,7 @@ from characterisation.statements.coverage import (
 )
 from characterisation.statements.one_sided import OneSidedErrors, stated_errors, without_bias
 from characterisation.statements.tolerance import Tolerance
+from characterisation.tasks.decision_table import Decision
 
 #: errors (n,) of trials, or those of a value that folds
 Errors = Floats | OneSidedErrors
@@ -85,9 +86,9 @@ class Decided:
         JCGM 106: the producer's risk over the stated one. Simple acceptance: the required ratio over the actual one.
     verdict
         - ``fits``: the demand is met.
-        - ``does not fit``: some readings are accepted, but the demand is not met.
-        - ``undecidable``: no reading can be accepted, because the expanded uncertainty is as large as the tolerance, or
-          no value was measured.
+        - ``does not fit``: the demand is not met.
+        - ``undecidable``: no reading can be accepted, because the expanded uncertainty is as large as the tolerance,
+          also at the low end of its 95 % interval, or no value was measured.
         - ``not decided``: too few trials to decide, such as a single one with a value, or less than five without one.
     fits_corrected
         Whether it fits if the bias is subtracted.
@@ -155,7 +156,7 @@ def decide(
     if high <= 1:
         verdict = "fits"
     elif low > 1:
-        verdict = "undecidable" if limits is None else "does not fit"
+        verdict = "undecidable" if limits is None and low >= _hopeless(rule) else "does not fit"
     edges = [edge for edge in (tolerance.lower, tolerance.upper) if math.isfinite(edge)]
     if _limited_below(taken, tolerance):
         edges = [tolerance.lower]
@@ -176,6 +177,11 @@ def decide(
         1 - float(_within(tolerance.middle + _errors_at(taken, tolerance.middle), limits).mean()),
         *(risks or (None, None)),
     )
+
+
+def _hopeless(rule: Decision) -> float:
+    """Return the demand from which on no reading is accepted; of JCGM 106 it depends on the process, so 1."""
+    return {"iso_14253_1": 1 / rule.largest_share, "simple_acceptance": rule.least_ratio}.get(rule.rule, 1.0)
 
 
 def _errors_at(errors: Errors, value: float) -> Floats:

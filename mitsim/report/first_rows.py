@@ -110,7 +110,8 @@ class RowValues:
         limit = self.share_limit
         size = (self.tolerance[1] - self.tolerance[0]) / 2 if isinstance(self.tolerance, tuple) else self.tolerance
         accepted = NONE
-        if self.rule and self.stated:
+        unknown = self.verdict == "not decided" and self.demand is None  # fewer than two values: nothing is computed
+        if self.rule and self.stated and not unknown:
             accepted = accepted_words(self.accepted, self.unit, size)
             accepted += ", bias subtracted" * (self.accepted is not None and self.rule.endswith(BIAS_SUBTRACTED))
         return ResultRow(

@@ -19,7 +19,7 @@ from mitsim.study.choose.ranking import OUT_BY_FAR
 from mitsim.study.run_folder import read_run
 from mitsim.study.scene_geometry import read_scene_geometry
 from tests.plain_pages import without_pictures
-from tests.report.choice_run import write_choice
+from tests.report.choice_run import NAMES, write_choice
 from tests.report.conftest import MEASUREMENTS, write_run
 from tests.report.test_sheet import with_rows
 
@@ -256,5 +256,10 @@ def test_a_sensor_that_was_not_measured_and_may_fit_more_is_named(tmp_path):
     assert words.endswith("allow more minutes")
     (far,) = of_choice(choice.model_copy(update={"sensors": [best_one, left_out]}), None).doubts
     assert "minutes" not in far and far.endswith("to measure it, compare sensor-c alone")
+    cell = best_one.measurements[NAMES[0]].model_copy(
+        update={"verdict": "not decided", "demand": None, "accepted": None}
+    )
+    unknown = best_one.model_copy(update={"measurements": best_one.measurements | {NAMES[0]: cell}})
+    assert sensor_rows(choice, unknown)[0].accepted == "–"  # of a single value: "none", as if every part were rejected
     accepted = [{row.accepted for row in sensor_rows(choice, one)} for one in choice.sensors]
     assert accepted[1] == {"–"} and "–" not in accepted[0]

@@ -292,8 +292,8 @@ def judged(stated: Sequence[Statement]) -> list[Judged]:
 
 
 def _accepted(stated: Statement) -> str:
-    if stated.decided is None:
-        return "-"
+    if stated.decided is None or (stated.verdict == "not decided" and math.isnan(stated.decided.demand)):
+        return "-"  # no tolerance, or too few values to compute them
     if stated.decided.accepted is None:
         return "none"
     text = plain(accepted_text(*stated.decided.accepted, stated.tolerance or 1.0))

@@ -150,12 +150,22 @@ def test_a_few_trials_without_a_value_do_not_show_that_there_is_none():
 
 
 def test_where_the_uncertainty_is_as_large_as_the_tolerance_nothing_is_accepted():
-    found = decide(normal_errors(0.12), plus_minus(20.0, 0.235))
+    found = decide(normal_errors(0.12), plus_minus(20.0, 0.2))
     assert found.accepted is None and found.verdict == "undecidable"
-    assert found.needed == pytest.approx(0.03, rel=0.01)  # a quarter of the tolerance at 1.96 u
+    assert found.needed == pytest.approx(0.2 / 4 / 1.96, rel=0.01)  # a quarter of the tolerance at 1.96 u
     assert found.false_accept == 0 and found.false_reject == found.false_reject_nominal == 1
-    simple = decide(normal_errors(0.12), plus_minus(20.0, 0.235, SIMPLE))
+    simple = decide(normal_errors(0.12), plus_minus(20.0, 0.2, SIMPLE))
     assert simple.verdict == "undecidable" and simple.accepted is None
+
+
+@pytest.mark.parametrize("rule", [Decision(), SIMPLE])
+@pytest.mark.parametrize("count", [4, 10, 40])
+def test_few_trials_do_not_show_that_no_reading_can_be_accepted(rule, count):
+    """The expanded uncertainty is 0.9 of the tolerance: of 4 trials 78 % said "undecidable", of 40 trials 70 %."""
+    rng, asked = np.random.default_rng(5), plus_minus(20.0, 1.0, rule)
+    verdicts = [decide(0.9 / 1.96 * rng.standard_normal(count), asked).verdict for _ in range(200)]
+    assert verdicts.count("undecidable") <= 10  # 2.5 % of 200 are 5, with a standard deviation of 2.2
+    assert decide(normal_errors(3.0 / 1.96), asked).verdict == "undecidable"
 
 
 def test_simple_acceptance_accepts_to_the_edge_where_it_is_a_coin_toss():

@@ -32,3 +32,8 @@ def test_a_few_lost_values_are_not_none_and_many_are_not_all():
 def test_readings_that_are_accepted_after_a_correction_say_so():
     assert "69.821 to 70.179, bias subtracted" in row(5 + 0.09 * NORMAL, 0.36, subtract_bias=True)
     assert "bias subtracted" not in row(0.09 * NORMAL, 0.36)
+
+
+def test_accepted_readings_of_a_single_value_are_unknown_and_not_none():
+    assert row(np.array([0.1]), 5.0).endswith(" - not decided")
+    assert " none " in row(9 * NORMAL, 5.0)
