@@ -119,7 +119,8 @@ def _of_run(run: Run, geometry: SceneGeometry | None) -> Declaration:
 
 def _of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None, folder: Path) -> Declaration:
     document, best = best_statement(choice, folder), choice.best
-    first = of_choice(choice, geometry, document)
+    shown = _of_its_view(document, best)
+    first = of_choice(choice, geometry, shown)
     if best is None:
         title = f"No sensor measures {Path(choice.scene).stem}"
         return _declared(folder, title, _day(folder / CHOICE), first, None, [("Part", _part(choice.scene, []))])
@@ -128,6 +129,9 @@ def _of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None, folder: P
     finishes = [] if about is None else list(about.features.values())
     facts = [("Part", _part(choice.scene, finishes)), ("Sensor", best.name)]
     facts += [("Pose of the sensor", pose_in_full(pose)) for pose in best.poses[:1]]
+    for pose in best.poses[1:]:
+        names = [name for name, cell in best.measurements.items() if cell.view == pose.view]
+        facts.append(("Another pose", f"for {listed(names)}, {pose_in_full(pose)}"))
     exposures = ""
     if best.capture is not None:
         times = listed([two_digits(1e3 * exposure_s) for exposure_s in best.capture.exposures_s])
@@ -144,7 +148,16 @@ def _of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None, folder: P
     facts.append(("Made with", f"mitsim {choice.mitsim}, seed {choice.seed}; SHA-256 of {digests}{maps}"))
     title = f"{best.name} measures {Path(choice.scene).stem}"
     date = (about.date if about else "") or _day(folder / CHOICE)
-    return _declared(own, title, date, first, document, facts)
+    return _declared(own, title, date, first, shown, facts)
+
+
+def _of_its_view(document: StatementDocument | None, best: SensorEntry | None) -> StatementDocument | None:
+    """Return a statement with the measurements alone that the comparison takes from its view; others have another."""
+    if document is None or best is None:
+        return document
+    views = {name: cell.view for name, cell in best.measurements.items()}
+    own = {name: one for name, one in document.measurements.items() if views.get(name) in (None, document.view)}
+    return document.model_copy(update={"measurements": own})
 
 
 def _declared(

@@ -267,11 +267,16 @@ def _others_fit_more(choice: ChoiceDocument, best: SensorEntry) -> Iterator[str]
 
 
 def sensor_rows(choice: ChoiceDocument, sensor_entry: SensorEntry) -> list[ResultRow]:
-    """Return the rows for the measurements of one sensor; screening alone gives no readings and no losses."""
+    """Return the rows for the measurements of one sensor; screening alone gives no readings and no losses.
+
+    A row from another view than the first names it.
+    """
+    shown = [pose.view for pose in sensor_entry.poses[:1]]
     return [
         RowValues(
             name=name,
-            about=measured_words(asked.kind, asked.features),
+            about=measured_words(asked.kind, asked.features)
+            + (f", from view {cell.view}" if cell.view not in (None, *shown) else ""),
             unit=asked.unit,
             nominal=asked.nominal,
             tolerance=asked.tolerance,

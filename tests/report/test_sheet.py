@@ -228,6 +228,28 @@ def test_the_sheet_of_a_comparison_has_the_statement_of_the_best_sensor(tmp_path
     assert [text for text, box in boxes_of(figure) if box.x0 < 0.5 * figure.dpi] == []
 
 
+def test_a_row_from_another_view_has_no_numbers_of_the_stated_one(tmp_path):
+    """Its u was that of view 5, beside U, k and interval of view 3; the sheet gave the pose of view 3 alone."""
+    folder = write_choice(tmp_path / "choice")
+    made = json.loads((folder / "choice.json").read_text(encoding="utf-8"))
+    best = made["sensors"][0]
+    name = list(best["measurements"])[1]
+    best["measurements"][name] = best["measurements"][name] | {"view": 5, "uncertainty": 0.001}
+    best["poses"].append(best["poses"][0] | {"view": 5})
+    (folder / "choice.json").write_text(json.dumps(made), encoding="utf-8")
+    path = folder / best["name"] / "statement.json"
+    statement = json.loads(path.read_text(encoding="utf-8"))
+    statement["measurements"] = dict.fromkeys(best["measurements"], next(iter(statement["measurements"].values())))
+    path.write_text(json.dumps(statement), encoding="utf-8")
+    declaration = read_declaration(folder, None)
+    facts = dict(declaration.facts)
+    assert facts["Pose of the sensor"].startswith("view 3: ") and f"for {name}, view 5: " in facts["Another pose"]
+    rows = {row.result.name: row for row in declaration.rows}
+    assert rows[name].expanded == rows[name].interval == rows[name].factor == "–"
+    assert rows[name].result.about.endswith("from view 5") and "view" not in declaration.rows[0].result.about
+    assert any(row.interval != "–" for row in declaration.rows)
+
+
 def test_a_statement_far_below_the_maker_says_so_on_sheet_and_page_of_a_comparison(tmp_path):
     folder = write_choice(tmp_path / "choice")
     path = folder / "sensor-a-of-a-long-name" / "statement.json"
