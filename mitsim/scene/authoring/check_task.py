@@ -22,6 +22,7 @@ from characterisation.tasks.task_reading import misstated, read_task
 from mitsim.running.progress import say
 from mitsim.scene.authoring.face import surface_distance
 from mitsim.scene.authoring.finding import SceneFinding, Severity
+from mitsim.scene.authoring.naming import ROUND, round_angle
 from mitsim.scene.inspect import SceneFacts, ShapeFacts, shape_facts
 from mitsim.scene.load import Scene
 
@@ -189,6 +190,8 @@ def _bore(shape: ShapeFacts, feature: Feature, task: TaskFeatures) -> Iterator[S
         return
     surface = feature.nominal()
     assert isinstance(surface, Cylinder)
+    if round_angle(shape.points, surface.axis, surface.point) <= ROUND:
+        return  # a fillet, or the end of a slot
     across = shape.points - surface.point
     across -= np.outer(across @ surface.axis, surface.axis)
     if np.einsum("ij,ij->i", shape.normals, across).mean() >= 0 or any(

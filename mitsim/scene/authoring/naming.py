@@ -33,7 +33,7 @@ _ALONG = float(np.cos(np.deg2rad(0.5)))
 _CHAMFER_SHARE = 0.08
 
 #: a cylinder that spans more than this angle is a bore or a boss, else a fillet [rad]
-_ROUND = np.deg2rad(200.0)
+ROUND = np.deg2rad(200.0)
 
 #: a concave cylinder that spans more than this angle, half a turn, is the end of a slot; a fillet joins two faces [rad]
 _HALF = np.deg2rad(150.0)
@@ -145,8 +145,8 @@ def described_name(face: Face, low: Floats, high: Floats) -> str:
     if isinstance(surface, Plane):
         return _plane_name(face, surface, low, high)
     if isinstance(surface, Cylinder):
-        angle = round_angle(face, surface.axis, surface.point)
-        if angle > _ROUND:
+        angle = round_angle(face.vertices, surface.axis, surface.point)
+        if angle > ROUND:
             return f"{'boss' if face.convex else 'bore'}_{size(2 * surface.radius)}mm"
         kind = "round" if face.convex else "slot_end" if angle > _HALF else "fillet"
         return f"{kind}_r{size(surface.radius)}mm"
@@ -186,14 +186,14 @@ def _extents(face: Face) -> Floats:
     return np.asarray(np.ptp(local @ directions[:2].T, axis=0))
 
 
-def round_angle(face: Face, axis: Floats, point: Floats) -> float:
-    """Return the angle about an axis that a face spans [rad]: 2 pi less the largest gap between its vertices."""
+def round_angle(vertices: Floats, axis: Floats, point: Floats) -> float:
+    """Return the angle about an axis that a face spans [rad]: 2 pi less the largest gap between its vertices (n, 3)."""
     first = np.eye(3)[np.argmin(np.abs(axis))]
     first = first - (first @ axis) * axis
-    local = face.vertices - point
+    local = vertices - point
     angle = np.sort(np.arctan2(local @ np.cross(axis, first), local @ first))
     gaps = np.diff(np.append(angle, angle[0] + 2 * np.pi))
-    steps = len(face.vertices)
+    steps = len(vertices)
     gap = float(gaps.max())
     return 2 * np.pi if gap < max(np.deg2rad(50.0), 4 * np.pi / steps) else 2 * np.pi - gap
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import trimesh
 
 from characterisation.tasks.task_reading import read_task
-from mitsim.scene.authoring.check_task import report_geometry
+from mitsim.scene.authoring.check_task import read_features, report_geometry, task_findings
 from mitsim.scene.authoring.part_folder import Finishing, write_part
+from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
 
 RIM = '[features.rim]\nkind = "circle"\nof = ["top"]\npoint_mm = [0, 0, 5]\nradius_mm = 4\n'
@@ -67,3 +69,19 @@ def test_the_end_of_a_slot_is_on_the_edge_of_its_face(tmp_path, capsys):
     path.write_text((tmp_path / "half/task.toml").read_text() + RIM + size)
     report_geometry(read_task(path), load_scene(tmp_path / "half/half.xml", 850))
     assert "rim" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("quarters", "noted"), [(4, True), (1, False)])
+def test_a_fillet_is_no_bore(tmp_path, quarters, noted):
+    """The wall of a quarter of a washer spans 90 deg, as a fillet does: a camera sees all of it."""
+    part = trimesh.creation.annulus(4.0, 20.0, 10.0, sections=128)
+    x, y, _ = part.triangles_center.T
+    part.update_faces((x > 0) & (y > 0) if quarters == 1 else np.ones(len(x), bool))
+    part.export(tmp_path / "part.stl")
+    made = write_part(tmp_path / "part.stl", tmp_path / "part", finishing=Finishing(named="matt_white"))
+    (wall,) = [face.name for face in made.faces if face.name.startswith(("bore", "fillet"))]
+    path = tmp_path / "task.toml"
+    path.write_text((tmp_path / "part/task.toml").read_text() + SIZE.replace("bore_8mm", wall))
+    facts = inspect(load_scene(tmp_path / "part/part.xml", 850))
+    told = [one for one in task_findings(facts, read_features(path)) if "wall of this bore" in one.what]
+    assert bool(told) is noted
