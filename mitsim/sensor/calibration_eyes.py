@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from mitsim.sensor.calibration_names import USUAL_NAMES
 from mitsim.sensor.calibration_numbers import Composed, dotted, vector
 from mitsim.sensor.calibration_poses import pose_in, second_from_first
+from mitsim.sensor.lens_models import is_fisheye
 
 #: number of maps around the deepest one that is searched; chosen
 _DEEPEST = 8
@@ -47,12 +48,6 @@ _LENSES = frozenset(name.lower() for name in (*USUAL_NAMES["distortion"][0], "co
 #: single numbers of the distortion in OpenCV's order, and those of a fisheye lens
 _BENT = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "taux", "tauy")
 _FISHEYE = ("k1", "k2", "k3", "k4")
-
-#: names under which maps state the model of a lens
-LENS_MODELS = (
-    *("camera_model", "distortion_model", "distortion_type", "camera_type", "lens_model"),
-    *("model_type", "model", "type"),
-)
 
 #: a map by its dotted name
 _Named = tuple[str, dict[str, Any]]
@@ -230,12 +225,6 @@ def _matrix(name: str, table: dict[str, Any]) -> Composed | None:
     return Composed(
         np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), tuple(dotted(name, source) for source in sources), {}
     )
-
-
-def is_fisheye(table: dict[str, Any]) -> bool:
-    """Return whether a map states a fisheye lens, by any of the names of :data:`LENS_MODELS`."""
-    words = ("kannala", "fisheye", "equidistant", "kb4")
-    return any(word in str(table.get(name, "")).lower() for name in LENS_MODELS for word in words)
 
 
 def _lens(maps: list[_Named], fisheye: bool) -> Composed | None:

@@ -5,7 +5,7 @@ The numbers of a camera matrix mean nothing without these:
 - **the part of the imager** that the images show, and its binning. ROS (``sensor_msgs/CameraInfo``) states K of the
   full imager beside ``roi`` and ``binning_x``, ``binning_y``;
 - **the size of the images**, by which normalised values and values in mm are recognised;
-- **the lens model** of the distortion coefficients;
+- **the lens model** of the distortion coefficients (:mod:`mitsim.sensor.lens_models`);
 - **the unit of length** of a translation.
 """
 
@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
-from mitsim.sensor.calibration_eyes import LENS_MODELS
 from mitsim.sensor.calibration_numbers import vector
 from mitsim.sensor.camera import Camera
 
@@ -52,32 +51,6 @@ UNIT_NAMES = ("unit", "units", "length_unit", "world_units", "WorldUnits", "tran
 
 #: units of other quantities that may have the same name
 _NOT_LENGTHS = ("px", "pixel", "pixels", "deg", "degree", "degrees", "rad", "radian", "radians", "none")
-
-#: OpenCV's lens models by the names that programs give them
-_MODELS = {
-    **dict.fromkeys(
-        (
-            *(
-                "plumb_bob",
-                "radtan",
-                "radial-tangential",
-                "radialtangential",
-                "rational_polynomial",
-                "brown_conrady",
-                "none",
-            ),
-            *("pinhole", "perspective", "opencv"),
-        ),
-        "perspective",
-    ),
-    **dict.fromkeys(("equidistant", "fisheye", "opencv_fisheye", "kannala_brandt", "kannalabrandt8", "kb4"), "fisheye"),
-}
-
-#: values of other names than ``distortion_model`` that are none of OpenCV's; other texts there may name a device
-_OTHER_MODELS = ("omni", "omnidirectional", "mei", "eucm", "ds", "double_sphere", "fov", "scaramuzza", "ocam")
-
-#: models of librealsense that are OpenCV's only if all coefficients are zero
-_OF_ZEROS = ("inverse_brown_conrady", "modified_brown_conrady", "ftheta")
 
 
 @dataclass(frozen=True)
@@ -240,50 +213,6 @@ def of_images(
             f"point {matrix[0, 2]:g}, {matrix[1, 2]:g} of the full imager, {cx:g}, {cy:g} of the images"
         ),
     )
-
-
-def lens_model(
-    table: dict[str, Any], where: str | Path, model: str | None = None, straight: bool = False
-) -> str | None:
-    """Return ``perspective`` or ``fisheye`` if a table states the lens model; None if it does not.
-
-    Parameters
-    ----------
-    table
-        Table of the calibration file.
-    where
-        File that messages name.
-    model
-        Model that the sensor file gives.
-    straight
-        Whether all coefficients are zero, so that the distortion model does not matter.
-
-    Raises
-    ------
-    InputError
-        If the model is none of OpenCV's, or contradicts ``model``.
-    """
-    stated_model: str | None = None
-    for name in LENS_MODELS:
-        text = table.get(name)
-        if name == "distortion_type" and isinstance(text, int | float):
-            text = {0: "perspective", 1: "fisheye"}.get(int(text), str(text))  # MC-Calib
-        if not isinstance(text, str) or not text:
-            continue
-        word = text.lower().removeprefix("distortion.")  # as librealsense's wrappers write it
-        opencv_model = _MODELS.get(word)
-        other = word in _OTHER_MODELS or (word in _OF_ZEROS and not straight)
-        if name in ("distortion_model", "distortion_type"):
-            other = opencv_model is None and not straight
-        if other and model is None:
-            hint = 'if the coefficients are OpenCV\'s, say so in a sensor file: model = "perspective" or "fisheye"'
-            raise InputError(where, name, repr(text), f"OpenCV's models: {', '.join(_MODELS)}", hint)
-        stated_model = opencv_model or stated_model
-    if model is not None and stated_model is not None and stated_model != model:
-        raise InputError(
-            where, "model", repr(model), f"{stated_model}, which the calibration states", "leave out model"
-        )
-    return stated_model
 
 
 def unit_mm(table: dict[str, Any], where: str | Path) -> float | None:

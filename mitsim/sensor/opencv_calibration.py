@@ -28,9 +28,10 @@ from mitsim.sensor.calibration_formats import beside
 from mitsim.sensor.calibration_names import USUAL_NAMES, Names
 from mitsim.sensor.calibration_numbers import by_rows, checked_matrix, numbers_of, rotation_matrix
 from mitsim.sensor.calibration_poses import is_motion
-from mitsim.sensor.calibration_qualifiers import lens_model, of_images, read_out_of, rectified_pair, unit_mm
+from mitsim.sensor.calibration_qualifiers import of_images, read_out_of, rectified_pair, unit_mm
 from mitsim.sensor.calibration_quaternions import ORDERED
 from mitsim.sensor.calibration_tree import CalibrationTree, Found, read_tree
+from mitsim.sensor.lens_models import lens_model
 
 
 class EyeKeys(Document):

@@ -245,7 +245,7 @@ def test_groups_of_mc_calib_are_not_posed_to_one_another(tmp_path):
 
 
 def test_an_unknown_lens_of_mc_calib_is_refused(tmp_path):
-    with pytest.raises(InputError, match="distortion_type: found '2'"):
+    with pytest.raises(InputError, match="distortion_type: found 2"):
         read_calibration(mc_calib(tmp_path, 2, BENT))
 
 

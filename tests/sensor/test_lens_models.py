@@ -1,0 +1,107 @@
+"""Lens models as other programs state them, against OpenCV's projection by the coefficients of that model."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from characterisation.files.errors import InputError
+from mitsim.capture.recordings.calibration_file import read_calibration
+
+K = np.array([[600.0, 0, 322.0], [0, 602.0, 238.0], [0, 0, 1]])
+BENT = np.array([0.01, -0.005, 0.002, -0.001])  # too small to raise a doubt by themselves
+POINTS = np.random.default_rng(1).uniform([-120, -90, 400], [120, 90, 800], (50, 3))
+SIZE = (640, 480)
+
+
+def storage(path, **values):
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for name, value in values.items():
+        file.write(name, value)
+    file.release()
+    return path
+
+
+def single(path, **more):
+    camera = {"fx": 600.0, "fy": 602.0, "cx": 322.0, "cy": 238.0, "width": 640, "height": 480}
+    path.write_text(json.dumps(camera | more))
+    return path
+
+
+def is_fisheye(path):
+    seen, _ = cv2.fisheye.projectPoints(POINTS[:, None], np.zeros(3), np.zeros(3), K, BENT)
+    np.testing.assert_allclose(read_calibration(path, SIZE).rig.reference.project(POINTS), seen[:, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".yml", ".xml", ".json"])
+@pytest.mark.parametrize("fisheye", [0, 1])
+def test_opencvs_sample_marks_a_fisheye_lens(tmp_path, suffix, fisheye):
+    """Its saveCameraParams writes fisheye_model; the coefficients were those of a perspective lens, 4.6 px off."""
+    values = {"camera_matrix": K, "distortion_coefficients": BENT.reshape(4, 1)}
+    path = storage(tmp_path / f"a{suffix}", fisheye_model=fisheye, **values)
+    if fisheye:
+        is_fisheye(path)
+        return
+    seen, _ = cv2.projectPoints(POINTS, np.zeros(3), np.zeros(3), K, BENT)
+    np.testing.assert_allclose(read_calibration(path, SIZE).rig.reference.project(POINTS), seen[:, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "name", ["KannalaBrandt", "kannala_brandt4", "Kannala Brandt4", "KB8", "pinhole-equi", "equi", "opencv_fisheye"]
+)
+@pytest.mark.parametrize("key", ["camera_model", "distortion_model", "model"])
+def test_opencvs_fisheye_model_by_many_names(tmp_path, name, key):
+    bent = dict(zip(("k1", "k2", "k3", "k4"), BENT, strict=True))
+    is_fisheye(single(tmp_path / "a.json", **{key: name}, **bent))
+    is_fisheye(single(tmp_path / "b.json", **{key: name}, distortion=BENT.tolist()))
+
+
+def test_a_pinhole_with_equidistant_coefficients_is_a_fisheye_in_any_order(tmp_path):
+    is_fisheye(single(tmp_path / "a.json", type="pinhole", distortion_model="equidistant", distortion=BENT.tolist()))
+
+
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [
+        ({"camera_model": "THIN_PRISM_FISHEYE"}, "camera_model: found 'THIN_PRISM_FISHEYE'"),
+        ({"camera_model": "FISHEYE624"}, "camera_model: found 'FISHEYE624'"),
+        ({"camera_model": "RADIAL_FISHEYE"}, "camera_model: found 'RADIAL_FISHEYE'"),
+        ({"camera_type": "ucm", "alpha": 0.6}, "camera_type: found 'ucm'"),
+        ({"model_type": "double-sphere"}, "model_type: found 'double-sphere'"),
+        ({"model": "radial_division"}, "model: found 'radial_division'"),
+        ({"model": "Inverse Brown Conrady"}, "model: found 'Inverse Brown Conrady'"),
+        ({"xi": 1.2}, "xi: found 1.2"),
+    ],
+)
+def test_a_model_that_opencv_lacks_is_refused_by_any_spelling(tmp_path, more, told):
+    """Its coefficients were taken for those of a perspective lens."""
+    with pytest.raises(InputError, match=told):
+        read_calibration(single(tmp_path / "a.json", distortion=BENT.tolist(), **more), SIZE)
+
+
+def test_a_number_of_librealsense_states_the_model(tmp_path):
+    camera = {"fx": 600.0, "fy": 602.0, "ppx": 322.0, "ppy": 238.0, "width": 640, "height": 480}
+    (tmp_path / "a.json").write_text(json.dumps(camera | {"model": 2, "coeffs": [-0.1, 0.05, 0.0004, -0.0003, 0.0]}))
+    with pytest.raises(InputError, match="model: found 2"):
+        read_calibration(tmp_path / "a.json", SIZE)
+    (tmp_path / "a.json").write_text(json.dumps(camera | {"model": 2, "coeffs": [0.0] * 5}))
+    assert read_calibration(tmp_path / "a.json", SIZE).rig.reference.model == "perspective"
+
+
+def test_the_unified_model_of_two_cameras_is_refused(tmp_path):
+    """cv2.omnidir's sample of two cameras; read as perspective, points were 83 px off."""
+    bent = np.array([[-0.1, 0.05, 0.001, 0.001]])
+    first = {"camera_matrix_1": K, "distortion_coefficients_1": bent, "xi_1": 1.2}
+    second = {"camera_matrix_2": K, "distortion_coefficients_2": bent, "xi_2": 1.2}
+    pose = {"rotation": np.array([0.0, 0.1, 0.0]), "translation": np.array([-120.0, 0, 0])}
+    with pytest.raises(InputError, match=r"xi_1: found 1\.2"):
+        read_calibration(storage(tmp_path / "a.yml", **first, **second, **pose), SIZE)
+
+
+@pytest.mark.parametrize("device", ["OmniVision OV9281", "DS-2CD2143", "RealSense D435", "Basler acA1920 FOV60"])
+def test_the_name_of_a_device_is_no_model(tmp_path, device):
+    read = read_calibration(single(tmp_path / "a.json", model=device, distortion=[0.0] * 5), SIZE)
+    assert read.rig.reference.model == "perspective"
