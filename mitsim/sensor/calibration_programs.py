@@ -33,6 +33,9 @@ from mitsim.sensor.calibration_quaternions import with_rotations
 #: endings of names in MATLAB's toolbox and similar programs: one camera, the cameras of a pair, camera and projector
 _ENDINGS = ("", "_left", "_right", "_cam", "_proj", "_camera", "_projector")
 
+#: number of maps around a structure of MATLAB, beyond the first, that are searched; chosen
+_DEEPEST = 3
+
 #: fields of a message of ROS, their shapes, and the names in a calibration file of ROS
 _MESSAGE = {
     "k": ((3, 3), "camera_matrix"),
@@ -48,14 +51,37 @@ def with_usual_names(tree: dict[str, Any]) -> dict[str, Any]:
     out = _of_message(tree)
     out |= usual_values(eyes_of(out)) | _bouguet(out)
     out |= _orb_slam(out)
-    for name, holder in [("", tree), *((name, value) for name, value in tree.items() if isinstance(value, dict))]:
+    return out | _toolbox(tree, out)
+
+
+def _toolbox(tree: dict[str, Any], out: dict[str, Any]) -> dict[str, Any]:
+    """Return the values of the Computer Vision Toolbox: of the pair, or else of the camera, that a file has.
+
+    Those of several cameras are found by the name of their structure alone. ``out`` loses a K whose pixels count from
+    1, which is none of OpenCV's.
+    """
+    pairs: list[dict[str, Any]] = []
+    cameras: dict[str, dict[str, Any]] = {}
+    maps: list[tuple[str, dict[str, Any]]] = [("", tree)]
+    for name, holder in maps:  # which grows
         if isinstance(holder.get("CameraParameters1"), dict):
-            out |= _toolbox_pair(holder, name)
-        elif camera_values := _toolbox_camera(holder, name, "1", {}):
-            out |= camera_values
-            if not name:  # its pixels count from 1, so it is no K of OpenCV
-                out.pop("K", None)
-    return out
+            pairs.append(_toolbox_pair(holder, name))
+        elif values := _toolbox_camera(holder, name, "1", {}):
+            cameras[name] = values
+            continue
+        if name.count(".") < _DEEPEST:
+            maps += [(dotted(name, key), value) for key, value in holder.items() if isinstance(value, dict)]
+    if "" in cameras:
+        out.pop("K", None)
+    quantities = {"+K1": "matrix", "+D1": "distortion", "+size": "size"}
+    named = {
+        f"+{quantities[key]} of {name}": value
+        for name, values in cameras.items()
+        for key, value in values.items()
+        if name
+    }
+    alone = pairs or list(cameras.values())
+    return named | (alone[0] if len(alone) == 1 else {})
 
 
 def _of_message(tree: dict[str, Any]) -> dict[str, Any]:

@@ -284,6 +284,41 @@ def test_the_structures_of_newer_matlab(tmp_path, unit, length):
     sees(read_calibration(tmp_path / "alone.mat").rig.reference, K, D)
 
 
+def vision_camera(matrix, bent):
+    """Return the structure of a camera, whose pixels count from 1."""
+    return {
+        "K": np.add(matrix, [[0, 0, 1], [0, 0, 1], [0, 0, 0]]).tolist(),
+        "RadialDistortion": bent[[0, 1, 4]].tolist(),
+        "TangentialDistortion": bent[2:4].tolist(),
+        "ImageSize": [480, 640],
+    }
+
+
+@pytest.mark.parametrize("suffix", [".mat", ".json"])
+def test_a_pair_of_matlab_without_a_structure_around_it(tmp_path, suffix):
+    """``save('a.mat', '-struct', 's')``, or jsonencode(s): the first camera got the matrix of the second."""
+    pair = {"CameraParameters1": vision_camera(K, D), "CameraParameters2": vision_camera(K2, -D)}
+    pair |= {"PoseCamera2": {"R": R.tolist(), "Translation": T.tolist()}}
+    path = tmp_path / f"a{suffix}"
+    savemat(path, pair) if suffix == ".mat" else path.write_text(json.dumps(pair))
+    read = read_calibration(path)
+    sees(read.rig.cameras["left"], K, D)
+    sees(read.rig.cameras["right"], K2, -D, R, T)
+    assert read.notes == ()
+
+
+def test_of_several_cameras_of_matlab_none_is_taken_unasked(tmp_path):
+    """The last structure was taken, and a name of a matrix alone kept pixels that count from 1."""
+    savemat(tmp_path / "a.mat", {"unit": {"colour": vision_camera(K, D), "depth": vision_camera(K2, -D)}})
+    with pytest.raises(InputError, match=r"the file has unit\.colour\.K"):
+        read_calibration(tmp_path / "a.mat")
+    for name in ("unit.depth", "unit.depth.K"):
+        (tmp_path / "a.toml").write_text(
+            f'[calibration]\nfile = "a.mat"\nprojector = false\n[calibration.keys.camera]\nmatrix = "{name}"\n'
+        )
+        sees(read_calibration(tmp_path / "a.toml").rig.reference, K2, -D)
+
+
 # --- units and warnings
 
 
