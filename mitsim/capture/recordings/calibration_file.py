@@ -13,7 +13,8 @@ others                    YAML, XML or JSON of OpenCV, ROS, Kalibr; .mat, .npz, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from mitsim.capture.recordings.depthai_calibration import is_depthai_calibration
 from mitsim.capture.recordings.json_fields import parsed_json
 from mitsim.capture.recordings.nxlib_calibration import NxLibTree, nxlib_rig
 from mitsim.capture.recordings.recording_files import plain_name
+from mitsim.capture.recordings.stated_scale import stated_scales
 from mitsim.sensor.calibration_eyes import cameras_of
 from mitsim.sensor.calibration_qualifiers import check_camera
 from mitsim.sensor.calibration_tree import CalibrationTree, read_tree, tree_of
@@ -42,7 +44,8 @@ class Calibrated:
     """A ``rig`` read from a file, the name of its ``sensor``, and its range if the file states one.
 
     ``notes``: warnings for the user. ``nominal``: whether the cameras are those of a type of device, not of one unit.
-    ``unrelated``: whether they are several single cameras, such as those of colour and depth.
+    ``unrelated``: whether they are several single cameras, such as those of colour and depth. ``depth_scales``: numbers
+    of the file about the depth of one grey level, by name.
     """
 
     rig: Rig
@@ -51,6 +54,7 @@ class Calibrated:
     notes: tuple[str, ...] = ()
     nominal: bool = False
     unrelated: bool = False
+    depth_scales: Mapping[str, float] = field(default_factory=dict)
 
 
 class RigFile(Document):
@@ -239,11 +243,12 @@ def _of_opencv(path: Path, size: tuple[int, int] | None) -> Calibrated:
     tree = read_tree([path])
     stated = tree.values[0].get("name")
     sensor = stated if isinstance(stated, str) else ""
+    scales = dict(scale for values in tree.values for scale in stated_scales(values))
     eyes, _ = cameras_of(tree.eyes())
     if has_pair(tree) or len(eyes) < 2:
         names = ["left", "right"] if has_pair(tree) else ["camera"]
         rig, notes = _rig_of(path, tree, size, names, {})
-        return Calibrated(rig, sensor, notes=tuple(notes))
+        return Calibrated(rig, sensor, notes=tuple(notes), depth_scales=scales)
     cameras: dict[str, Camera] = {}
     told: list[str] = []
     for eye in [*eyes, *eyes]:  # only at the second time the tree knows that the others are read
@@ -252,7 +257,7 @@ def _of_opencv(path: Path, size: tuple[int, int] | None) -> Calibrated:
         if not any(_sees_alike(rig.reference, other) for other in cameras.values()):
             cameras[name if name not in cameras else plain_name(eye.name)] = rig.reference
         told = notes if eye is eyes[0] else [*told, *(note for note in notes if note not in told)]
-    return Calibrated(Rig(cameras), sensor, notes=tuple(told), unrelated=len(cameras) > 1)
+    return Calibrated(Rig(cameras), sensor, notes=tuple(told), unrelated=len(cameras) > 1, depth_scales=scales)
 
 
 def _sees_alike(camera: Camera, other: Camera) -> bool:

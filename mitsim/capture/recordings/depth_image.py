@@ -21,9 +21,10 @@ from mitsim.capture.decoding import Decoding
 from mitsim.capture.exr import EXR_MAGIC, exr_depths
 from mitsim.capture.grey_image import read_depths
 from mitsim.capture.npy import NPY_MAGIC
-from mitsim.capture.recordings.array_file import disparities, is_disparity, map_in
+from mitsim.capture.recordings.array_file import arrays_of_npz, disparities, is_disparity, map_in
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
 from mitsim.capture.recordings.cloud_numbers import FARTHEST_MM, METRES_UNDER, NEITHER_ABOVE
+from mitsim.capture.recordings.stated_scale import check_scale, stated_scales
 from mitsim.running.numbers import percent
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.png import LONGEST_SIDE_PX
@@ -80,7 +81,7 @@ def read_depth_image(
     path = Path(path)
     if is_disparity(path.stem):
         raise disparities(path)
-    image = _levels(path, frame)
+    image, beside = _levels(path, frame)
     if image.dtype == np.uint8:
         hint = "an 8-bit picture has lost its depths: save the device's 16 bits"
         raise InputError(path, "depth", "8 bits", "16 bits", hint)
@@ -106,6 +107,9 @@ def read_depth_image(
         depth = image.astype(np.float32) * np.float32(scale_mm)
     depth[missing] = np.nan
     read = read_calibration(calibration, (image.shape[1], image.shape[0]))
+    if assumed and image.dtype.kind != "f":
+        check_scale(beside, path)
+        check_scale(read.depth_scales, calibration)
     return depth_capture(depth, read, path, settings, camera=camera, sensor=sensor)
 
 
@@ -145,8 +149,11 @@ def missing_depths(image: NDArray[Any], invalid: int = 0) -> tuple[NDArray[np.bo
     return missing, warnings
 
 
-def _levels(path: Path, frame: int | None) -> NDArray[Any]:
-    """Return the numbers (H, W) of an image or a file of NumPy; integers of any size as floating point."""
+def _levels(path: Path, frame: int | None) -> tuple[NDArray[Any], dict[str, float]]:
+    """Return the numbers (H, W) of an image or a file of NumPy, and the scales that stand beside them.
+
+    Integers beyond 16 bits are floating point.
+    """
     data = read_bounded(path, "a depth image")
     of_numpy = data.startswith(NPY_MAGIC) or path.suffix.lower() == ".npz"
     if of_numpy:
@@ -155,9 +162,10 @@ def _levels(path: Path, frame: int | None) -> NDArray[Any]:
         values = exr_depths(path) if data.startswith(EXR_MAGIC) else read_depths(path)
     if values.ndim != 2 or not all(1 <= side <= LONGEST_SIDE_PX for side in values.shape):
         raise InputError(path, "shape", " x ".join(map(str, values.shape)), "depths of rows x columns")
-    if values.dtype.kind == "f" or values.dtype in (np.uint8, np.uint16):
-        return values
-    return values.astype(np.uint16) if values.min() >= 0 and values.max() < 1 << 16 else values.astype(np.float64)
+    beside = dict(stated_scales(arrays_of_npz(data, path))) if of_numpy and not data.startswith(NPY_MAGIC) else {}
+    if values.dtype.kind != "f" and values.dtype not in (np.uint8, np.uint16):
+        values = values.astype(np.uint16 if values.min() >= 0 and values.max() < 1 << 16 else np.float64)
+    return values, beside
 
 
 def depth_capture(
