@@ -6,6 +6,7 @@ requested -> grey image (H, W) of 8 or 16 bits.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -22,6 +23,9 @@ from mitsim.sensor.png import LONGEST_SIDE_PX, PNG_SIGNATURE, check_png, decode_
 
 #: suffixes of the image files that are read
 SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".pgm")
+
+#: the head of a PFM, whose last number is its scale
+_PFM = re.compile(rb"P[fF]\s+\d+\s+\d+\s+(\S{1,40})\s")
 
 Image = NDArray[np.unsignedinteger[Any]]
 
@@ -115,9 +119,24 @@ def read_depths(path: Path) -> NDArray[Any]:
         As :func:`read_grey`.
     """
     data = _bytes_of(path)
+    _check_scale(data, path)
     image = _decoded(data, path, None)
     of_depths = image.dtype.kind in "fi" and image.ndim == 2 and max(image.shape) <= LONGEST_SIDE_PX
     return image if of_depths else _checked(image, path)
+
+
+def _check_scale(data: bytes, where: str | Path) -> None:
+    """Check that a PFM has a scale of 1 or -1: OpenCV divides by another one, and most programs do not."""
+    head = _PFM.match(data)
+    if head is None:
+        return
+    try:
+        is_one = abs(float(head[1])) == 1
+    except ValueError:
+        return  # OpenCV refuses it
+    if not is_one:
+        hint = "programs differ on whether it divides the numbers: save them with a scale of -1"
+        raise InputError(where, "scale", head[1].decode("ascii", "replace"), "1 or -1 in a PFM", hint)
 
 
 def _bytes_of(path: Path) -> bytes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import cv2
@@ -181,6 +182,21 @@ def test_depths_in_images_of_floating_point_and_of_16_bits(tmp_path, name, metre
     capture = read_recording(tmp_path / name, ReadOptions(calibration=pinhole_file(tmp_path))).capture
     expected = np.where(depth > 0, depth, np.nan)
     assert np.allclose(capture.derived["depth"], expected, atol=1e-3, equal_nan=True)
+
+
+@pytest.mark.parametrize(("scale", "read"), [("-1", True), ("-1.000000", True), ("-0.003922", False), ("-2", False)])
+def test_a_scale_in_a_pfm_is_refused_since_programs_differ(tmp_path, scale, read):
+    """Middlebury writes -1/255 beside numbers that are as they are; OpenCV divides by it."""
+    depth = np.full((60, 80), 0.6, "<f4")
+    (tmp_path / "a.pfm").write_bytes(f"Pf\n80 60\n{scale}\n".encode() + depth.tobytes())
+    camera = {"fx": 80.0, "fy": 80.0, "cx": 39.5, "cy": 29.5, "width": 80, "height": 60}
+    (tmp_path / "camera.json").write_text(json.dumps(camera))
+    options = ReadOptions(calibration=str(tmp_path / "camera.json"))
+    if read:
+        assert np.allclose(read_recording(tmp_path / "a.pfm", options).capture.derived["depth"], 600)
+        return
+    with pytest.raises(InputError, match=f"scale: found {scale}; allowed: 1 or -1"):
+        read_recording(tmp_path / "a.pfm", options)
 
 
 def test_the_largest_level_is_no_depth(tmp_path):
