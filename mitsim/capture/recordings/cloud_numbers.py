@@ -40,6 +40,9 @@ _SAMPLE = 4000
 #: how often the most frequent point occurs at least, over the second most; points on a raster all repeat
 _MORE_THAN_OTHERS = 4
 
+#: ratio of a repeated depth to the median of the others from which it means no depth; chosen
+FAR_BEYOND = 10.0
+
 _STATED = re.compile(r"\bunits?\b\s*(?:\bof length\b)?[\s:=,;]*[\"'(\[]?([a-zµμ]+)")
 
 
@@ -61,28 +64,52 @@ def unit_named(word: str) -> str:
 def leave_out_marks(points: NDArray[np.floating]) -> str:
     """Set the points (n, 3) or (H, W, 3) that stand for missing ones to NaN, in place; return a note, or nothing.
 
-    These are (0, 0, 0), points without three finite numbers, and a point that is repeated as no measured one is.
+    These are (0, 0, 0), points without three finite numbers, a point that is repeated as no measured one is, and points
+    with a z so repeated that is behind the sensor or far beyond all others, as of OpenCV's ``reprojectImageTo3D``.
     """
     missing = _without_place(points)
     points[missing] = np.nan
-    indices = np.flatnonzero(~missing)
-    if len(indices) < _LEAST_REPEATS:
-        return ""
     flat = points.reshape(-1, 3)
+    for columns, what in ((slice(0, 3), "all"), (slice(2, 3), "all at z =")):
+        mark = _repeated(flat[:, columns], ~np.isnan(flat[:, 0]))
+        if mark is None:
+            continue
+        marked = (flat[:, columns] == mark).all(axis=1)
+        others = flat[~marked & ~np.isnan(flat[:, 0]), 2]
+        if len(mark) == 1 and not _is_no_depth(float(mark[0]), others):
+            continue
+        flat[marked] = np.nan
+        points[...] = flat.reshape(points.shape)
+        shown = ", ".join(f"{coordinate:g}" for coordinate in mark)
+        shown = f"({shown})" if len(mark) == 3 else shown
+        return f"{int(marked.sum())} points are {what} {shown}: left out, since measured points do not repeat"
+    return ""
+
+
+def _repeated(values: NDArray[np.floating], seen: NDArray[np.bool_]) -> NDArray[np.floating] | None:
+    """Return the row of values (n, k) that is repeated among those ``seen`` (n,) as no measured one is; else None."""
+    indices = np.flatnonzero(seen)
+    if len(indices) < _LEAST_REPEATS:
+        return None
     chosen = indices[np.linspace(0, len(indices) - 1, min(_SAMPLE, len(indices))).astype(np.intp)]
-    values, counts = np.unique(flat[chosen], axis=0, return_counts=True)
+    rows, counts = np.unique(values[chosen], axis=0, return_counts=True)
     order = np.argsort(counts)
     most, second = counts[order[-1]], counts[order[-2]] if len(counts) > 1 else counts[order[-1]]
     if most < max(_LEAST_SHARE * len(chosen), 3) or most < _MORE_THAN_OTHERS * second:
-        return ""
-    mark = values[order[-1]]
-    marked = (points == mark).all(axis=-1)
-    count = int(marked.sum())
-    if count < _LEAST_REPEATS:
-        return ""
-    points[marked] = np.nan
-    shown = ", ".join(f"{coordinate:g}" for coordinate in mark)
-    return f"{count} points are all ({shown}): left out, since measured points do not repeat"
+        return None
+    mark = rows[order[-1]]
+    return mark if (values[seen] == mark).all(axis=1).sum() >= _LEAST_REPEATS else None
+
+
+def _is_no_depth(z: float, others: NDArray[np.floating]) -> bool:
+    """Return whether a z that is repeated is none of a surface, beside the z of the ``others``.
+
+    A face of a part in the part's own frame may lie at z = 0.
+    """
+    if not len(others):
+        return False
+    behind = z < 0 < float(np.percentile(others, 1))
+    return behind or abs(z) > FAR_BEYOND * float(np.median(np.abs(others)))
 
 
 def _without_place(points: NDArray[np.floating]) -> NDArray[np.bool_]:

@@ -8,6 +8,7 @@ The image uses the camera's own pixels: if the calibration has lens distortion, 
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from mitsim.capture.grey_image import read_depths
 from mitsim.capture.npy import NPY_MAGIC
 from mitsim.capture.recordings.array_file import arrays_of_npz, disparities, is_disparity, map_in
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
-from mitsim.capture.recordings.cloud_numbers import FARTHEST_MM, METRES_UNDER, NEITHER_ABOVE
+from mitsim.capture.recordings.cloud_numbers import FAR_BEYOND, FARTHEST_MM, METRES_UNDER, NEITHER_ABOVE
 from mitsim.capture.recordings.stated_scale import check_scale, stated_scales
 from mitsim.running.numbers import percent
 from mitsim.sensor.camera import Rig
@@ -31,11 +32,11 @@ from mitsim.sensor.png import LONGEST_SIDE_PX
 
 Depth = NDArray[np.float32]
 
+#: beginning of the names of folders of disparities, such as KITTI's disp_occ_0, whose files are named by numbers alone
+_DISPARITIES = re.compile(r"disp(?:arit(?:y|ies))?s?(?![a-z])", re.IGNORECASE)
+
 #: share of the pixels with one largest depth from which it may mean no depth; chosen
 _MARKED = 0.01
-
-#: ratio of this depth to the median of the others from which it does; chosen
-_FAR_BEYOND = 10.0
 
 
 def read_depth_image(
@@ -79,7 +80,8 @@ def read_depth_image(
     depth_capture : the capture of a depth image
     """
     path = Path(path)
-    if is_disparity(path.stem):
+    of_disparities = _DISPARITIES.match(path.resolve().parent.name) and "depth" not in path.stem.lower()
+    if of_disparities or is_disparity(path.stem):
         raise disparities(path)
     image, beside = _levels(path, frame)
     if image.dtype == np.uint8:
@@ -143,7 +145,7 @@ def missing_depths(image: NDArray[Any], invalid: int = 0) -> tuple[NDArray[np.bo
         if (
             nearer_depths.size
             and same.sum() >= _MARKED * image.size
-            and float(farthest) > _FAR_BEYOND * float(np.median(nearer_depths)) > 0
+            and float(farthest) > FAR_BEYOND * float(np.median(nearer_depths)) > 0
         ):
             leave_out(same, f"the same depth of {farthest:g}, far beyond all others")
     return missing, warnings

@@ -45,6 +45,18 @@ def test_depths_of_an_unknown_quantity_are_refused(tmp_path, name, depth, messag
         assert capture.derived["depth"].max() == pytest.approx(depth[0, 0] / 100)
 
 
+def test_disparities_are_told_by_the_folder(tmp_path):
+    """KITTI's are levels of 1/256 px in files of numbers alone: a wall at 0.6 m was at 12.8 m."""
+    for name, refused in (("disp_occ_0/000000_10.png", True), ("disparity/depth_0.png", False)):
+        (tmp_path / name).parent.mkdir()
+        cv2.imwrite(str(tmp_path / name), np.full((48, 64), 12800, np.uint16))
+        if refused:
+            with pytest.raises(InputError, match="found disparities, by the name"):
+                read_depth_image(tmp_path / name, pinhole(tmp_path))
+        else:
+            assert read_depth_image(tmp_path / name, pinhole(tmp_path)).derived["depth"].max() == 12800
+
+
 def test_disparities_beside_depths_are_left_out(tmp_path):
     np.savez(tmp_path / "a.npz", disparity=np.full((48, 64), 66.0))
     with pytest.raises(InputError, match="found disparities, by the name"):
