@@ -126,6 +126,13 @@ def same_surface(first: Face, second: Face, tolerance_mm: float = TOLERANCE_MM) 
     return bool(np.abs(surface_distance(larger.surface, smaller.vertices)).max() <= tolerance_mm)
 
 
+def centred(plane: Plane, vertices: Floats, triangles: Ints) -> Plane:
+    """Return a plane with its point at the centroid of the area of its face, which every mesh of the face has alike."""
+    areas, middles = _areas(vertices, triangles), vertices[triangles].mean(axis=1)
+    middle = areas @ middles / areas.sum() if areas.any() else middles.mean(axis=0)
+    return Plane(middle - ((middle - plane.point) @ plane.normal) * plane.normal, plane.normal)
+
+
 def surface_distance(surface: Surface, points: Floats) -> Floats:
     """Return the signed distance [mm] of points (..., 3) from a surface; outside is positive."""
     if isinstance(surface, Torus):
@@ -140,6 +147,15 @@ def surface_distance(surface: Surface, points: Floats) -> Floats:
             np.linalg.norm(local - (local @ surface.axis)[..., None] * surface.axis, axis=-1) - surface.radius
         )
     return np.asarray(np.linalg.norm(points - surface.centre, axis=-1) - surface.radius)
+
+
+def mesh_distances(surface: Surface, vertices: Floats, triangles: Ints) -> tuple[float, float]:
+    """Return the largest distances [mm] of the vertices of a mesh and of its triangles' centres from a surface."""
+    at_vertices, at_middles = (
+        float(np.abs(surface_distance(surface, points)).max())
+        for points in (vertices, vertices[triangles].mean(axis=1))
+    )
+    return at_vertices, at_middles
 
 
 def outward_normals(surface: Surface, points: Floats) -> Floats:

@@ -167,7 +167,7 @@ def _plane_name(face: Face, surface: Plane, low: Floats, high: Floats) -> str:
     along = int(np.argmax(np.abs(surface.normal)))
     if abs(surface.normal[along]) >= _ALONG:
         up = bool(surface.normal[along] > 0)
-        at = float(face.vertices[:, along].mean())
+        at = float(surface.point[along])
         name = SIDES[along][up]
         if abs(at - (high if up else low)[along]) < 1e-3 * max(float(high[along] - low[along]), 1.0):
             return name

@@ -16,7 +16,6 @@ import sys
 import tempfile
 import threading
 import time
-from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,10 +28,10 @@ from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from mitsim.running.progress import say_progress
 from mitsim.scene.authoring import step_mesh, step_worker
-from mitsim.scene.authoring.face import Face, Ints, Surface, Torus, outward_normals, same_surface, surface_distance
+from mitsim.scene.authoring.face import Face, Ints, Surface, Torus, centred, mesh_distances, outward_normals
+from mitsim.scene.authoring.join_faces import join_faces
 from mitsim.scene.authoring.part21 import StepText, read_step_text
 from mitsim.scene.authoring.placements import check_placements
-from mitsim.scene.authoring.segment_mesh import components
 from mitsim.scene.authoring.units import step_units, unit_assumed, unit_words
 from mitsim.sensor.calibration_qualifiers import LENGTHS_MM
 
@@ -43,9 +42,6 @@ BEND = 0.2
 
 #: seconds between lines of progress
 _LINE_EVERY_S = 5.0
-
-#: halves of one surface agree within this [mm]; a CAD program's own tolerance is 1e-3 to 1e-5
-ONE_SURFACE_MM = 1e-3
 
 #: finest mesh [mm]; finer ones exceed every sensor, and single precision for a part of a metre
 FINEST_MM = 1e-4
@@ -137,7 +133,7 @@ def read_step(path: str | Path, fineness: Fineness = _DEFAULT, units: str | None
         vertex, triangle = vertex + points, triangle + corners
         face = _face(record, arrays["vertices"][here], arrays["normals"][here], arrays["triangles"][there])
         faces.append(replace(face, drawn_name=names.get(record["entity"], "")))
-    joined = _joined(faces)
+    joined = join_faces(faces)
     remarks = unit_remarks
     if len(joined) < len(faces):
         remarks.append(f"{len(faces)} faces in the file, {len(joined)} after those of one surface were joined")
@@ -249,7 +245,7 @@ def _names(text: StepText) -> dict[int, str]:
 
 def _face(record: dict[str, Any], vertices: Floats, normals: Floats, triangles: Ints) -> Face:
     """Make one face from the worker's data."""
-    surface = _surface(record, vertices)
+    surface = _surface(record, vertices, triangles)
     convex, deviation, sag = True, float("nan"), float("nan")
     if surface is not None:
         facing = np.einsum("ij,ij->i", outward_normals(surface, vertices), normals).sum()
@@ -257,7 +253,7 @@ def _face(record: dict[str, Any], vertices: Floats, normals: Floats, triangles: 
             surface = Plane(surface.point, surface.normal if facing > 0 else -surface.normal)
         else:
             convex = bool(facing > 0)
-        deviation, sag = _distances(surface, vertices, triangles)
+        deviation, sag = mesh_distances(surface, vertices, triangles)
     colour = record["colour"]
     return Face(
         "",
@@ -277,20 +273,14 @@ def _face(record: dict[str, Any], vertices: Floats, normals: Floats, triangles: 
     )
 
 
-def _distances(surface: Surface, vertices: Floats, triangles: Ints) -> tuple[float, float]:
-    middles = vertices[triangles].mean(axis=1)
-    at_vertices, at_middles = (float(np.abs(surface_distance(surface, points)).max()) for points in (vertices, middles))
-    return at_vertices, at_middles
-
-
-def _surface(record: dict[str, Any], vertices: Floats) -> Surface | None:
+def _surface(record: dict[str, Any], vertices: Floats, triangles: Ints) -> Surface | None:
     """Return the surface in a task's terms: points on the face's own section of an axis."""
     if record["kind"] == "freeform":
         return None
     point, axis = np.array(record["point"]), np.array(record["axis"])
     axis = axis / np.linalg.norm(axis)
     if record["kind"] == "plane":
-        return Plane(vertices.mean(axis=0) - ((vertices.mean(axis=0) - point) @ axis) * axis, axis)
+        return centred(Plane(point, axis), vertices, triangles)
     if record["kind"] == "sphere":
         return Sphere(point, record["radius"])
     if record["kind"] == "cone":
@@ -304,47 +294,3 @@ def _surface(record: dict[str, Any], vertices: Floats) -> Surface | None:
     if record["kind"] == "torus":
         return Torus(point, axis, record["radius"], record["tube"])
     return Cylinder(point + float(((vertices - point) @ axis).min()) * axis, axis, record["radius"])
-
-
-def _joined(faces: list[Face]) -> list[Face]:
-    """Join faces of one body that share an edge and lie on one surface."""
-    owners = defaultdict(list)
-    for number, face in enumerate(faces):
-        for edge in face.edges:
-            owners[face.part, face.body, edge].append(number)
-    neighbours = {(shared[0], other) for shared in owners.values() for other in shared[1:]}
-    same = [pair for pair in neighbours if same_surface(faces[pair[0]], faces[pair[1]], ONE_SURFACE_MM)]
-    groups = components(np.array(same, int).reshape(-1, 2), np.arange(len(faces)))
-    return [_as_one([faces[number] for number in group]) for group in groups]
-
-
-def _as_one(members: list[Face]) -> Face:
-    """Join the parts of one surface to one face."""
-    if len(members) == 1:
-        return members[0]
-    start = np.cumsum([0, *(len(member.vertices) for member in members)])
-    vertices = np.concatenate([member.vertices for member in members])
-    triangles = np.concatenate([member.triangles + at for member, at in zip(members, start, strict=False)])
-    surface = members[0].surface
-    assert surface is not None  # only faces with a surface are joined
-    if isinstance(surface, Cylinder):
-        along = float(((vertices - surface.point) @ surface.axis).min())
-        surface = Cylinder(surface.point + along * surface.axis, surface.axis, surface.radius)
-    elif isinstance(surface, Plane):
-        middle = vertices.mean(axis=0)
-        surface = Plane(middle - ((middle - surface.point) @ surface.normal) * surface.normal, surface.normal)
-    deviation, sag = _distances(surface, vertices, triangles)
-    normals = np.concatenate([member.normals for member in members if member.normals is not None])
-    return replace(
-        members[0],
-        vertices=vertices,
-        triangles=triangles,
-        surface=surface,
-        deviation=deviation,
-        sag=sag,
-        normals=normals,
-        entities=tuple(sorted(number for member in members for number in member.entities)),
-        colour=next((member.colour for member in members if member.colour), None),
-        drawn_name=next((member.drawn_name for member in members if member.drawn_name), ""),
-        edges=frozenset().union(*(member.edges for member in members)),
-    )
