@@ -8,7 +8,7 @@ features, else a sentence with the reason.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -125,11 +125,16 @@ class _TaskBuilder:
 
     def add(self, name: str, measurement: DrawnMeasurement) -> None:
         """Add a measurement under a unique name."""
-        base, count = name, 1
-        while name in self.task.measurements:
-            count += 1
-            name = f"{base}_{count}"
-        self.task.measurements[name] = measurement
+        self.task.measurements[_unique(name, self.task.measurements)] = measurement
+
+    def feature(self, side: Side) -> str:
+        """Return the name of the feature of a side, a face or one of the mid-planes of the task."""
+        if not side.derived:
+            return side.name
+        there = next((name for name, known in self.task.middles.items() if known.faces == side.faces), None)
+        name = there or _unique(side.name, [*self.by_name, *self.task.middles])
+        self.task.middles.setdefault(name, side)
+        return name
 
     def dimension(self, dimension: Dimension) -> None:
         """Convert a size or a location."""
@@ -223,21 +228,26 @@ class _TaskBuilder:
         datums = {letter: [self.by_name[name] for name in names] for letter, names in self.task.datums.items()}
         made = zones(geometric_tolerance, faces, datums)
         for zone in made.zones:
-            for side in (zone.of, *zone.datums):
-                if side.derived:
-                    self.task.middles[side.name] = side
-            features = (zone.of.name, *(datum.name for datum in zone.datums))
+            features = tuple(self.feature(side) for side in (zone.of, *zone.datums))
             said = (*geometric_tolerance.notes, *zone.remarks)
-            name = f"{zone.of.name}_{zone.kind}"
             self.add(
-                name,
+                f"{features[0]}_{zone.kind}",
                 DrawnMeasurement(
                     zone.kind, features, 0.0, "mm", geometric_tolerance.zone, geometric_tolerance.number, said
                 ),
             )
             told = (*(note for note in geometric_tolerance.notes if not note.startswith("zone:")), *zone.remarks)
-            self.task.in_part += [f"{described} of {zone.of.name}: {remark}" for remark in told]
+            self.task.in_part += [f"{described} of {features[0]}: {remark}" for remark in told]
         self.task.left_out += [f"{described}{f' of {name}' if name else on}: {why}" for name, why in made.left_out]
+
+
+def _unique(name: str, taken: Collection[str]) -> str:
+    """Return a name, with a number if it is taken."""
+    base, count = name, 1
+    while name in taken:
+        count += 1
+        name = f"{base}_{count}"
+    return name
 
 
 def _deviations(dimension: Dimension) -> float | tuple[float, float] | None:

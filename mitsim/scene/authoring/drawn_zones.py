@@ -23,7 +23,10 @@ _OPPOSITE = -0.9999
 
 @dataclass(frozen=True)
 class Side:
-    """A toleranced feature or a datum: a face, or the mid-plane of two sides, with its ``name`` in the task."""
+    """A toleranced feature or a datum: a face, or the mid-plane of two sides.
+
+    Mid-planes of one face with several others have the same ``name``; those in the task are unique.
+    """
 
     name: str
     surface: Plane | Cylinder | Cone | Sphere
@@ -33,6 +36,11 @@ class Side:
     def derived(self) -> bool:
         """Return whether it is a mid-plane."""
         return len(self.of) == 2
+
+    @property
+    def faces(self) -> frozenset[str]:
+        """Return the names of its faces."""
+        return frozenset(face.name for face in self.of)
 
 
 @dataclass(frozen=True)
@@ -152,7 +160,7 @@ def _oriented(tolerance: GeometricTolerance, kind: str, side: Side, datums: Sequ
         return f"its datum {'|'.join(tolerance.datums)} is not one face"
     if isinstance(datum.surface, Sphere):
         return f"its datum {datum.name} is neither a plane nor has an axis"
-    if datum.name == side.name:
+    if datum.faces == side.faces:
         return f"its datum {datum.name} is the face itself"
     more = (f"only its first datum {tolerance.datums[0]} is used",) if len(datums) > 1 else ()
     return Zone(kind, side, (datum,), more)
@@ -162,7 +170,7 @@ def _frame(tolerance: GeometricTolerance, datums: Sequence[Side | None]) -> tupl
     """Return three datums that define a frame, or the condition that is not met."""
     frame_datums = [datum for datum in datums if datum is not None]
     surfaces: list[Datum] = [datum.surface for datum in frame_datums if not isinstance(datum.surface, Sphere)]
-    if len(tolerance.datums) != 3 or len(surfaces) != 3 or len({datum.name for datum in frame_datums}) != 3:
+    if len(tolerance.datums) != 3 or len(surfaces) != 3 or len({datum.faces for datum in frame_datums}) != 3:
         return "three datums that are planes or axes"
     return frame_fault(surfaces) or tuple(frame_datums)
 

@@ -1,0 +1,39 @@
+"""Zones and dimensions of a drawing on the right features: mid-planes, axes and planes of the bracket."""
+
+import pytest
+
+from characterisation.tasks.task_reading import read_task
+from mitsim.scene.authoring.part_folder import read_part, write_part
+from mitsim.scene.authoring.read_step import step_installed
+from tests.scene.authoring.bracket import bracket, write_step
+from tests.scene.authoring.drawing import Drawing
+
+pytestmark = [
+    pytest.mark.skipif(not step_installed(), reason="OpenCASCADE, which reads STEP, is not installed"),
+    pytest.mark.usefixtures("step_here"),
+]
+
+
+@pytest.fixture
+def drawn(tmp_path):
+    """The bracket's file, its drawing without entities, and the numbers of its faces by name."""
+    path = write_step([("bracket", bracket(), None)], tmp_path / "bracket.step", "AP242DIS")
+    face = {one.name: one.entities[0] for one in read_part(path).faces}
+    return path, Drawing(path.read_text()), face
+
+
+def task_of(path, drawing):
+    path.write_text(drawing.whole())
+    write_part(path, path.parent / "made")
+    return read_task(path.parent / "made/task.toml")
+
+
+def test_mid_planes_that_share_a_face_are_different_features(drawn):
+    """The back is at y = 30 mm, the front at -30 mm, and the front of the wall at 18 mm."""
+    path, drawing, face = drawn
+    for zone, other in ((0.1, "front"), (0.2, "front_at_y18mm"), (0.3, "front")):
+        drawing.tolerance("POSITION", drawing.measure(zone), drawing.aspect(face["back"], face[other]))
+    task = task_of(path, drawing)
+    places = {one.tolerance: task.nominal(one.features[0]).point[1] for one in task.measurements.values()}
+    assert places == pytest.approx({0.1: 0.0, 0.2: 24.0, 0.3: 0.0})
+    assert sum(feature.kind == "mid_plane" for feature in task.features.values()) == 2
