@@ -27,7 +27,7 @@ const measurements = new Map(Object.entries(data.measurements));
 
 // Add a feature without a face of its own, such as the rim of a bore, to those that can be chosen.
 function addConstructed(name) {
-  const made = { name, number: faces.length, node: null, finish: '', triangles: 0, anchor: features.get(name).point_mm ?? null, size: [0, 0, 0], area: null, constructed: true };
+  const made = { name, number: faces.length, node: null, finish: '', triangles: 0, anchor: geometry(name).point_mm ?? null, size: [0, 0, 0], area: null, constructed: true };
   faces.push(made);
   return made;
 }

@@ -16,6 +16,19 @@ const onAxis = (point, normal, axis) => {
   return add(axis.point_mm, way, dot(less(point, axis.point_mm), normal) / dot(way, normal));
 };
 
+// Return the plane midway between two planes, with the normal in the sense of the first.
+function midPlane(p, q) {
+  const other = sameWay(along(p), along(q)), total = add(along(p), other), middle = add(p.point_mm, q.point_mm).map((v) => v / 2);
+  const off = dot(less(middle, p.point_mm), along(p)) + dot(less(middle, q.point_mm), other);
+  return { point_mm: add(middle, total, -off / dot(total, total)), direction: unit(total) };
+}
+
+// Return the geometry of a feature; a mid-plane has that of its two faces.
+function geometry(name) {
+  const one = features.get(name), [p, q] = (one?.of ?? []).map((parent) => features.get(parent));
+  return one?.kind === 'mid_plane' && p?.point_mm && q?.point_mm ? { ...one, ...midPlane(p, q) } : one;
+}
+
 // Return the two ends of a distance [mm].
 const ENDS = {
   plane_distance([p, q]) {
@@ -62,9 +75,9 @@ function possible(names) {
       : names.length > 4 ? null
         : orders(names).find(fits(one.kinds)) ?? (one.datums.length ? orders(names).find(fits([...one.kinds, ...one.datums])) : null);
     if (!order || (one.outline && KEYED.has(kindOf(order[0])) && !features.get(order[0]).outline_mm)) continue;
-    const value = nominal(kind, order.map((name) => features.get(name)));
+    const value = nominal(kind, order.map(geometry));
     if (value === null) continue;
-    if (!suits(kind, order.map((name) => features.get(name)))) continue;
+    if (!suits(kind, order.map(geometry))) continue;
     found.push({ kind, features: order, nominal: value, unit: one.unit });
   }
   return found;
@@ -73,10 +86,10 @@ function possible(names) {
 // Return whether a kind is meaningful for the angle between the faces; crossing planes have no distance.
 function suits(kind, [p, q]) {
   if (kind === 'coaxiality') return lineAngle(along(p), along(q)) < 1 && length(cross(less(p.point_mm, q.point_mm), along(q))) < 1;
-  if (kind === 'symmetry') return p.kind === 'mid_plane' || Math.abs(dot(less(p.point_mm, q.point_mm), along(q))) < 1;
-  if (!['plane_distance', 'axis_distance', 'parallelism', 'perpendicularity', 'angularity'].includes(kind)) return true;
-  const angle = lineAngle(along(p), along(q)), alike = (p.kind === 'plane') === (q.kind === 'plane');
+  if (!['plane_distance', 'axis_distance', 'parallelism', 'perpendicularity', 'angularity', 'symmetry'].includes(kind)) return true;
+  const angle = lineAngle(along(p), along(q)), alike = FLAT.has(p.kind) === FLAT.has(q.kind);
   const parallel = alike ? angle : 90 - angle; // a plane is parallel to an axis perpendicular to its normal
+  if (kind === 'symmetry') return parallel < 1 && Math.abs(dot(less(p.point_mm, q.point_mm), along(q))) < 1;
   return { plane_distance: angle < 1, axis_distance: angle < 45, parallelism: parallel < 1, perpendicularity: parallel > 89, angularity: parallel >= 1 && parallel <= 89 }[kind];
 }
 
@@ -89,6 +102,18 @@ function rim(names) {
   const ends = (tube.outline_mm ?? []).map((one) => Math.abs(dot(less(one, centre), along(tube))));
   if (ends.length && Math.min(...ends) > 0.05 * tube.radius_mm + 0.05) return null; // it ends elsewhere
   return { name: `${round}_rim_${plane}`.slice(0, 78), feature: { kind: 'circle', of: [plane], point_mm: centre, radius_mm: tube.radius_mm } };
+}
+
+// Return the plane midway between two nearly parallel faces, of a slot or a rib, as a feature; null if there is none.
+function midway(names) {
+  const [p, q] = names.map((name) => features.get(name));
+  if (names.length !== 2 || p?.kind !== 'plane' || q?.kind !== 'plane' || lineAngle(along(p), along(q)) > MOST_ASKEW) return null;
+  const middle = midPlane(p, q), there = [...features].find(([, one]) => one.kind === 'mid_plane' && names.every((name) => one.of.includes(name)));
+  const spread = (p.outline_mm ?? q.outline_mm)?.map((one) => add(one, middle.direction, -dot(less(one, middle.point_mm), middle.direction)).map((v) => Math.round(v * 1e4) / 1e4));
+  const base = `middle_of_${names.join('_and_')}`.slice(0, 74);
+  let name = there?.[0] ?? base, n = 1;
+  while (!there && features.has(name)) name = `${base}_${++n}`;
+  return { name, feature: { kind: 'mid_plane', of: names, ...(spread ? { outline_mm: spread } : {}) } };
 }
 
 // Return the name of the measurement of the same kind and faces, if the task has one.
@@ -109,7 +134,9 @@ function generalTolerance({ kind, nominal: value, features: names }, dimensions,
   return wide === undefined ? undefined : wide / half;
 }
 
-const KEYED = new Set(['plane', 'cylinder', 'cone']);
+const KEYED = new Set(['plane', 'cylinder', 'cone', 'mid_plane']);
+const FLAT = new Set(['plane', 'mid_plane']);
+const MOST_ASKEW = 5; // deg; a task takes planes whose normals have a sine of 0.1 or less
 
 const short = (value) => String(Math.round(value * 1e4) / 1e4);
 
@@ -139,7 +166,7 @@ function dimensionText(one) {
 
 // Return a dimension as lines in mm, with the position of its text; null without a position.
 function dimension(one) {
-  const named = one.features.map((name) => features.get(name)), shown = one.features.map((name) => faces.find((face) => face.name === name));
+  const named = one.features.map(geometry), shown = one.features.map((name) => faces.find((face) => face.name === name));
   const anchors = shown.map((face) => face?.anchor).filter(Boolean);
   if (named.every((each) => each?.point_mm) && ENDS[one.kind]) {
     const ends = ENDS[one.kind](named), leaders = shown.flatMap((face, i) => (face?.anchor && shown.length === 2 ? [[face.anchor, ends[i]]] : []));
@@ -159,7 +186,7 @@ function dimension(one) {
     const corner = add(middle, out, 0.12 * view.reach);
     return { lines: [], thin: [[corner, anchors[0]], [corner, anchors[1]]], arc: [corner, anchors[0], anchors[1]], at: corner };
   }
-  const out = feature?.kind === 'plane' ? along(feature) : unit(less(first, view.centre));
+  const out = FLAT.has(feature?.kind) ? along(feature) : unit(less(first, view.centre));
   const at = add(first, out, 0.16 * view.reach);
   return { lines: [[at, first]], thin: [], arrows: 'end', at };
 }

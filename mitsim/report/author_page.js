@@ -245,22 +245,24 @@ function facePanel() {
 }
 
 function measurePanel() {
-  const offers = possible(chosen.map((number) => faces[number].name)), panel = place('measure');
+  const names = chosen.map((number) => faces[number].name), offers = possible(names), panel = place('measure');
   if (!chosen.length) return panel.replaceChildren(element('p', { class: 'quiet' }, 'Choose one face for a size or form, two for a distance, an angle or an orientation.'));
-  const edge = rim(chosen.map((number) => faces[number].name)), rims = [];
-  if (edge) {
-    const there = faces.find((face) => face.name === edge.name);
-    rims.push(element('p', {}, button(there ? 'Choose its rim here' : 'Add its rim here', () => {
+  const constructions = [
+    ['rim', rim(names), 'its rim here', 'the circle in which the round face leaves the plane. It is seen where the wall is not.'],
+    ['midway', midway(names), 'the plane midway', 'the plane midway between both faces.'],
+  ].filter(([, made]) => made).map(([id, made, what, is]) => {
+    const there = faces.some((face) => face.name === made.name);
+    return element('p', {}, button(`${there ? 'Choose' : 'Add'} ${what}`, () => {
       if (!there) {
-        features.set(edge.name, edge.feature);
-        addConstructed(edge.name);
-        say(`Added ${edge.name}: the circle in which the round face leaves the plane. It is seen where the wall is not.`);
+        features.set(made.name, made.feature);
+        addConstructed(made.name);
+        say(`Added ${made.name}: ${is}`);
         state.dirty = true;
       }
-      choose(faces.findIndex((face) => face.name === edge.name));
-    }, { id: 'author-rim' })));
-  }
-  if (!offers.length) return panel.replaceChildren(...rims, element('p', { class: 'quiet' }, 'A task has no measurement for this choice of faces.'));
+      choose(faces.findIndex((face) => face.name === made.name));
+    }, { id: `author-${id}` }));
+  });
+  if (!offers.length) return panel.replaceChildren(...constructions, element('p', { class: 'quiet' }, 'A task has no measurement for this choice of faces.'));
   let offer = offers.find((one) => one.kind === state.kind) ?? offers[0];
   const value = element('output', { class: 'au-value' }), unit_ = element('span', {}, '');
   const tolerance = element('input', { id: 'author-tolerance', autocomplete: 'off', size: 9 });
@@ -290,7 +292,7 @@ function measurePanel() {
   shown();
   panel.replaceChildren(
     field('Kind', choice), element('p', {}, 'Nominal: ', value), element('label', { class: 'au-field' }, unit_, tolerance),
-    button('Add measurement', addIt, { id: 'author-add', class: 'au-main' }), ...rims,
+    button('Add measurement', addIt, { id: 'author-add', class: 'au-main' }), ...constructions,
   );
 }
 

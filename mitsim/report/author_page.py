@@ -33,7 +33,7 @@ from mitsim.scene.surface.metals import CONSTANTS
 from mitsim.scene.surface.processes import PROCESSES
 
 #: in the order in which they are joined to one script
-SCRIPTS = ("view_scene.js", "author_files.js", "author_geometry.js", "author_page.js")
+SCRIPTS = ("view_scene.js", "author_geometry.js", "author_files.js", "author_page.js")
 
 #: triangles of all faces together; enough for display
 MOST_TRIANGLES = 150_000

@@ -16,6 +16,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from characterisation.tasks.task_reading import read_task
 from mitsim.report.author_page import fair_share
 from mitsim.scene.authoring.read_step import step_installed
 from mitsim.study import open_study
@@ -297,6 +298,42 @@ def test_rims_tolerance_classes_and_a_coat_are_given_by_a_click(step_file, step_
     browser.tell("document.getElementById('author-spray').click()")
     assert "finish" in {one.find("ref").get("id") for one in ElementTree.fromstring(page.downloaded()[0]).iter("shape")}
     assert [one for one in browser.problems if "blob:none" not in one] == []  # downloads are caught, see Author
+
+
+@needs_step
+@pytest.mark.browser
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
+def test_the_plane_midway_between_the_sides_of_a_wall_is_measured(step_file, step_here, browser, tmp_path):
+    """The wall lies between y = 18 and 30 mm, and the base between -30 and 30 mm."""
+    made = tmp_path / "made"
+    mitsim_here("part", step_file, "-o", made)
+    mitsim_here("check", made / "made.xml", "--task", made / "task.toml", "--html", tmp_path / "page.html")
+    page = Author(browser, (tmp_path / "page.html").as_uri())
+    kinds = "[...document.getElementById('author-kind').options].map((one) => one.value)"
+    page.choose("front_at_y18mm", "top")
+    assert browser.tell("document.getElementById('author-midway')") is None
+    for sides in (("front_at_y18mm", "back"), ("back", "front_at_y18mm"), ("left", "right")):
+        page.choose(*sides)
+        browser.tell("document.getElementById('author-midway').click()")
+    wall, base = (name for name in page.faces() if "middle" in name)
+    page.choose(wall, "top")
+    assert browser.tell(kinds) == ["perpendicularity"]
+    page.measure("perpendicularity", "0.1")
+    page.choose(wall, "front")
+    assert browser.tell(kinds) == ["parallelism"]  # a plane 54 mm away is no plane of symmetry
+    page.choose(wall, base)
+    assert browser.tell(kinds) == ["perpendicularity"]
+    page.choose(wall)
+    page.measure("position", "0.2")
+    (made / "task.toml").write_text(page.downloaded()[1])
+    task = read_task(made / "task.toml")
+    assert {(one.kind, len(one.features)) for one in task.measurements.values()} == {
+        ("perpendicularity", 2),
+        ("position", 1),
+    }
+    (name,) = {one.features[0] for one in task.measurements.values()}
+    assert task.nominal(name).point[1] == 24
+    assert {place[1] for place in task.features[name].outline_mm} == {24}
 
 
 @needs_step
