@@ -55,6 +55,7 @@ from characterisation.statements.coverage import (
 from characterisation.statements.one_sided import OneSidedErrors, stated_errors, without_bias
 from characterisation.statements.tolerance import Tolerance
 from characterisation.tasks.decision_table import Decision
+from characterisation.tasks.task_file import AT_FOLD
 
 #: errors (n,) of trials, or those of a value that folds
 Errors = Floats | OneSidedErrors
@@ -191,7 +192,7 @@ def _errors_at(errors: Errors, value: float) -> Floats:
 
 def _limited_below(errors: Errors, tolerance: Tolerance) -> bool:
     """Return whether only the lower limit is one that values can exceed: those of a right angle are at most 90 deg."""
-    return isinstance(errors, OneSidedErrors) and errors.fold == 90 and tolerance.upper >= 90
+    return isinstance(errors, OneSidedErrors) and errors.fold == 90 and tolerance.upper >= 90 - AT_FOLD
 
 
 def acceptance(errors: Errors, tolerance: Tolerance) -> tuple[float, float] | None:

@@ -40,7 +40,7 @@ from characterisation.features.pose_fit import Pose
 from characterisation.features.surfaces import Cone, Cylinder, Plane, unit
 from characterisation.tasks.definitions import DEFINITIONS
 from characterisation.tasks.places import between_axes, between_planes, direction, on_axis, place
-from characterisation.tasks.task_file import LINE_ANGLES, Measurement
+from characterisation.tasks.task_file import AT_FOLD, LINE_ANGLES, Measurement
 from characterisation.tasks.zones import datum_motion, feet_on, largest_distance
 
 Array = NDArray[np.float64]
@@ -73,12 +73,12 @@ class Deviations:
 def fold_of(asked: Measurement) -> float | None:
     """Return the value at which the values of a measurement fold: 0, 90 (deg), or None for values that do not.
 
-    Zones fold at 0. Distances and angles fold at 0 if they are nominally 0 or their tolerance includes 0. Angles of
-    lines fold at 90 deg likewise.
+    Zones fold at 0. Distances and angles fold at 0 if they are nominally 0 or their tolerance includes 0, within
+    :data:`~characterisation.tasks.task_file.AT_FOLD`. Angles of lines fold at 90 deg likewise.
     """
-    if asked.zone or (asked.kind in LENGTHS and (asked.nominal == 0 or asked.one_sided)):
+    if asked.zone or (asked.kind in LENGTHS and (asked.nominal <= AT_FOLD or asked.one_sided)):
         return 0.0
-    if asked.folds_at_90 or (asked.kind in LINE_ANGLES and asked.nominal == 90):
+    if asked.folds_at_90 or (asked.kind in LINE_ANGLES and asked.nominal >= 90 - AT_FOLD):
         return 90.0
     return None
 

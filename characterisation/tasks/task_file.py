@@ -28,6 +28,10 @@ Vector = tuple[float, float, float]
 
 #: angles that fold at 90 deg
 LINE_ANGLES = ("plane_axis_angle", "axis_angle", "plane_angle")
+
+#: nominal values and limits this near to 0 or 90 deg lie there [mm or deg]; chosen: coordinates are rounded to 1e-4 mm,
+#: which turns a face of 10 mm by up to 1e-3 deg
+AT_FOLD = 1e-3
 FeatureKind = Literal["plane", "cylinder", "sphere", "cone", "circle", "edge_point", "intersection", "mid_plane"]
 Nominal = Surface | Circle | EdgePoint | Point
 
@@ -190,7 +194,7 @@ class Measurement(Document):
     @property
     def folds_at_90(self) -> bool:
         """Return whether the upper limit has no effect, since the angle of the lines is at most 90 deg."""
-        return self.kind in LINE_ANGLES and self.tolerance is not None and self.limits[1] >= 90
+        return self.kind in LINE_ANGLES and self.tolerance is not None and self.limits[1] >= 90 - AT_FOLD
 
     @property
     def one_sided(self) -> bool:
@@ -216,7 +220,7 @@ def effective_deviations(
     if tolerance is None:
         return None
     lower, upper = tolerance if isinstance(tolerance, tuple) else (-tolerance, tolerance)
-    return (lower if nominal + lower > 0 else None), upper
+    return (lower if nominal + lower > AT_FOLD else None), upper
 
 
 def tolerance_size(kind: str, nominal: float, tolerance: float | tuple[float, float] | None) -> float | None:
@@ -228,9 +232,10 @@ def tolerance_size(kind: str, nominal: float, tolerance: float | tuple[float, fl
         return None
     lower, upper = tolerance if isinstance(tolerance, tuple) else (-tolerance, tolerance)
     lowest, highest = nominal + lower, nominal + upper
-    if lowest <= 0 < highest:
+    if lowest <= AT_FOLD < highest:
         return highest
-    return 90.0 - lowest if kind in LINE_ANGLES and lowest < 90 <= highest else (upper - lower) / 2
+    folds = kind in LINE_ANGLES and lowest < 90 - AT_FOLD <= highest
+    return 90.0 - lowest if folds else (upper - lower) / 2
 
 
 class Task(Document):

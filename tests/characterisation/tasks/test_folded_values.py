@@ -124,6 +124,33 @@ def measured(some, name, rng, scale=1.0):
     return model.value(*moved), model.deviations(*moved)
 
 
+@pytest.mark.parametrize(
+    ("nominal", "more", "size"),
+    [
+        (89.99999, {}, None),
+        (89.99999, {"tolerance": 0.1}, 0.1),
+        (89.95, {"tolerance": (-0.1, 0.04999999)}, 0.15),
+        (90 + 4e-6, {"tolerance": (-0.1, -2e-6)}, 0.1),
+    ],
+)
+def test_an_angle_that_rounding_moved_from_90_deg_folds_there(nominal, more, size):
+    """No measured angle of lines exceeds 90 deg, however the model was rounded."""
+    some = task({"corner": RIGHT["corner"]}, nominal, **more)
+    folded = folded_value(some, "corner")
+    assert folded is not None and folded.fold == 90
+    assert some.measurements["corner"].tolerance_size == (size if size is None else pytest.approx(size, abs=1e-4))
+    assert folded.limit == (size if size is None else pytest.approx(size, abs=1e-4))
+    rng = np.random.default_rng(5)
+    assert max(folded.value(rng.normal(0, 0.01, (1000, 1, 1)))) <= 90
+
+
+@pytest.mark.parametrize(("nominal", "tolerance"), [(1e-6, None), (0.1 + 0.2, (-0.3, 0.3))])
+def test_a_distance_that_rounding_moved_from_0_folds_there(nominal, tolerance):
+    some = task({"axes": CASES["axes"]}, nominal, tolerance=tolerance)
+    assert folded_value(some, "axes").fold == 0
+    assert some.measurements["axes"].one_sided == (tolerance is not None)
+
+
 @pytest.mark.parametrize("name", [*CASES, *RIGHT])
 def test_a_value_is_the_size_of_its_deviations(name):
     right = name in RIGHT
