@@ -16,6 +16,7 @@ import numpy as np
 
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
 from characterisation.tasks.definitions import (
+    axis_angle,
     axis_distance,
     plane_angle,
     plane_axis_angle,
@@ -171,14 +172,11 @@ class _TaskBuilder:
         if not made:
             return left_out("a task has no such measurement between such faces")
         for name, kind, members, model in made:
-            nominal = dimension.nominal
-            allowed = tolerance
-            if (
-                dimension.angular and kind != "cone_angle" and nominal > 90
-            ):  # a task has angles between lines, 0 to 90 deg
-                nominal = 180.0 - nominal
-                allowed = (-tolerance[1], -tolerance[0]) if isinstance(tolerance, tuple) else tolerance
-            said = list(remarks)
+            nominal, allowed, said = dimension.nominal, tolerance, list(remarks)
+            if dimension.angular and kind != "cone_angle" and nominal > 90:  # a task has lines' angles, 0 to 90 deg
+                nominal, allowed = 180.0 - nominal, _turned(allowed)
+            if kind == "plane_axis_angle":  # the drawing's angle is that of the face, the task's that of its normal
+                nominal, allowed = 90.0 - nominal, _turned(allowed)
             if abs(nominal - model) > _AGREE:
                 said.append(f"the drawing states {nominal:g}, the model has {model:.6g}")
                 nominal, allowed = _about(model, nominal, allowed)
@@ -261,6 +259,11 @@ def _deviations(dimension: Dimension) -> float | tuple[float, float] | None:
     return (high - low) / 2 if alike else (low, high)
 
 
+def _turned(allowed: float | tuple[float, float] | None) -> float | tuple[float, float] | None:
+    """Return a tolerance of the supplementary or the complementary angle."""
+    return (-allowed[1], -allowed[0]) if isinstance(allowed, tuple) else allowed
+
+
 def _about(
     model: float, nominal: float, allowed: float | tuple[float, float] | None
 ) -> tuple[float, float | tuple[float, float] | None]:
@@ -295,6 +298,8 @@ def _between(first: Face, second: Face, angular: bool) -> tuple[str, float]:
             surface, other = other, surface
         if isinstance(surface, Plane) and isinstance(other, Cylinder | Cone):
             return "plane_axis_angle", float(np.rad2deg(plane_axis_angle(surface, other)))
+        if isinstance(surface, Cylinder | Cone) and isinstance(other, Cylinder | Cone):
+            return "axis_angle", float(np.rad2deg(axis_angle(surface, other)))
         return "", 0.0
     if isinstance(surface, Plane) and isinstance(other, Plane) and abs(float(surface.normal @ other.normal)) > 0.9999:
         return "plane_distance", plane_distance(surface, other, nominal=(surface, other))

@@ -1,8 +1,10 @@
 """Zones and dimensions of a drawing on the right features: mid-planes, axes and planes of the bracket."""
 
+import math
+
 import pytest
 
-from characterisation.tasks.task_reading import read_task
+from characterisation.tasks.task_reading import check_nominal_values, read_task
 from mitsim.scene.authoring.part_folder import read_part, write_part
 from mitsim.scene.authoring.read_step import step_installed
 from tests.scene.authoring.bracket import bracket, write_step
@@ -37,3 +39,33 @@ def test_mid_planes_that_share_a_face_are_different_features(drawn):
     places = {one.tolerance: task.nominal(one.features[0]).point[1] for one in task.measurements.values()}
     assert places == pytest.approx({0.1: 0.0, 0.2: 24.0, 0.3: 0.0})
     assert sum(feature.kind == "mid_plane" for feature in task.features.values()) == 2
+
+
+def test_an_angle_of_a_face_and_an_axis_is_that_of_the_face_not_of_its_normal(drawn):
+    """Drawings state 90 deg for a face across a bore; a task has the angle of its normal, 0 deg."""
+    path, drawing, face = drawn
+    mm = drawing.measure
+    for name, value, low, high in (
+        ("top_at_z12mm", 90.0, -0.5, 0.5),
+        ("left", 0.0, -0.4, 0.4),
+        ("chamfer_45deg", 45.0, -0.1, 0.3),
+        ("front_at_y18mm", 180.0, -0.2, 0.2),
+    ):
+        ends = (drawing.aspect(face[name]), drawing.aspect(face["bore_12mm_left"]))
+        made = drawing.add(f"ANGULAR_LOCATION('angle',$,#{ends[0]},#{ends[1]},.SMALL.)")
+        nominal, lower, upper = (mm(math.radians(one), "nominal value", angle=True) for one in (value, low, high))
+        drawing.values(made, nominal)
+        drawing.plus_minus(made, lower, upper)
+    axes = (drawing.aspect(face["bore_12mm_left"]), drawing.aspect(face["bore_12mm_right"]))
+    made = drawing.add(f"ANGULAR_LOCATION('angle',$,#{axes[0]},#{axes[1]},.SMALL.)")
+    drawing.values(made, mm(0.0, "nominal value", angle=True))
+    task = task_of(path, drawing)
+    check_nominal_values(task, "task.toml")
+    found = {one.features[0]: (one.kind, one.nominal, one.deviations) for one in task.measurements.values()}
+    assert found == {
+        "top_at_z12mm": ("plane_axis_angle", 0, pytest.approx((-0.5, 0.5))),
+        "left": ("plane_axis_angle", 90, pytest.approx((-0.4, 0.4))),
+        "chamfer_45deg": ("plane_axis_angle", 45, pytest.approx((-0.3, 0.1))),
+        "front_at_y18mm": ("plane_axis_angle", 90, pytest.approx((-0.2, 0.2))),
+        "bore_12mm_left": ("axis_angle", 0, None),
+    }
