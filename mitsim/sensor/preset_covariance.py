@@ -29,4 +29,4 @@ def preset_covariance(sensor: Sensor, drift: Drift | None = None) -> RigCovarian
             "sensor", "name", repr(sensor.name), f"a sensor that comes calibrated: {', '.join(names)}", hint
         )
     covariance = read_rig_covariance(path, sensor.rig)
-    return with_drift(covariance, sensor.rig, Drift() if drift is None else drift)
+    return with_drift(covariance, sensor, Drift() if drift is None else drift)

@@ -143,6 +143,19 @@ class Sensor:
         return replace(self.rig, cameras=cameras)
 
     @property
+    def measuring_eyes(self) -> dict[str, Camera]:
+        """Return the cameras that measure, reference first, and as ``projector`` the projector if the decoder uses it.
+
+        A calibration estimates these.
+        """
+        rig = self.measuring_rig
+        seen = dict(rig.cameras)
+        if len(seen) == 1 and self.technology in ("structured_light", "reference_stereo"):
+            assert rig.projector is not None
+            seen["projector"] = rig.projector
+        return seen
+
+    @property
     def true_rig(self) -> Rig:
         """Return the true rig; ``rig`` is the calibrated one, which the decoder uses."""
         return self.misaligned(self.rig)

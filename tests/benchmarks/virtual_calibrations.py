@@ -22,7 +22,6 @@ from mitsim.study.calibration.virtual_calibration import (
     _with_path,
     board_views,
     calibrate,
-    calibrated_eyes,
     sensor_drift,
 )
 
@@ -85,7 +84,7 @@ def tell_causes(names: list[str]) -> None:
 def causes(name: str) -> list[float]:
     """Return the relative error of a ball bar by each cause, root mean square over the bars of VDI/VDE 2634-2."""
     sensor = load_sensor(name)
-    eyes = calibrated_eyes(sensor)
+    eyes = sensor.measuring_eyes
     board = default_board(sensor.rig.reference, float(np.sqrt(np.prod(sensor.working_range_mm))))
     views = board_views(sensor, eyes, board, POSES, 1)
     linear = linearise(sensor.measuring_rig, eyes, board, views)
@@ -105,7 +104,7 @@ def causes(name: str) -> list[float]:
     drift = sensor_drift(sensor)
     for terms in DRIFTS.values():
         alone = replace(Drift.none(), **{term: getattr(drift, term) for term in terms})
-        covariances.append(with_drift(nothing, sensor.rig, alone))
+        covariances.append(with_drift(nothing, sensor, alone))
     bars = measuring_volume(eyes, sensor.working_range_mm).points(_BARS)
     lengths = np.linalg.norm(bars[:, 1] - bars[:, 0], axis=1)
 

@@ -60,7 +60,7 @@ def main(arguments: list[str]) -> None:
         sys.exit(f"{sensor.name} has no [published_lengths]")
     alone = preset_covariance(sensor, Drift.none())
     for vergence in given.vergence or [own.vergence_mrad]:
-        covariance = with_drift(alone, sensor.rig, replace(own, vergence_mrad=vergence))
+        covariance = with_drift(alone, sensor, replace(own, vergence_mrad=vergence))
         ratios = []
         print(f"\nvergence {vergence:g} mrad")
         print(f"| distance [mm] | maker, {100 * curve.share:.0f} % within | the same, stated |\n|---|---|---|")

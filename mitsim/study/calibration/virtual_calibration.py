@@ -55,16 +55,6 @@ class VirtualCalibration:
     accuracy_drifted: Accuracy
 
 
-def calibrated_eyes(sensor: Sensor) -> dict[str, Camera]:
-    """Return the cameras, and as ``projector`` the projector if the decoder uses it, reference camera first."""
-    rig = sensor.measuring_rig
-    seen = dict(rig.cameras)
-    if len(seen) == 1 and sensor.technology in ("structured_light", "reference_stereo"):
-        assert rig.projector is not None
-        seen["projector"] = rig.projector
-    return seen
-
-
 def sensor_drift(sensor: Sensor) -> Drift:
     """Return the drift by a sensor's own file, and by the default change of its temperature."""
     return replace(sensor.unknowns.calibration.drift(), temperature_k=Drift.temperature_k)
@@ -95,7 +85,7 @@ def calibrate(
     """
     if not 6 <= poses <= 300:
         raise InputError("--poses", "", poses, "6 to 300")
-    eyes = calibrated_eyes(sensor)
+    eyes = sensor.measuring_eyes
     middle = float(np.sqrt(np.prod(sensor.working_range_mm)))
     board = board or default_board(sensor.rig.reference, middle)
     views = board_views(sensor, eyes, board, poses, seed)
@@ -107,7 +97,7 @@ def calibrate(
     drift = drift or sensor_drift(sensor)
     rng = np.random.default_rng(seed)
     alone = accuracy(sensor, eyes, covariance, _DRAWS, rng)
-    drifted = accuracy(sensor, eyes, with_drift(covariance, sensor.rig, drift), _DRAWS, rng)
+    drifted = accuracy(sensor, eyes, with_drift(covariance, sensor, drift), _DRAWS, rng)
     numbers = {f"calibration_{key}": value for key, value in alone.numbers().items()}
     numbers |= {f"with_drift_{key}": value for key, value in drifted.numbers().items() if key not in ("middle_mm",)}
     numbers |= {f"drift_{key}": value for key, value in drift.numbers().items()}

@@ -89,14 +89,14 @@ def calibration_covariance(sensor: Sensor, table: CalibrationUnknowns, folder: P
 
 def _unscaled_covariance(sensor: Sensor, table: CalibrationUnknowns, folder: Path) -> RigCovariance:
     if table.covariance is not None:
-        return with_drift(read_rig_covariance(folder / table.covariance, sensor.rig), sensor.rig, table.drift())
+        return with_drift(read_rig_covariance(folder / table.covariance, sensor.rig), sensor, table.drift())
     if sensor.name in presets():
         try:
             return preset_covariance(sensor, table.drift())
         except InputError:
             pass  # a user's sensor with the name of a preset, but another rig
     say(f"{sensor.name}: no covariance of its calibration is given; it is simulated (see mitsim calibrate)")
-    return with_drift(calibrate(sensor, drift=Drift.none()).covariance, sensor.rig, table.drift())
+    return with_drift(calibrate(sensor, drift=Drift.none()).covariance, sensor, table.drift())
 
 
 def _expansion(study: Study) -> float:

@@ -11,16 +11,18 @@ from mitsim.decoding.structured_light.newton_polynomial import evaluate
 from mitsim.sensor.drift import SOURCES, Drift, drift_modes, with_drift
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.rig_covariance import RigCovariance
-from mitsim.sensor.rig_parameters import moved, parameter_names
+from mitsim.sensor.rig_parameters import moved, parameter_names, parameter_values
+from mitsim.sensor.unknowns import CalibrationUnknowns
 from mitsim.study.calibration import virtual_calibration
 from mitsim.study.calibration.accuracy import accuracy, measured_points, measuring_volume
 from mitsim.study.calibration.board import seen_by_all
-from mitsim.study.calibration.virtual_calibration import calibrate, calibrated_eyes
+from mitsim.study.calibration.virtual_calibration import calibrate
+from mitsim.study.virtual.study_unknowns import calibration_covariance
 from tests.smaller_sensors import binned
 
 
 def some_points(sensor, rng, count=200):
-    volume = measuring_volume(calibrated_eyes(sensor), sensor.working_range_mm)
+    volume = measuring_volume(sensor.measuring_eyes, sensor.working_range_mm)
     return volume.points(rng.uniform(-0.9, 0.9, (count, 3)))
 
 
@@ -28,7 +30,7 @@ def some_points(sensor, rng, count=200):
 def test_the_nominal_rig_measures_what_is_there(name, rng):
     sensor = load_sensor(name)
     points = some_points(sensor, rng)
-    assert seen_by_all(points, calibrated_eyes(sensor)).all()
+    assert seen_by_all(points, sensor.measuring_eyes).all()
     assert np.abs(measured_points(sensor, points, sensor.rig) - points).max() < 2e-3  # rectification's own rays
 
 
@@ -45,7 +47,7 @@ def test_vergence_moves_depth_by_the_law_of_stereo(rng):
 
 
 def test_baseline_error_scales_all_lengths(n10, rng):
-    eyes = calibrated_eyes(n10)
+    eyes = n10.measuring_eyes
     place = n10.rig.cameras["right"].centre
     names = tuple(f"right.position_{axis}_mm" for axis in "xyz")
     scale = 1e-3
@@ -65,7 +67,7 @@ def test_a_code_is_triangulated_as_the_decoder_does(rng):
     rows, columns = rng.integers(100, 300, 50), rng.integers(170, 460, 50)
     rays = camera.rays(np.stack([columns, rows], axis=-1).astype(float))
     points = rays / rays[:, 2:] * rng.uniform(400, 600, (50, 1))
-    points = points[seen_by_all(points, calibrated_eyes(sensor))]
+    points = points[seen_by_all(points, sensor.measuring_eyes)]
     kept = np.rint(camera.project(points)).astype(int)
     u = true.projector.project(points)[:, 0]
     inverse, _ = evaluate(*(each[:, kept[:, 1], kept[:, 0]] for each in (geometry.nodes, geometry.differences)), u)
@@ -111,8 +113,8 @@ def test_a_row_error_moves_rows_by_the_focal_length_and_no_depth(n10):
 def test_drift_adds_to_a_covariance(n10):
     names = parameter_names(n10.rig, projector=False)
     nothing = RigCovariance(names, np.zeros((len(names),) * 2), "one-sigma figures")
-    assert not with_drift(nothing, n10.rig, Drift.none()).covariance.any()
-    found = with_drift(nothing, n10.rig, Drift(vergence_mrad=0.3, row_mrad=0.0, roll_mrad=0.2, focal_relative=1e-3))
+    assert not with_drift(nothing, n10, Drift.none()).covariance.any()
+    found = with_drift(nothing, n10, Drift(vergence_mrad=0.3, row_mrad=0.0, roll_mrad=0.2, focal_relative=1e-3))
     sigma = dict(zip(names, found.one_sigma, strict=True))
     assert sigma["right.rotation_y_rad"] == pytest.approx(3e-4, rel=0.01)
     assert sigma["right.rotation_z_rad"] == pytest.approx(2e-4)
@@ -122,6 +124,25 @@ def test_drift_adds_to_a_covariance(n10):
     assert set(SOURCES) == set(Drift().numbers())
     with pytest.raises(InputError, match=r"drift: roll_mrad.*0 or more"):
         Drift(roll_mrad=-1)
+
+
+def test_parameters_that_a_covariance_does_not_name_drift_all_the_same(n10, tmp_path):
+    def one_sigma(sensor, parameter):
+        (nominal,) = parameter_values(sensor.rig, [parameter])
+        file = f'source = "own"\n[one_sigma]\n"{parameter}" = 0.0\n[nominal]\n"{parameter}" = {nominal}\n'
+        (tmp_path / "own.toml").write_text(file)
+        table = CalibrationUnknowns(covariance="own.toml", row_mrad=0, roll_mrad=0, focal_relative=0)
+        return calibration_covariance(sensor, table, tmp_path)
+
+    turning = one_sigma(n10, "right.position_x_mm")
+    ends = np.array([[-50.0, 0, 600], [150, 0, 600]])
+    step = dict(zip(turning.names, turning.one_sigma, strict=True))
+    (first, second) = measured_points(n10, ends, moved(n10.rig, list(step), list(step.values())))
+    # an angle e between the eyes moves a depth z by z^2 e / b, and a length by z e / b of it
+    expected = 200 * 600 * 0.24e-3 / 100.775
+    assert abs(np.linalg.norm(second - first) - 200) == pytest.approx(expected, rel=0.05)
+    later = one_sigma(load_sensor("kinect-v2"), "path.scale")
+    assert later.one_sigma[later.names.index("path.offset_mm")] == pytest.approx(1.0)
 
 
 def test_the_same_seed_gives_the_same_calibration(monkeypatch):

@@ -14,14 +14,14 @@ from mitsim.sensor.rig_parameters import moved, parameter_differences, parameter
 from mitsim.study.calibration.board import TILTS_DEG, Board, board_poses, default_board, parse_board, seen_by_all
 from mitsim.study.calibration.bundle import BoardView, Linearised, linearise, view_jacobian
 from mitsim.study.calibration.simulated import coverage, estimate, simulate_corners
-from mitsim.study.calibration.virtual_calibration import _with_path, calibrated_eyes
+from mitsim.study.calibration.virtual_calibration import _with_path
 
 BOARD = Board(8, 6, 40.0, "glass")
 
 
 def setting(name, poses=10, board=BOARD, camera_px=0.05, coordinate_px=0.02):
     sensor = load_sensor(name)
-    eyes = calibrated_eyes(sensor)
+    eyes = sensor.measuring_eyes
     views = [
         BoardView(place, corners, camera_px, coordinate_px)
         for place, corners in board_poses(board, eyes, sensor.working_range_mm, poses)
@@ -32,7 +32,7 @@ def setting(name, poses=10, board=BOARD, camera_px=0.05, coordinate_px=0.02):
 @pytest.mark.parametrize("poses", [7, 14, 20, 35])
 def test_every_pose_has_a_distance_of_its_own(poses):
     sensor = load_sensor("ensenso-n10")
-    eyes = calibrated_eyes(sensor)
+    eyes = sensor.measuring_eyes
     board = default_board(sensor.rig.reference, np.sqrt(np.prod(sensor.working_range_mm)))
     shown = board_poses(board, eyes, sensor.working_range_mm, poses)
     assert len({round(float(np.linalg.norm(place.translation))) for place, _ in shown}) > 0.8 * len(shown)
@@ -45,7 +45,7 @@ def only_noise(found):
 @pytest.mark.parametrize("name", presets())
 def test_every_sensor_sees_its_board_over_range_and_field(name):
     sensor = load_sensor(name)
-    eyes, (near, far) = calibrated_eyes(sensor), sensor.working_range_mm
+    eyes, (near, far) = sensor.measuring_eyes, sensor.working_range_mm
     board = default_board(sensor.rig.reference, np.sqrt(near * far))
     poses = board_poses(board, eyes, (near, far), 20)
     assert len(poses) >= 18
@@ -80,7 +80,7 @@ def test_boards_are_read_from_a_command_line():
 def test_a_board_that_is_too_large_is_refused():
     sensor = load_sensor("photoneo-phoxi-s")
     with pytest.raises(InputError, match=r"of 12 poses.*smaller board"):
-        board_poses(Board(11, 8, 200.0, "glass"), calibrated_eyes(sensor), sensor.working_range_mm, 12)
+        board_poses(Board(11, 8, 200.0, "glass"), sensor.measuring_eyes, sensor.working_range_mm, 12)
 
 
 @pytest.mark.parametrize("name", ["ensenso-n10", "ensenso-n35", "david-sls-3"])

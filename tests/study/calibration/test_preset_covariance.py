@@ -18,7 +18,7 @@ from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_covariance import read_rig_covariance
 from mitsim.sensor.rig_parameters import moved
 from mitsim.study.calibration import virtual_calibration
-from mitsim.study.calibration.virtual_calibration import calibrate, calibrated_eyes
+from mitsim.study.calibration.virtual_calibration import calibrate
 
 FOLDER = Path(mitsim.sensor.__file__).parent / "presets" / "calibrations"
 
@@ -27,7 +27,7 @@ FOLDER = Path(mitsim.sensor.__file__).parent / "presets" / "calibrations"
 def test_every_preset_comes_calibrated(name, rng):
     sensor = load_sensor(name)
     alone, drifted = preset_covariance(sensor, Drift.none()), preset_covariance(sensor)
-    assert {each.rpartition(".")[0] for each in alone.names} - {"path"} == set(calibrated_eyes(sensor))
+    assert {each.rpartition(".")[0] for each in alone.names} - {"path"} == set(sensor.measuring_eyes)
     assert (drifted.one_sigma >= alone.one_sigma).all() and (alone.one_sigma > 0).all()
     true = moved(sensor.rig, drifted.names, drifted.draw(rng))
     point = np.array([0.0, 0.0, np.sqrt(np.prod(sensor.working_range_mm))])

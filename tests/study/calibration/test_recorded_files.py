@@ -14,6 +14,7 @@ from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.drift import Drift, with_drift
 from mitsim.sensor.fitted_to import FittedCapture, images_digest
 from mitsim.sensor.opencv_calibration import with_calibration
+from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.rig_covariance import read_rig_covariance
 from mitsim.sensor.rig_parameters import parameter_differences
 from mitsim.sensor.transforms import Transform
@@ -152,7 +153,9 @@ def test_the_covariance_keeps_the_images_that_decided_it(tmp_path):
     checked = calibrate_checked(boards, BOARD, {"left": SIZE, "right": SIZE}, "recorded")
     write_calibration(checked, tmp_path / "unit.toml")
     again = read_rig_covariance(tmp_path / "unit.toml", checked.calibration.rig)
-    drifted = with_drift(again, checked.calibration.rig, Drift(temperature_k=1.0))
+    drifted = with_drift(
+        again, replace(load_sensor("ensenso-n10"), rig=checked.calibration.rig), Drift(temperature_k=1.0)
+    )
     assert again.fitted_to == drifted.fitted_to == tuple(shown)
     rig_file = tmp_path / "unit.yml"
     assert f'# fitted to "boards/9", SHA-256 {9:064x}' in rig_file.read_text()
