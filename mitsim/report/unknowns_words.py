@@ -12,16 +12,25 @@ _UNITS = {"mrad": "mrad", "mm": "mm", "um": "µm", "deg": "°", "kelvin": "K", "
 _COUNTS = {"scale": "times all of these", "spread": "relative", "daylight": "of it"}
 _HEADS = {"finish": "finish, shares of its range"}
 
+#: keys of the light of a room that say nothing of a dark one
+_OF_ROOM = ("room_factor", "daylight", "filter_nm")
+
 
 def unknowns_in_words(unknowns: Mapping[str, Mapping[str, Any]]) -> str:
     """Return the sizes that the virtual measurements drew from: ``pose: placement 1 mm, ...; form: plane 0.02 mm``.
 
     One standard deviation each, or a range; a group without a size is left out.
     """
-    groups = {name: list(_sizes(table)) for name, table in unknowns.items() if name != "decoder"}
+    groups = {name: list(_sizes(_lit(table))) for name, table in unknowns.items() if name != "decoder"}
     if not unknowns.get("decoder", {}).get("known", True):
         groups["decoder"] = ["drawn from the ranges in statement.json"]
     return "; ".join(f"{_HEADS.get(name, name)}: {', '.join(sizes)}" for name, sizes in groups.items() if sizes)
+
+
+def _lit(table: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a group without the properties of the light of a room that has none."""
+    dark = table.get("room") in (0, "dark cell")
+    return {key: value for key, value in table.items() if not (dark and key in _OF_ROOM)}
 
 
 def _sizes(table: Mapping[str, Any]) -> Iterator[str]:

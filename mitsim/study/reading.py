@@ -38,7 +38,7 @@ from mitsim.scene.surface.lay import lays_in_words
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.sensor_text import sensor_checksum
-from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
+from mitsim.sensor.unknowns import LightUnknowns, UnknownsTable, unknowns_of
 from mitsim.study.screened_errors import needed_by_tolerance
 from mitsim.study.tables import CharacterisationTable, ExposureTable, StudyFile
 from mitsim.views import Candidates, View, candidate_views
@@ -82,8 +82,14 @@ class Study:
 
     @property
     def unknowns(self) -> UnknownsTable:
-        """Return the unknowns: values of the study, else of the sensor, else the defaults."""
-        return unknowns_of(self.sensor.unknowns, self.file.unknowns)
+        """Return the unknowns: values of the study, else of the sensor, else the defaults.
+
+        A sensor with the known light of its own room has no unknown room.
+        """
+        known = (
+            UnknownsTable() if self.sensor.room is None else UnknownsTable(light=LightUnknowns(room=0, room_factor=1))
+        )
+        return unknowns_of(self.sensor.unknowns, self.file.unknowns, known)
 
 
 def open_study(

@@ -298,6 +298,9 @@ def test_sizes_of_unknowns_have_units_and_meanings():
     assert unknowns_in_words({"calibration": {"scale": 0.5}, "decoder": {"known": True}}) == (
         "calibration: scale 0.5 times all of these"
     )
+    dark = {"room_factor": 1.6, "daylight": 0.2, "power_relative": 0.05}
+    assert unknowns_in_words({"light": {"room": 0.0} | dark}) == "light: power 0.05 relative"
+    assert unknowns_in_words({"light": {"room": "dark cell"} | dark}) == "light: room dark cell, power 0.05 relative"
 
 
 @pytest.mark.parametrize(("spray", "shown"), [("thickness of the spray on the part", True), ("dirt, oil", False)])

@@ -76,7 +76,9 @@ def influences(table: UnknownsTable, source: str, depth: int, sprayed: bool = Fa
         Influence(
             "light of the room",
             rendered and light.illuminance > 0,
-            "drawn; equal from all sides" if rendered else "as during the characterisation of the sensor",
+            ("drawn; equal from all sides" if light.illuminance > 0 else "none, or [room] of the sensor file")
+            if rendered
+            else "as during the characterisation of the sensor",
         ),
         Influence("power of the projector", rendered and light.power_relative > 0, "drawn"),
         Influence("position of the part", pose.placement_mm > 0 or pose.placement_deg > 0, "drawn anew in every trial"),

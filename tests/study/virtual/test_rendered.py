@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,11 +28,14 @@ from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.sensor_file import RoomTable
 from mitsim.sensor.transforms import Transform, look_at
 from mitsim.study import StudyFile, open_study
+from mitsim.study.remedies.changes import _room
 from mitsim.study.session import Session
 from mitsim.study.statement_document import statement_document
 from mitsim.study.virtual import rendered
 from mitsim.study.virtual.displacement import displaced
 from mitsim.study.virtual.drawn_finish import finish_deviation
+from mitsim.study.virtual.drawn_numbers import drawn_numbers
+from mitsim.study.virtual.influences import influences
 from mitsim.study.virtual.plan import measurements_of, race_rendering, trial_digest
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.rendered import RenderedMeasurements
@@ -500,6 +504,22 @@ def test_power_is_that_of_the_projector_alone(coarse_n10, tmp_path, monkeypatch,
     assert alone.mean() > 0.01 * of_quarter.mean()
     np.testing.assert_allclose(alone, exposed(1e-9 * flux, 1.0), rtol=1e-4, atol=1e-6 * alone.mean())
     np.testing.assert_allclose(quarter, of_quarter, rtol=1e-3, atol=1e-3 * alone.mean())
+
+
+def test_a_known_room_is_fixed_and_no_remedy():
+    """A trial with the light of the sensor file's own room does not depend on the draw of a room."""
+    plain = study_of("ensenso-n10")
+    lit = replace(plain, sensor=replace(plain.sensor, room=RoomTable(irradiance_w_mm2=1e-6)))
+
+    def said(study):
+        unknowns = study_unknowns(study)
+        listed = {one.name: one for one in influences(unknowns.table, "render", 1)}["light of the room"]
+        numbers = drawn_numbers(study, unknowns, "render", [Trial(day) for day in range(3)], ["light"])["light"]
+        now = SimpleNamespace(study=study, session=None, missed={}, stated=SimpleNamespace(view=study.views[0]))
+        return listed.included, numbers.shape[1], len(list(_room(now))), unknowns.draw(Trial(0)).room > 0
+
+    assert said(plain) == (True, 6, 1, True)  # room, power, exposure and their squares
+    assert said(lit) == (False, 4, 0, False)
 
 
 def test_unknowns_of_a_study_are_checked(tmp_path):
