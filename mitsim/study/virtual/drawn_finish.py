@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -50,15 +51,14 @@ def _normals(number: int, finish: str) -> dict[str, float]:
 
 
 def finish_deviation(unknowns: Unknowns, number: int, finish: str) -> Deviation:
-    """Return the deviation of a finish, given by its BSDF's id, from its best estimate in the finishes of a number.
+    """Return the deviation of a finish, given by its BSDF's id, from the scene's finish in the finishes of a number.
 
-    The lay of a finish is drawn unless ``lay`` of its table is 0. The number -1 is the best estimate, whose lay is not
-    drawn.
+    The lay of a finish is drawn unless ``lay`` of its table is 0. The number -1 is the best estimate: the centres of a
+    measured finish, and no drawn lay.
     """
-    if number < 0:
-        return Deviation()
     table = unknowns.table.finish
-    return deviation_of(table.centres_and_sizes(finish), _normals(number, finish))
+    deviation = deviation_of(table.centres_and_sizes(finish), _normals(number, finish))
+    return replace(deviation, lay_deg=None) if number < 0 else deviation
 
 
 def deviation_of(prior: Mapping[str, tuple[float, float]], numbers: Mapping[str, float]) -> Deviation:

@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import kstest
 
 from characterisation.files.errors import InputError
+from mitsim.scene.surface.scatter import Deviation
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_parameters import parameter_names
@@ -162,6 +163,10 @@ def test_finishes_have_the_spread_of_a_normal_distribution(unknowns):
     assert abs(alphas.mean()) < 4.5 / np.sqrt(2000) and alphas.std() == pytest.approx(1, abs=4.5 / np.sqrt(4000))
     assert abs(np.corrcoef(alphas, others)[0, 1]) < 4.5 / np.sqrt(2000)
     assert finish_deviation(unknowns, -1, "plate").alpha == 0
+    fitted = {"finish": {"measured": {"plate": {"alpha": (1.4, 0.2), "lay": (-0.5, 1.0)}}}}
+    fitted = replace(unknowns, table=UnknownsTable.model_validate(fitted))
+    assert finish_deviation(fitted, -1, "plate") == Deviation(alpha=1.4, lay=-0.5)
+    assert finish_deviation(fitted, -1, "pillar") == Deviation()
     known = replace(unknowns, table=UnknownsTable.model_validate({"finish": {"alpha": 0.0, "lay": 0.0}}))
     assert finish_deviation(known, 3, "plate").alpha == 0 and finish_deviation(known, 3, "plate").lay_deg is None
 
