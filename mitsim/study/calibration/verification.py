@@ -26,7 +26,7 @@ from mitsim.decoding.plate import Plate, image_on_grid, plate_dots, plate_scale
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.published_lengths import PublishedLengths
 from mitsim.sensor.rig_covariance import RigCovariance
-from mitsim.sensor.rig_parameters import moved, parameter_names, path_error
+from mitsim.sensor.rig_parameters import PATH_NAMES, moved, parameter_names, path_error
 from mitsim.sensor.sensor import Sensor
 from mitsim.study.calibration.accuracy import measured_points, triangulated
 from mitsim.study.calibration.board import Board
@@ -91,7 +91,7 @@ class Verification:
     def too_large(self) -> list[str]:
         """Return the errors beyond their limits, in words."""
         out = []
-        if abs(self.length_error) > _INSIDE * self.length_uncertainty:
+        if not abs(self.length_error) <= _INSIDE * self.length_uncertainty:
             out.append("lengths")
         if abs(self.row_error_px) > _INSIDE * self.row_uncertainty_px:
             out.append("rows")
@@ -217,20 +217,21 @@ def verify(
     --------
     corners_of_board, dots_of_plate : the points
     """
-    measuring = replace(sensor, rig=rig)
-    covariance = parameters_of(covariance, rig)
-    rng = np.random.default_rng(_SEED)
-    nominal = measured_points(measuring, artefact.points, rig)
-    cameras, scales, shifts = list(rig.cameras.values()), [], []
-    for stream in rng.spawn(_DRAWS):
+    stated, names = _stated_rig(sensor, rig, covariance)
+    eyes, by_pair = {name.partition(".")[0] for name in names}, len(artefact.rows_px) > 0
+    if by_pair and not set(list(stated.cameras)[:2]) <= eyes:
+        found = f"errors of {', '.join(sorted(eyes))} alone, but two cameras measured the board"
+        hint = "measure a plate of dots in the cloud: --dots"
+        raise InputError("--sensor", "covariance of the calibration", found, "errors of both cameras", hint)
+    measuring = replace(sensor, rig=stated)
+    nominal, _ = _measured(artefact, measuring, stated)
+    scales, shifts = [], []
+    for stream in np.random.default_rng(_SEED).spawn(_DRAWS):
         values = covariance.draw(stream)
-        true = moved(rig, covariance.names, values)
-        points = measured_points(measuring, artefact.points, true, path_error(covariance.names, values))
+        points, row_errors = _measured(artefact, measuring, moved(stated, names, values), path_error(names, values))
         scales.append(_spread(points) / _spread(nominal))
-        if len(artefact.rows_px):
-            pixels, second_pixels = (eye.project(artefact.points) for eye in list(true.cameras.values())[:2])
-            second_rays = cameras[1].rays(second_pixels)
-            shifts.append(float(np.mean(triangulated(cameras[0], pixels, cameras[1], second_rays)[1])))
+        if by_pair:
+            shifts.append(float(np.mean(row_errors)))
     rigs = float(np.sqrt(np.mean((np.array(scales) - 1) ** 2)))
     distance = float(np.linalg.norm(artefact.points - rig.reference.centre, axis=1).mean())
     rows = artefact.rows_px
@@ -249,12 +250,33 @@ def verify(
     )
 
 
-def parameters_of(covariance: RigCovariance, rig: Rig) -> RigCovariance:
-    """Return the part of a covariance of which a rig has the parameters: a unit's lens may have fewer coefficients."""
-    rig_names = parameter_names(rig, rig.projector is not None)
-    chosen = [index for index, name in enumerate(covariance.names) if name in rig_names or name.startswith("path.")]
-    names = tuple(covariance.names[index] for index in chosen)
-    return replace(covariance, names=names, covariance=covariance.covariance[np.ix_(chosen, chosen)])
+def _stated_rig(sensor: Sensor, rig: Rig, covariance: RigCovariance) -> tuple[Rig, tuple[str, ...]]:
+    """Return the rig that the covariance of a sensor moves, and the names of all parameters of the covariance in it.
+
+    A capture may name its cameras otherwise: then they follow in the order of the sensor's. A capture that lacks an eye
+    or a parameter, such as a device's own cloud, is described by the calibration of the sensor.
+    """
+    same = set(sensor.measuring_rig.cameras) <= set(rig.cameras)
+    eyes = {} if same else dict(zip(sensor.rig.cameras, rig.cameras, strict=False))
+    split = [name.partition(".") for name in covariance.names]
+    names = tuple(f"{eyes.get(eye, eye)}.{parameter}" for eye, _, parameter in split)
+    if set(names) <= {*parameter_names(rig), *PATH_NAMES}:
+        return rig, names
+    return sensor.rig, covariance.names
+
+
+def _measured(
+    artefact: KnownPoints, sensor: Sensor, true: Rig, path: tuple[float, float] = (0.0, 0.0)
+) -> tuple[Floats, Floats]:
+    """Return the points (n, 3) [mm] as the sensor measures them if ``true`` is its rig, and the row errors of a pair.
+
+    Points that two cameras measured are triangulated again, whatever the sensor's own decoder does.
+    """
+    if len(artefact.rows_px) == 0:
+        return measured_points(sensor, artefact.points, true, path), np.empty(0)
+    first, second = list(sensor.rig.cameras.values())[:2]
+    pixels, second_pixels = (eye.project(artefact.points) for eye in list(true.cameras.values())[:2])
+    return triangulated(first, pixels, second, second.rays(second_pixels))
 
 
 def _on_plane(capture: Capture, pixels: Floats, cloud: PointCloud) -> Floats:

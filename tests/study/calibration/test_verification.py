@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import write_capture
+from mitsim.sensor.camera import Rig
 from mitsim.sensor.fitted_to import images_digest
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.preset_covariance import preset_covariance
@@ -20,7 +21,8 @@ from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.transforms import Transform
 from mitsim.study.calibration.accuracy import triangulated
 from mitsim.study.calibration.board import Board
-from mitsim.study.calibration.verification import corners_of_board, verify
+from mitsim.study.calibration.verification import KnownPoints, corners_of_board, verify
+from mitsim.study.virtual.study_unknowns import calibration_covariance
 from mitsim.twin.sensor.run import sensor_path
 from tests.shell import mitsim_here
 
@@ -101,6 +103,48 @@ def test_rigs_drawn_from_the_covariance_are_usable(n10, good):
     drawn = [moved(n10.rig, covariance.names, covariance.draw(rng)) for _ in range(10)]
     found = [verify(seen_through(n10, true, base), n10, n10.rig, covariance).usable for true in drawn]
     assert found.count(False) <= 4
+
+
+def test_the_names_of_cameras_do_not_matter(n10, good, turned):
+    """Before, the covariance of cameras with other names was dropped: the limit of lengths was that of the board."""
+    for capture in (good, turned):
+        other = dict(zip(("cam0", "cam1"), capture.rig.cameras.values(), strict=True))
+        images = dict(zip(other, capture.images.values(), strict=True))
+        renamed = replace(capture, rig=replace(capture.rig, cameras=other), images=images)
+        known = corners_of_board(renamed, BOARD, None)
+        found, same = (verify(known, n10, rig, preset_covariance(n10)) for rig in (renamed.rig, n10.rig))
+        assert found.rig_uncertainty == pytest.approx(same.rig_uncertainty, rel=1e-9)
+        assert found.row_uncertainty_px == pytest.approx(same.row_uncertainty_px, rel=1e-9)
+        assert found.usable == (capture is good)
+
+
+def test_a_board_by_two_cameras_of_a_sensor_that_measures_with_one_is_refused(n10, good):
+    covariance = preset_covariance(n10)
+    kept = [index for index, name in enumerate(covariance.names) if name.startswith("left.")]
+    names = tuple(covariance.names[index] for index in kept)
+    left = replace(covariance, names=names, covariance=covariance.covariance[np.ix_(kept, kept)])
+    with pytest.raises(InputError, match="errors of left alone, but two cameras measured"):
+        verify(corners_of_board(good, BOARD, None), n10, n10.rig, left)
+
+
+def test_a_cloud_with_an_image_is_verified_by_the_calibration_of_its_sensor(tmp_path):
+    """Before, the eye that the cloud does not state, the projector, ended the command in a traceback."""
+    carmine = load_sensor("primesense-carmine-1.09")
+    camera = carmine.rig.reference
+    y, x = np.mgrid[: camera.height, : camera.width]
+    rays = camera.rays(np.stack([x, y], -1).astype(float))
+    depths = (PLACE.rotation[:, 2] @ PLACE.translation) / (rays @ PLACE.rotation[:, 2])
+    image = seen_board(camera)[None].astype(np.uint8)
+    derived = {"points": (rays * depths[..., None]).astype(np.float32)}
+    rig = Rig({"camera": camera})
+    write_capture(Capture("a file", "point_map", "replay", rig, {"camera": image}, derived=derived), tmp_path / "cloud")
+    command = ("calibrate", "verify", tmp_path / "cloud", "--board", "9x6x18:glass", "--sensor", carmine.name)
+    done = mitsim_here(*command)
+    assert done.stdout.splitlines()[-1].startswith("Use it")
+    known = KnownPoints(PLACE.points(BOARD.corners), 1.0, 0.0, 0.0, np.empty(0), 160.0)
+    covariance = calibration_covariance(carmine, carmine.unknowns.calibration, tmp_path)
+    stated = verify(known, carmine, carmine.rig, covariance).rig_uncertainty
+    assert f"(calibration and drift {1.96e3 * stated:.2f}" in done.stdout
 
 
 def test_a_capture_without_the_board_is_refused(n10):
