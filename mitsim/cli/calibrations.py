@@ -137,7 +137,7 @@ def verify(
     """Verify a calibration by one capture of a board or a plate of dots: use it, or calibrate again.
 
     Compares the error of lengths, and the difference of rows of two cameras, with what the stated covariance of the
-    calibration and the drift since then allow. Exit code 1 if one is larger.
+    calibration, the drift since then and the temperature allow. Exit code 1 if one is larger.
 
     Example: mitsim calibrate verify captures/board --board 11x8x30:glass
     """
@@ -149,7 +149,7 @@ def verify(
     from mitsim.sensor.fitted_to import shows_the_fit
     from mitsim.study.calibration import verification
     from mitsim.study.calibration.board import parse_board
-    from mitsim.study.virtual.study_unknowns import calibration_covariance
+    from mitsim.study.virtual.study_unknowns import calibration_covariance, with_temperature
     from mitsim.twin.finish.electrons import sensor_of
 
     if (board is None) == (dots is None):
@@ -162,6 +162,7 @@ def verify(
     for note in chosen.notes:
         say(f"warning: {note}")
     covariance = calibration_covariance(chosen, chosen.unknowns.calibration, Path(sensor or ".").parent)
+    covariance = with_temperature(covariance, chosen.rig, chosen.unknowns.temperature)
     cloud = None
     if dots is not None or len(read.images) < 2:
         settings, imager = decoder_settings(read, None, None)

@@ -2,7 +2,7 @@
 
 Signal chain: capture -> corners of a board in every eye, or dots of a plate in the cloud -> points -> scale of the
 known lengths, and rows of both cameras, which must be equal -> the same errors of rigs drawn from the covariance of the
-calibration, with the drift since then -> standard uncertainties -> one sentence: use, or calibrate again.
+calibration, with drift and temperature since then -> standard uncertainties -> one sentence: use, or calibrate again.
 
 A length error e is compared with u^2 = u_rig^2 + u_board^2 + u_points^2: what the calibration allows, the error of the
 board's own scale, and the scatter of its points. The mean row error is compared with that of the drawn rigs. Both count
@@ -118,7 +118,7 @@ class Verification:
         out = [
             f"points of known spacing\t{len(self.artefact.points)}, up to {self.artefact.extent_mm:.0f} mm apart, at "
             f"{self.distance_mm:.0f} mm",
-            f"error of lengths\t{length:+.2f} per mille, 95 % limit {limit:.2f} (calibration and drift "
+            f"error of lengths\t{length:+.2f} per mille, 95 % limit {limit:.2f} (calibration, drift, temperature "
             f"{1e3 * _INSIDE * self.rig_uncertainty:.2f}, board {1e3 * _INSIDE * self.artefact.board:.2f}, scatter "
             f"{1e3 * _INSIDE * self.artefact.scatter:.2f})",
         ]
@@ -209,7 +209,7 @@ def verify(
     rig
         Calibration with which the capture was measured.
     covariance
-        Of the calibration, with the drift since then.
+        Of the calibration, with drift and temperature since then.
     published
         The maker's own length errors.
 

@@ -26,7 +26,7 @@ from mitsim.sensor.working_volume import in_image
 from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.study.calibration.accuracy import measured_points
 from mitsim.study.virtual.study_unknowns import study_unknowns
-from mitsim.study.virtual.world import Unknowns, scaled_baseline, scaled_focal
+from mitsim.study.virtual.world import Unknowns, warmed
 from mitsim.views.view_scores import score_candidates, scoring_order
 
 #: number of places along each axis of the box around a part for which displacements are computed; chosen
@@ -84,10 +84,7 @@ def shared_errors(study: Study, unknowns: Unknowns) -> SharedErrors:
     values, vectors = np.linalg.eigh(calibration.correlation)
     root = calibration.one_sigma[:, None] * vectors * np.sqrt(np.clip(values, 0, None))
     causes = [(calibration.names, column) for column in root.T]
-    causes += [
-        scaled_baseline(sensor.rig, temperature.body_per_kelvin * temperature.sensor_kelvin),
-        scaled_focal(sensor.rig, temperature.focal_per_kelvin * temperature.sensor_kelvin),
-    ]
+    causes.append(warmed(sensor.rig, temperature, temperature.sensor_kelvin))
     points = points[_measurable(sensor, points)]
     nominal = measured_points(sensor, points, sensor.rig)
     moves = [

@@ -13,17 +13,18 @@ import numpy as np
 
 from characterisation.files.errors import InputError, nearest
 from mitsim.running.progress import say
+from mitsim.sensor.camera import Rig
 from mitsim.sensor.drift import Drift, with_drift
 from mitsim.sensor.preset import presets
 from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_covariance import RigCovariance, read_rig_covariance
 from mitsim.sensor.sensor import Sensor
-from mitsim.sensor.unknowns import CalibrationUnknowns, FormUnknowns
+from mitsim.sensor.unknowns import CalibrationUnknowns, FormUnknowns, TemperatureUnknowns
 from mitsim.study import Study
 from mitsim.study.calibration.virtual_calibration import calibrate
 from mitsim.study.virtual.coat import coated_shapes
 from mitsim.study.virtual.form import drawn_form
-from mitsim.study.virtual.world import GROUPS, Unknowns
+from mitsim.study.virtual.world import GROUPS, Unknowns, warmed
 
 #: linear expansion near 20 C [1/K], by the metal of a finish (CRC Handbook of Chemistry and Physics; AISI 304)
 EXPANSION_PER_KELVIN = {
@@ -85,6 +86,19 @@ def calibration_covariance(sensor: Sensor, table: CalibrationUnknowns, folder: P
         covariance=table.scale**2 * covariance.covariance,
         source=f"{covariance.source}; times {table.scale:g}",
     )
+
+
+def with_temperature(covariance: RigCovariance, rig: Rig, table: TemperatureUnknowns) -> RigCovariance:
+    """Return a covariance plus that of the sensor's temperature, which changes the eyes with errors as trials draw."""
+    step = dict.fromkeys(covariance.names, 0.0)
+    errors_of = {name.partition(".")[0] for name in covariance.names}
+    changes = zip(*warmed(rig, table, table.sensor_kelvin), strict=True)
+    step |= {name: float(value) for name, value in changes if name.partition(".")[0] in errors_of}
+    total = np.outer(list(step.values()), list(step.values()))
+    count = len(covariance.names)
+    total[:count, :count] += covariance.covariance
+    source = f"{covariance.source}; temperature of the sensor {table.sensor_kelvin:g} K"
+    return replace(covariance, names=tuple(step), covariance=total, source=source)
 
 
 def _unscaled_covariance(sensor: Sensor, table: CalibrationUnknowns, folder: Path) -> RigCovariance:

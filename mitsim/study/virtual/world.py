@@ -25,7 +25,7 @@ from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import eyes, moved, parameter_names, path_error
 from mitsim.sensor.room_light import room_irradiance
 from mitsim.sensor.transforms import Transform
-from mitsim.sensor.unknowns import UnknownsTable
+from mitsim.sensor.unknowns import TemperatureUnknowns, UnknownsTable
 
 #: effects outside the performance map, for measurements drawn from a map (:mod:`mitsim.study.virtual.beyond_map`); they
 #: are the same in all captures of a day
@@ -154,12 +154,10 @@ class Unknowns:
             for name, value in zip(names, values.tolist(), strict=True):
                 error[name] = error.get(name, 0.0) + value
 
-        temperature = self.table.temperature
         if "calibration" in self.varied:
             add(self.calibration.names, self.calibration.draw(rng))
         if sensor_kelvin:
-            add(*scaled_baseline(self.rig, temperature.body_per_kelvin * sensor_kelvin))
-            add(*scaled_focal(self.rig, temperature.focal_per_kelvin * sensor_kelvin))
+            add(*warmed(self.rig, self.table.temperature, sensor_kelvin))
         return tuple(error), np.array(list(error.values()))
 
     def _light(self, rng: np.random.Generator) -> tuple[float, float, float]:
@@ -211,6 +209,15 @@ def scaled_baseline(rig: Rig, share: float) -> Scaled:
     reference = rig.reference.centre
     values = [(optics[name.rpartition(".")[0]].centre - reference)["xyz".index(name[-4])] for name in names]
     return names, share * np.array(values)
+
+
+def warmed(rig: Rig, table: TemperatureUnknowns, kelvin: float) -> Scaled:
+    """Return the parameters that the temperature of a sensor changes, and their changes by a deviation [K]."""
+    places, lengths = (
+        scaled_baseline(rig, table.body_per_kelvin * kelvin),
+        scaled_focal(rig, table.focal_per_kelvin * kelvin),
+    )
+    return places[0] + lengths[0], np.concatenate([places[1], lengths[1]])
 
 
 def _seed(rng: np.random.Generator) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,10 +20,11 @@ from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.published_lengths import PublishedLengths
 from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.transforms import Transform
+from mitsim.sensor.unknowns import CalibrationUnknowns, TemperatureUnknowns
 from mitsim.study.calibration.accuracy import triangulated
 from mitsim.study.calibration.board import Board
 from mitsim.study.calibration.verification import KnownPoints, corners_of_board, verify
-from mitsim.study.virtual.study_unknowns import calibration_covariance
+from mitsim.study.virtual.study_unknowns import calibration_covariance, with_temperature
 from mitsim.twin.sensor.run import sensor_path
 from tests.shell import mitsim_here
 
@@ -143,8 +145,28 @@ def test_a_cloud_with_an_image_is_verified_by_the_calibration_of_its_sensor(tmp_
     assert done.stdout.splitlines()[-1].startswith("Use it")
     known = KnownPoints(PLACE.points(BOARD.corners), 1.0, 0.0, 0.0, np.empty(0), 160.0)
     covariance = calibration_covariance(carmine, carmine.unknowns.calibration, tmp_path)
+    covariance = with_temperature(covariance, carmine.rig, carmine.unknowns.temperature)
     stated = verify(known, carmine, carmine.rig, covariance).rig_uncertainty
-    assert f"(calibration and drift {1.96e3 * stated:.2f}" in done.stdout
+    assert f"(calibration, drift, temperature {1.96e3 * stated:.2f}" in done.stdout
+
+
+def test_a_limit_contains_the_temperature(n10):
+    """The lengths that a warm sensor measures: its baseline and focal lengths have grown by 4 per mille, by hand.
+
+    Before, the limit was that of an exact temperature.
+    """
+    known = KnownPoints(PLACE.points(BOARD.corners), 1.0, 0.0, 0.0, np.empty(0), 160.0)
+    none = calibration_covariance(n10, CalibrationUnknowns(scale=0.0), Path())
+    longer, grown = {}, np.diag([1.004, 1.004, 1.0])
+    for name, eye in n10.rig.cameras.items():
+        middle = eye.matrix * [[0, 0, 1], [0, 0, 1], [0, 0, 0]]
+        longer[name] = replace(eye, matrix=grown @ (eye.matrix - middle) + middle)
+    for body, focal, eyes in ((1e-4, 0.0, n10.rig.cameras), (0.0, 1e-4, longer)):
+        table = TemperatureUnknowns(sensor_kelvin=40.0, body_per_kelvin=body, focal_per_kelvin=focal)
+        found = verify(known, n10, n10.rig, with_temperature(none, n10.rig, table)).rig_uncertainty
+        truth = seen_through(n10, replace(n10.rig, cameras=eyes), known).scale - 1 if focal else 4e-3
+        assert found == pytest.approx(abs(truth), rel=0.15)  # 200 draws tell it to 5 %
+    assert verify(known, n10, n10.rig, none).rig_uncertainty == pytest.approx(0, abs=1e-9)
 
 
 def test_a_capture_without_the_board_is_refused(n10):
