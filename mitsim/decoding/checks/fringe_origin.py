@@ -55,6 +55,9 @@ _OTHER_PERIOD = 0.02
 #: ratio of the two periods above which the phases do not follow the Gray code at all; chosen
 _FOLLOWED = 5.0
 
+#: excess of edges beyond the projector that excludes an offset, as a share of all; chosen
+_BEYOND = 0.02
+
 #: largest gamma of a projector, that of the recording kamino_phaseshift rounded up
 _GAMMA = 2.6
 
@@ -255,19 +258,24 @@ def origin_in_words(edges: StripeEdges, images: CodeLines, axis: Axis) -> str:
         None,
     )
     start = f"the fringes and the Gray code of the {axis} do not count from one origin"
-    if change != FringeChange():
-        offset = _fitting_offset(edges, every, image_roles, axis, images.extent(axis))
-        if offset is not None:
-            return f"{start}: they fit if the Gray code has offset_px = {offset} in [pattern]"
-    if change is None or any(
+    unusual = change is None or any(
         deviation.unusual(edges, f, n) for deviation, f, n in zip(measured, every, needed, strict=True)
-    ):
+    )
+    offset, certain = "", False
+    if unusual or change != FringeChange():
+        offset, certain = _fitting_offset(edges, every, image_roles, axis, images.extent(axis))
+    kind = "" if isinstance(code, ImageSequence) else ', in a [pattern] of kind = "image_sequence"'
+    if offset and certain:
+        return f"{start}: they fit if {offset}{kind}"
+    either = f"; or if {offset}{kind}. The images do not tell which: decode with each, and keep the right depths"
+    either = either if offset else ""
+    if change is None or unusual:
         fitting = " and ".join(
             f"shifts_deg = {_degrees(shifts - origin_shift(fringes.wave, fringes.at, fringes.period))} at "
             f"{fringes.period:g} px"
             for fringes, shifts in zip(every, needed, strict=True)
         )
-        return f"{start}: they fit if the fringes of the {axis} have about {fitting}"
+        return f"{start}: they fit if the fringes of the {axis} have about {fitting}{either}"
     change = replace(change, at=_half_a_pixel_off(edges, every, measured, needed))
     if change == FringeChange():
         return ""
@@ -276,9 +284,9 @@ def origin_in_words(edges: StripeEdges, images: CodeLines, axis: Axis) -> str:
     elif not change.wave and not change.half_turn:
         start += ", by half a pixel"
     where = f"the fringes of the {axis} have {change.in_words(every[0])}"
-    if isinstance(code, ImageSequence) or not (change.reverse or change.negated or change.half_turn):
-        return f"{start}: they fit if {where}"
-    return f'{start}: they fit if {where}, in a [pattern] of kind = "image_sequence"'
+    if change.reverse or change.negated or change.half_turn:
+        where += kind
+    return f"{start}: they fit if {where}{either}"
 
 
 def described(code: LightCode, image_roles: list[Role], axis: Axis) -> list[DescribedFringes]:
@@ -341,15 +349,16 @@ def _degrees(shifts: Floats) -> list[int]:
 
 def _fitting_offset(
     edges: StripeEdges, every: list[DescribedFringes], image_roles: list[Role], axis: Axis, extent: int
-) -> str | None:
-    """Return another usual offset of the Gray code with which it fits the fringes as they are described, or None.
+) -> tuple[str, bool]:
+    """Return another usual offset of the Gray code that fits the described fringes, and whether it alone is possible.
 
-    A whole number of quarter periods explains the same edges. It is the fringes that are then said to be wrong.
+    In words, "" if there is none. Other fringes explain the same edges if the offset is a whole number of quarters of
+    their periods. Then edges beyond the projector, with either offset, exclude it.
     """
     gray = [role for role in image_roles if role.kind == "gray" and role.axis == axis]
     stripe, stated = min(role.period for role in gray), gray[0].offset
     centred = offset_in_pixels("centred", len(gray), stripe, extent)
-    for words, offset in (('"centred"', centred), ("0", 0.0)):
+    for value, offset in (('"centred"', centred), ("0", 0.0)):
         if offset == stated or edges.rising <= 0.5:
             continue
         position = edges.position + stated - offset
@@ -357,10 +366,15 @@ def _fitting_offset(
             PhaseDeviation.of(position, fringes.period, cycles).cycles
             for fringes, cycles in zip(every, edges.cycles, strict=True)
         ]
+        if max(map(abs, deviations)) >= _EIGHTH / 4:
+            continue
         quarters = [4 * (offset - stated) / fringes.period for fringes in every]
-        if max(map(abs, deviations)) < _EIGHTH / 4 and any(abs(n - round(n)) > 0.1 for n in quarters):
-            return words
-    return None
+        certain = any(abs(n - round(n)) > 0.1 for n in quarters)
+        beyond, beyond_with_it = (float(np.mean((x < 0) | (x > extent))) for x in (edges.position, position))
+        if certain or beyond_with_it - beyond < _BEYOND:
+            words = f"the Gray code of the {axis} has offset_px = {value} in [pattern]"
+            return words, certain or beyond - beyond_with_it > _BEYOND
+    return "", False
 
 
 def gamma_error(edges: StripeEdges, period: float, shifts: Floats) -> float:

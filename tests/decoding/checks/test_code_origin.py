@@ -130,7 +130,7 @@ def test_a_centred_gray_code_under_fringes_from_the_edge():
     capture = taken(coded(fringes(20), stripe=10, offset_px="centred"))
     assert said(capture) == ""
     words = said(stated(capture, coded(fringes(20), stripe=10)))
-    assert 'the Gray code has offset_px = "centred"' in words
+    assert 'the Gray code of the columns has offset_px = "centred"' in words
 
 
 @pytest.mark.parametrize("code", [GrayCodePhaseShift(period_px=16), PhaseShift(periods_px=[260, 40, 16])])
@@ -259,3 +259,25 @@ def test_an_origin_that_is_whole_periods_away_is_stated_beside_the_other():
     depths = [float(each) for each in re.findall(r"at (\d+) mm", words)]
     assert abs(depths[1] - 498) < 5 and depths[0] > 530
     assert said(stated(capture, coded(fringes(period=8), offset_px="centred"))) == ""
+
+
+@pytest.mark.parametrize(("period", "wave"), [(16, "minus cosine"), (32, "sine")])
+def test_fringes_and_gray_code_are_both_named_if_either_may_count_from_elsewhere(period, wave):
+    """Centred by 8 px, half or a quarter of a period: to blame the fringes alone was 95 mm off."""
+    beamer, group = wide(240, 192, 253), fringes(period)
+    for shown in (coded(group, offset_px="centred"), coded(fringes(period, **WAVES[wave]))):
+        words = said(stated(taken(shown, beamer=beamer), coded(group)))
+        assert 'or if the Gray code of the columns has offset_px = "centred" in [pattern]' in words
+        rights = [coded(advised(group, words)), coded(group, offset_px="centred")]
+        off = [np.median(off_surface(stated(taken(shown, beamer=beamer), right))[1]) for right in rights]
+        assert min(off) < 0.5 and max(off) > 50
+
+
+@pytest.mark.parametrize(("period", "centred"), [(16, True), (8, True), (32, True), (16, False), (8, False)])
+def test_edges_beyond_the_projector_tell_a_gray_code_from_fringes(period, centred):
+    """Centred by 28 px, seven quarters of 16 px: the fringes were blamed, 1000 mm off."""
+    beamer, group = wide(200, 150, 211), fringes(period)
+    shown = coded(group, offset_px="centred") if centred else coded(fringes(period, wave="sine"))
+    words = said(stated(taken(shown, beamer=beamer), coded(group)))
+    assert ('has offset_px = "centred" in [pattern]' in words) == centred
+    assert ('have wave = "sine"' in words) != centred
