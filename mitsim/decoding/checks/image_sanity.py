@@ -65,6 +65,12 @@ _STEADY = 0.25
 #: file names often sort off before on
 _BEFORE = 'write inverse = "before" instead of "each"'
 
+#: gammas of projector and camera together that are tried; 2.2 is that of sRGB and of most projectors
+_GAMMAS = (0.5, 0.7, 1.4, 1.8, 2.2, 2.6)
+
+#: full scale of the levels without a gamma [DN]: fine enough for dark ones
+_FINE = 65535
+
 #: changes smaller than this [projector px] are ignored
 _STILL = 1e-3
 
@@ -115,7 +121,10 @@ def image_warnings(images: CodedImages, camera: str, decoded: Mapping[Axis, Proj
             warning = f"{_doubt(smoothness, axis, camera)}: they fit if {order}"
         warning = warning or _changed_exposure(rows, image_roles, axis, camera)
         if not warning and smoothness.doubtful:
-            warning = f"{_doubt(smoothness, axis, camera)}: check that the images are in the order of [pattern]"
+            advice = "check that the images are in the order of [pattern]"
+            if any(role.kind == "phase" and role.axis == axis for role in image_roles):
+                advice = _fitting_gamma(lines, axis) or f"{advice}, and that projector and camera have gamma 1"
+            warning = f"{_doubt(smoothness, axis, camera)}: {advice}"
         out += [warning] if warning else []
     return out
 
@@ -143,6 +152,26 @@ def _fitting_order(lines: CodeLines, axis: Axis, orders: Iterable[tuple[str, lis
         if not smoothness.doubtful and smoothness.evenness - smoothness.contradicted > best:
             best, description = smoothness.evenness - smoothness.contradicted, name
     return description
+
+
+def _fitting_gamma(lines: CodeLines, axis: Axis) -> str:
+    """Return what to do about a gamma without which the coordinates are smooth; "" if none is found."""
+    best, found = 0.0, 1.0
+    for gamma in _GAMMAS:
+        rows, columns = (
+            np.rint(_FINE * (part / lines.full_scale) ** (1 / gamma)).astype(np.uint16) for part in lines.lines
+        )
+        decoded = replace(lines, lines=(rows, columns), full_scale=_FINE).decoded(axis)
+        smoothness = _smoothness([{axis: coordinate} for coordinate in decoded])[axis]
+        if not smoothness.doubtful and smoothness.evenness - smoothness.contradicted > best:
+            best, found = smoothness.evenness - smoothness.contradicted, gamma
+    if not best:
+        return ""
+    side = "over" if found > 1 else "under"
+    return (
+        f"they fit in this order if projector and camera have a gamma {side} 1. Set both to 1, or use five steps or "
+        "more, or white and black images, with correct_gamma = true in [decoder]"
+    )
 
 
 def _smoothness(lines: Sequence[Mapping[Axis, ProjectorCoordinate]]) -> dict[Axis, Smoothness]:

@@ -140,6 +140,22 @@ def test_noise_gamma_and_bits_are_no_reason(disturbed):
     assert said(capture) == ""
 
 
+@pytest.mark.parametrize(
+    ("code", "gamma"),
+    [
+        (PhaseShift(periods_px=[260, 40, 16], steps=3), 2.6),
+        (PhaseShift(periods_px=[20, 18.6], steps=3), 0.5),
+        (PhaseShift(periods_px=[20, 18.6], steps=3), 2.2),
+    ],
+)
+def test_a_gamma_is_told_from_images_in_another_order(code, gamma):
+    capture = taken(code, gamma=gamma)
+    assert f"in this order if projector and camera have a gamma {'over' if gamma > 1 else 'under'} 1" in said(capture)
+    order = list(range(len(roles(code, 256, 192))))
+    order[1], order[3] = order[3], order[1]
+    assert "check that the images are in the order of [pattern]" in said(with_images(capture, order))
+
+
 def test_white_and_black_exchanged():
     capture = taken(BOTH)
     count = len(capture.images["camera"])
