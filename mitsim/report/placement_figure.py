@@ -69,6 +69,9 @@ _STACKED_IN = (3.9, 5.6)
 _BESIDE = (0.0, 0.09, 0.46, 0.91), (0.46, 0.09, 0.54, 0.91)
 _STACKED = (0.0, 0.54, 1.0, 0.46), (0.0, 0.1, 1.0, 0.42)
 
+#: gap above the legend, as a share of the figure's height; chosen
+_ABOVE_LEGEND = 0.03
+
 #: keeps text readable on lines
 _HALO = [withStroke(linewidth=2.5, foreground=PAPER)]
 
@@ -137,7 +140,11 @@ def draw_placement(
         middle = (geometry.corners.min(axis=(0, 1)) + geometry.corners.max(axis=(0, 1))) / 2
         turn = _viewpoint(matrices[0], middle)
         flat, depth = _projected(geometry.corners - middle, turn)
-        whole, near = (figure.add_axes(box) for box in (_STACKED if stacked else _BESIDE))
+        foot = _legend(figure, verdicts, geometry.camera, 2 if stacked else None) + _ABOVE_LEGEND
+        whole, near = (
+            figure.add_axes((left, max(bottom, foot), width, bottom + height - max(bottom, foot)))
+            for left, bottom, width, height in (_STACKED if stacked else _BESIDE)
+        )
         picture, extent = _part(geometry, flat, depth, turn, verdicts)
         for axes in (whole, near):
             axes.imshow(picture, origin="lower", extent=extent, interpolation="antialiased", zorder=2)
@@ -150,7 +157,6 @@ def draw_placement(
         _axes_of_part(near, turn)
         for axes in (whole, near):
             _make_room_for_texts(axes)
-        _legend(figure, verdicts, geometry.camera, 2 if stacked else None)
 
 
 def _viewpoint(part_from_sensor: Floats, middle: Floats) -> Floats:
@@ -272,10 +278,9 @@ def _sensor(
         body[:, 0], body[:, 1], color=colour, lw=5 if strong else 3, solid_capstyle="round", zorder=5, alpha=alpha
     )
     axes.plot(body[:, 0], body[:, 1], "o", ms=5 if strong else 3, mfc="white", mec=colour, mew=1.2, zorder=6)
-    top = body[np.argmax(body[:, 1])]
     axes.annotate(
         label,
-        tuple(top),
+        tuple(body[np.argmax(body[:, 1])]),
         (0, 8),
         textcoords="offset points",
         ha="center",
@@ -315,10 +320,7 @@ def _axes_of_part(axes: Axes, turn: Floats) -> None:
 
 def _make_room_for_texts(axes: Axes) -> None:
     """Widen the limits along x until all texts lie in the axes' part of the figure."""
-    root = axes.figure.figure
-    assert root is not None
-    canvas: Any = FigureCanvasAgg(root)
-    renderer = canvas.get_renderer()
+    renderer = _renderer(axes.figure)
     for _ in range(_WIDENINGS):
         axes.apply_aspect()
         cell = axes.get_position(original=True).transformed(axes.figure.transSubfigure)
@@ -332,13 +334,17 @@ def _make_room_for_texts(axes: Axes) -> None:
         axes.set_xlim(low - max(left + 2, 0) * per_pixel, high + max(right + 2, 0) * per_pixel)
 
 
-def _legend(figure: FigureBase, verdicts: Mapping[str, str], camera: str, columns: int | None) -> None:
+def _renderer(figure: Any) -> Any:
+    return FigureCanvasAgg(figure.figure).get_renderer()
+
+
+def _legend(figure: FigureBase, verdicts: Mapping[str, str], camera: str, columns: int | None) -> float:
+    """Draw the legend at the foot of a figure, and return its upper end as a share of the figure's height."""
     used = [verdict for verdict in VERDICTS if verdict in verdicts.values()]
     handles: list[Any] = [Patch(facecolor=VERDICTS[verdict], label=_LEGEND.get(verdict, verdict)) for verdict in used]
     handles.append(Patch(facecolor=_NOT_ASKED, label="not measured"))
     seen = f"field of view of the {camera or 'first'} camera".replace("camera camera", "camera")
     handles.append(Line2D([], [], color=INK, lw=0.8, ls="--", label=seen))
-    space = 1.4 if columns is None else 0.8
-    figure.legend(
-        handles=handles, loc="lower center", ncols=columns or len(handles), handlelength=1.2, columnspacing=space
-    )
+    layout: dict[str, Any] = {"ncols": columns or len(handles), "columnspacing": 1.4 if columns is None else 0.8}
+    legend = figure.legend(handles=handles, loc="lower center", handlelength=1.2, **layout)
+    return float(legend.get_window_extent(_renderer(figure)).transformed(figure.transSubfigure.inverted()).y1)

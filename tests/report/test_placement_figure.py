@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from characterisation.plots.labels import cut, spread
-from mitsim.report.placement_figure import depth_buffer, face_verdicts, placement_figure
+from mitsim.report.placement_figure import depth_buffer, draw_placement, face_verdicts, placement_figure
 from mitsim.study.scene_geometry import read_scene_geometry
 from tests.report.conftest import write_scene_geometry
 
@@ -53,6 +54,26 @@ def test_no_writing_of_the_picture_overlaps_other_writing_or_leaves_it(tmp_path,
     inside = figure.bbox.padded(0.5)
     assert all(inside.x0 <= one.x0 and one.x1 <= inside.x1 for one in boxes), boxes
     assert not [(a, b) for k, a in enumerate(boxes) for b in boxes[:k] if a.overlaps(b)]
+
+
+@pytest.mark.parametrize("height", [1.3, 1.58, 3.4])
+def test_the_legend_of_a_small_picture_touches_no_part_of_it(tmp_path, height):
+    """On a sheet of many rows the picture is 1.3 in high, and its legend lay over the part and its sensor."""
+    write_scene_geometry(tmp_path)
+    geometry = read_scene_geometry(tmp_path)
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[2, 3] = 500.0
+    figure = Figure((7.27, height))
+    draw_placement(figure, geometry, [("view 3", pose)], dict.fromkeys(geometry.names, "fits"))
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    legend = figure.legends[0].get_window_extent(canvas.get_renderer())
+    boxes = [
+        one.get_window_extent(canvas.get_renderer())
+        for axes in figure.axes
+        for one in (*axes.images, *axes.lines, *axes.patches, *axes.texts)
+    ]
+    assert len(boxes) > 10 and min(box.y0 for box in boxes) >= legend.y1
 
 
 def test_of_many_triangles_each_pixel_shows_the_nearest():
