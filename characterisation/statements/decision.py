@@ -198,6 +198,9 @@ def _limited_below(errors: Errors, tolerance: Tolerance) -> bool:
 def acceptance(errors: Errors, tolerance: Tolerance) -> tuple[float, float] | None:
     """Return the readings, from and to, that the rule of the tolerance accepts; None if there are none."""
     lower, upper, rule = tolerance.lower, tolerance.upper, tolerance.rule
+    folds = _limited_below(errors, tolerance)
+    if folds and not rule.subtract_bias:
+        upper = 90.0  # no reading lies above; one minus its bias may
     if rule.rule == "simple_acceptance":
         return (lower, upper) if expanded_uncertainty(stated_errors(errors)) < tolerance.size else None
     if rule.rule == "jcgm_106":
@@ -208,7 +211,7 @@ def acceptance(errors: Errors, tolerance: Tolerance) -> tuple[float, float] | No
         below, above = max(high, 0.0), max(-low, 0.0)
     else:
         below = above = expanded_uncertainty(stated_errors(errors))
-    most = max(upper - above, 90.0) if _limited_below(errors, tolerance) else upper - above
+    most = max(upper - above, 90.0) if folds else upper - above
     room = most - lower - below if math.isfinite(lower) else most
     return (lower + below, most) if room > 0 else None
 

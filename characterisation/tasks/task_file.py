@@ -174,6 +174,19 @@ class Measurement(Document):
             raise ValueError(f"deviations from nominal: as the limits of the value, they are [{shown}]")
         return lower, upper
 
+    @model_validator(mode="after")
+    def _limits_that_a_value_can_keep(self) -> Measurement:
+        """Check that some value conforms: lengths and angles are not negative, and angles have a largest value."""
+        lowest, highest = self.limits
+        most = math.inf if self.unit == "mm" else 90.0 if self.kind in LINE_ANGLES else 180.0
+        if highest <= 0 or lowest >= most:
+            range_of_values = "at least 0" + ("" if math.isinf(most) else f" and at most {most:g} deg")
+            raise ValueError(
+                f"no value of a {self.kind} keeps its limits, {lowest:.6g} and {highest:.6g} {self.unit}: a value is "
+                f"{range_of_values}; correct nominal or tolerance, which is the deviation from it"
+            )
+        return self
+
     @property
     def zone(self) -> bool:
         """Return whether the value is the width or diameter of a zone, and so never negative."""

@@ -4,6 +4,7 @@ import tomllib
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from characterisation.features.fitted import with_covariance
@@ -235,3 +236,19 @@ def test_tolerances_that_the_same_values_meet_have_one_size(kind, unit, nominal,
     table = {"kind": kind, "features": ("a", "b"), "nominal": nominal, "unit": unit}
     sizes = [Measurement.model_validate(table | {"tolerance": tolerance}).tolerance_size for tolerance in tolerances]
     assert sizes == pytest.approx([size] * len(tolerances))
+
+
+@pytest.mark.parametrize(
+    ("kind", "unit", "nominal", "tolerance", "limits"),
+    [
+        ("plane_angle", "deg", 90.0, [0.1, 0.5], "90.1 and 90.5 deg"),
+        ("axis_angle", "deg", 95.0, 1.0, "94 and 96 deg"),
+        ("point_distance", "mm", 0.1, [-0.5, -0.2], "-0.4 and -0.1 mm"),
+    ],
+)
+def test_limits_that_no_value_can_keep_are_refused(kind, unit, nominal, tolerance, limits):
+    """An angle of planes is at most 90 deg and a distance never negative: every part would be rejected."""
+    asked = {"kind": kind, "features": ("a", "b"), "nominal": nominal, "unit": unit}
+    with pytest.raises(ValidationError, match=limits):
+        Measurement.model_validate(asked | {"tolerance": tolerance})
+    assert Measurement.model_validate(asked | {"nominal": 90.0, "tolerance": [-0.5, 0.5]}).tolerance == (-0.5, 0.5)
