@@ -127,7 +127,7 @@ def _of_arrays(path: Path, data: bytes, suffix: str) -> NDArray[np.floating]:
         arrays = arrays_of_npz(data, path)
     else:
         arrays = dict(_arrays_in(read_mat(path, data, _MOST_NUMBERS, simplify_cells=True)))
-    points = points_among(arrays)
+    points = points_among(arrays, path)
     if points is None:
         shapes = ", ".join(f"{name} {' x '.join(map(str, array.shape))}" for name, array in arrays.items())[:200]
         allowed = "an array of n x 3, 3 x n or rows x columns x 3, or x, y and z alike"

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 from mitsim.capture.npy import NPY_MAGIC, numbers_of_npy
+from mitsim.capture.recordings.point_columns import check_points_first
 from mitsim.capture.recordings.recording_files import chosen_frame
 
 #: most values of a point: x, y, z, normal and colour
@@ -81,7 +82,7 @@ def map_in(data: bytes, where: Path, frame: int | None = None) -> NDArray[Any]:
         {"": numbers_of_npy(data, where, tables=True)} if data.startswith(NPY_MAGIC) else arrays_of_npz(data, where)
     )
     arrays = _large(arrays)
-    points = points_among(arrays)
+    points = points_among(arrays, where)
     if points is not None and points.ndim == 3 and min(points.shape[:2]) > 1:
         return points
     flat = {name: array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array for name, array in arrays.items()}
@@ -113,10 +114,15 @@ def disparities(where: str | Path) -> InputError:
     return InputError(where, "", "disparities, by the name", "depths", hint)
 
 
-def points_among(arrays: dict[str, NDArray[Any]]) -> NDArray[Any] | None:
+def points_among(arrays: dict[str, NDArray[Any]], where: str | Path) -> NDArray[Any] | None:
     """Return the array of points (n, 3) or (rows, columns, 3) among arrays; None without one.
 
     Of several, one that is named so comes first, then the largest; colours and normals are none.
+
+    Raises
+    ------
+    InputError
+        If numbers of rows or colours precede x, y and z in the array; the error names the file ``where``.
     """
     arrays = _large(arrays)
     fields = {
@@ -137,7 +143,11 @@ def points_among(arrays: dict[str, NDArray[Any]]) -> NDArray[Any] | None:
         for name, array in real.items()
         if (_POINTS.search(name) or not _NO_POINTS.search(name)) and (points := _with_points_last(array)) is not None
     ]
-    return max(turned, key=lambda candidate: candidate[:2], default=(False, 0, None))[2]
+    points = max(turned, key=lambda candidate: candidate[:2], default=(False, 0, None))[2]
+    if points is None:
+        return None
+    check_points_first(points.reshape(-1, points.shape[-1]), where, "save x, y and z alone")
+    return points[..., :3]
 
 
 def _large(arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
@@ -146,11 +156,11 @@ def _large(arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 
 def _with_points_last(array: NDArray[Any]) -> NDArray[Any] | None:
-    """Return x, y, z of an array whose last or first axis has them; None if it has no such axis."""
+    """Return an array whose last axis begins with x, y, z, of one whose last or first axis has them; else None."""
     if array.ndim not in (2, 3) or not array.size or array.dtype == np.uint8:  # of a colour image
         return None
     if 3 <= array.shape[-1] <= _MOST_VALUES:
-        return array[..., :3]
+        return array
     if array.shape[0] != 3 or min(array.shape[1:]) <= _MOST_VALUES or not (array[:2] < 0).any():
         return None  # without x or y on both sides of the axis they are three images of depths
     return np.moveaxis(array, 0, -1)

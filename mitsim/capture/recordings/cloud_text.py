@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from characterisation.files.errors import InputError
 from mitsim.capture.recordings.cloud_numbers import unit_in, unit_named
 from mitsim.capture.recordings.number_text import number_words
+from mitsim.capture.recordings.point_columns import check_points_first
 from mitsim.sensor.calibration_qualifiers import UNITS_MM
 
 #: largest text [bytes]; reading takes ten times as much memory
@@ -87,7 +88,7 @@ def points_of_text(data: bytes, path: Path) -> tuple[NDArray[np.float64], str | 
     names = next((titles for line in heads if (titles := _names(line, columns))), [])
     unit = _unit(heads, path)
     if not names:
-        _check_no_counters(table, path)
+        check_points_first(table, path, "write the names above: number,x,y,z")
         return table[:, :3], unit
     if len(names) != columns or not set("xyz") <= set(names):
         shown = f"the names {', '.join(names)[:80]} of {columns} columns"
@@ -145,35 +146,6 @@ def _unit(heads: list[str], path: Path) -> str | None:
         if units:
             return units.pop()
     return unit_in(heads)
-
-
-def _check_no_counters(table: NDArray[np.float64], path: Path) -> None:
-    """Check that a text without names has x, y and z first.
-
-    Numbers of a row, or of a row and a column, are whole, and three of a colour up to 255; three columns after them
-    that are not, or that do not vary, are x, y and z.
-
-    Raises
-    ------
-    InputError
-        If the first one or two columns count, or the first three are colours.
-    """
-    sample = table[np.linspace(0, len(table) - 1, min(1000, len(table))).astype(np.intp)]
-    sample = sample[np.isfinite(sample).all(axis=1)]
-    whole = (sample % 1 == 0).all(axis=0) if len(sample) else np.ones(table.shape[1], bool)
-    varies = (sample != sample[:1]).any(axis=0) if len(sample) else ~whole
-    for count in (1, 2, 3):
-        if table.shape[1] < count + 3:
-            continue
-        if count == 3 and not (
-            ((sample[:, :3] >= 0) & (sample[:, :3] <= 255)).all() and np.abs(sample[:, 3:6]).max() > 1
-        ):
-            continue  # whole coordinates, or normals after them
-        lengths = (~whole)[count : count + 3].sum() >= 2 and not (whole & varies)[count : count + 3].any()
-        if whole[:count].all() and varies[:count].any() and lengths:
-            counting = ("the first seems to count", "the first two seem to count", "the first three seem to be colours")
-            found = f"{table.shape[1]} columns without names, of which {counting[count - 1]}"
-            raise InputError(path, "", found, "x, y and z first, or names", "write the names above: number,x,y,z")
 
 
 def _with_points(rows: list[bytes]) -> list[bytes]:

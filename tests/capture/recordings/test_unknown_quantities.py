@@ -8,12 +8,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from characterisation.files.errors import InputError
 from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
 from mitsim.capture.recordings.array_file import map_in
 from mitsim.capture.recordings.cloud_text import points_of_text
 from mitsim.capture.recordings.depth_image import missing_depths, read_depth_image
+from mitsim.decoding.plain_clouds import read_plain_cloud
 from tests.capture.recordings.cloud_files_of_others import pinhole_cloud
 
 CLOUD = pinhole_cloud()
@@ -81,6 +83,40 @@ def test_colours_before_the_points_of_a_text_are_refused():
     whole = [(i % 9, i // 9, 200 - i, 0.6, 0.0, -0.8) for i in range(50)]
     text = "\n".join(" ".join(map(str, row)) for row in whole).encode()
     assert points_of_text(text, Path("a.xyz"))[0][-1].tolist() == [4, 5, 151]
+
+
+@pytest.mark.parametrize("ending", [".csv", ".txt", ".asc"])
+def test_a_map_of_depths_in_a_text_is_no_list_of_points(tmp_path, ending):
+    """The first three columns were measured as x, y and z."""
+    path = tmp_path / f"a{ending}"
+    head = "ncols 64\nnrows 48\ncellsize 1\n" if ending == ".asc" else ""
+    np.savetxt(path, np.full((48, 64), 600.5), header=head, comments="", delimiter="," if ending == ".csv" else " ")
+    with pytest.raises(InputError, match=r"64 columns without names, as of a map of depths.*--calibration"):
+        points_of_text(path.read_bytes(), path)
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".npz", ".mat"])
+@pytest.mark.parametrize(
+    ("before", "told"),
+    [
+        (np.arange(400.0)[:, None], "the first seems to count"),
+        (np.stack(np.divmod(np.arange(400.0), 20), axis=1), "the first two seem to count"),
+        (np.random.default_rng(0).integers(0, 255, (400, 3)), "the first three seem to be colours"),
+    ],
+)
+def test_counters_and_colours_before_the_points_of_an_array_are_refused(tmp_path, suffix, before, told):
+    """They were measured as x, y and z; of a text they were refused."""
+    values = np.concatenate(
+        [before, np.random.default_rng(1).uniform([-90, -90, 500], [90, 90, 600], (400, 3))], axis=1
+    )
+    path = tmp_path / f"a{suffix}"
+    save = {".npy": np.save, ".npz": lambda file, array: np.savez(file, cloud=array)}
+    (savemat(path, {"cloud": values}) if suffix == ".mat" else save[suffix](path, values))
+    with pytest.raises(InputError, match=told):
+        read_plain_cloud(path)
+    coloured = np.concatenate([values[:, -3:], before], axis=1)
+    np.save(tmp_path / "b.npy", coloured)
+    np.testing.assert_allclose(read_plain_cloud(tmp_path / "b.npy")[0].points[0], values[:, -3:], rtol=1e-6)
 
 
 @pytest.mark.parametrize(
