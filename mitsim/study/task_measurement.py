@@ -24,7 +24,7 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 from characterisation.tasks import evaluation
 from characterisation.tasks.result import Result
-from characterisation.tasks.task_file import Task
+from characterisation.tasks.task_file import LINE_ANGLES, Task
 from characterisation.tasks.task_reading import check_features
 from mitsim.capture.calibration import EXACT
 from mitsim.capture.recordings.pose_file import read_pose as read_pose_file
@@ -214,7 +214,12 @@ def measure_task(
         statement.check(cloud.sensor, world_from_sensor)
     labelled = _labelled(cloud, scene, world_from_sensor, margin_px)
     results = evaluation.measure(labelled, task, world_from_sensor.inverse().matrix()).values()
-    return [result if statement is None or not result.possible else corrected(result, statement) for result in results]
+    return [
+        result
+        if statement is None or not result.possible
+        else corrected(result, statement, 90.0 if task.measurements[result.name].kind in LINE_ANGLES else math.inf)
+        for result in results
+    ]
 
 
 def _labelled(cloud: PointCloud, scene: Scene, world_from_sensor: Transform, margin_px: int) -> PointCloud:
@@ -222,10 +227,11 @@ def _labelled(cloud: PointCloud, scene: Scene, world_from_sensor: Transform, mar
     return replace(cloud, feature=labels, feature_names=scene.names)
 
 
-def corrected(result: Result, statement: ViewStatement) -> Result:
+def corrected(result: Result, statement: ViewStatement, most: float = math.inf) -> Result:
     """Subtract the bias of a measurement; its uncertainty becomes that of the statement.
 
-    A value that folds stays at least 0: its bias is that of a part at the limit of the tolerance.
+    A value that folds stays at least 0, and at ``most`` 90 deg for an angle of lines: its bias is that of a part at the
+    limit of the tolerance.
 
     Raises
     ------
@@ -244,7 +250,7 @@ def corrected(result: Result, statement: ViewStatement) -> Result:
     value = result.value - correction.bias
     return replace(
         result,
-        value=value if result.deviations is None else max(value, 0.0),
+        value=min(value if result.deviations is None else max(value, 0.0), most),
         bias=correction.bias,
         uncertainty=correction.uncertainty,
         origin="statement",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -12,6 +13,7 @@ from mitsim.sensor.rig_parameters import eyes, parameter_differences
 from mitsim.sensor.transforms import Transform
 from mitsim.study.calibration.board import Board
 from mitsim.study.calibration.bundle import BoardView
+from mitsim.study.calibration.halves import calibrate_checked
 from mitsim.study.calibration.recorded import RecordedBoard, calibrate_recorded
 from mitsim.study.calibration.simulated import simulate_corners
 
@@ -103,4 +105,19 @@ def test_a_lens_beyond_the_model_is_refused():
         boards.append(RecordedBoard(np.arange(len(points)), {"camera": shown + np.array([2999.5, 1999.5])}))
     with pytest.raises(InputError, match=r"residuals of .* px") as caught:
         calibrate_recorded(boards, wide, {"camera": (6000, 4000)}, "simulated")
+    assert "nan" not in str(caught.value)
+
+
+@pytest.mark.parametrize("poses", [5, 8])
+def test_corners_of_a_transposed_board_are_refused(poses):
+    """--board 8x11 for 11x8: the fitted lens saw no corner. f was 1.7 px, its covariance NaN; 8 poses, a traceback."""
+    rng, lens = np.random.default_rng(6), np.array([-0.1, 0.05, 0.0005, -0.0003, 0.0])
+    matrix = np.array([[900.0, 0, 640], [0, 900, 400], [0, 0, 1]])
+    board, told, boards = Board(11, 8, 30.0, "glass"), Board(8, 11, 30.0, "glass"), []
+    for _ in range(poses):
+        place = np.array([*rng.uniform(-100, 100, 2) * (1, 0.6), rng.uniform(600, 1000)])
+        seen, _ = cv2.projectPoints(board.corners - (135, 90, 0), rng.uniform(-0.5, 0.5, 3), place, matrix, lens)
+        boards.append(RecordedBoard(np.arange(70), {"camera": seen[:, 0] + rng.normal(0, 0.05, (70, 2))}))
+    with pytest.raises(InputError, match=r"order of --board") as caught:
+        calibrate_checked(boards, told, {"camera": (1280, 800)}, "simulated")
     assert "nan" not in str(caught.value)
