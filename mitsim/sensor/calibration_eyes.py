@@ -49,6 +49,12 @@ _LENSES = frozenset(name.lower() for name in (*USUAL_NAMES["distortion"][0], "co
 _BENT = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "taux", "tauy")
 _FISHEYE = ("k1", "k2", "k3", "k4")
 
+#: names of lists of radial and of tangential coefficients; MATLAB's are written together
+_RADIAL_TANGENTIAL = (
+    ("radial_distortion", "radial_coefficients", "radial"),
+    ("tangential_distortion", "tangential_coefficients", "tangential"),
+)
+
 #: a map by its dotted name
 _Named = tuple[str, dict[str, Any]]
 
@@ -184,7 +190,7 @@ def _eye(path: list[_Named], depth: int, matrix: Composed) -> CalibratedEye:
         qualifying |= {key: value for key, value in table.items() if not isinstance(value, dict) or key == "roi"}
     values = {
         "matrix": Composed(matrix.value, matrix.sources, qualifying),
-        "distortion": _lens(maps, is_fisheye(qualifying)),
+        "distortion": lens_in(maps, is_fisheye(qualifying)),
         "size": _size(around),
         **pose_in(maps),
     }
@@ -214,6 +220,8 @@ def _matrix(name: str, table: dict[str, Any]) -> Composed | None:
     if all(keys[:4]):
         fx, fy, cx, cy = (_number(table[key]) for key in keys[:4])
         sources = keys[:4]
+        if "fl_x" in low and keys[0] == low["fl_x"]:  # of COLMAP, whose pixels have their centres at halves
+            cx, cy = cx - 0.5, cy - 0.5
     elif (focal := vector(table.get(keys[4]), 2)) is not None and (centre := vector(table.get(keys[5]), 2)) is not None:
         fx, fy, cx, cy = *focal, *centre
         sources = keys[4:]
@@ -222,13 +230,16 @@ def _matrix(name: str, table: dict[str, Any]) -> Composed | None:
         sources = [low["intrinsics"]]
     else:
         return None
-    return Composed(
-        np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), tuple(dotted(name, source) for source in sources), {}
-    )
+    skew = vector(table.get(low.get("skew", ""), 0.0), 1)  # which the check of the matrix refuses
+    K = np.array([[fx, 0 if skew is None else skew[0], cx], [0, fy, cy], [0, 0, 1]])
+    return Composed(K, tuple(dotted(name, source) for source in sources), {})
 
 
-def _lens(maps: list[_Named], fisheye: bool) -> Composed | None:
-    """Return the distortion in the first of several maps that states one, as a list or as single numbers."""
+def lens_in(maps: Sequence[_Named], fisheye: bool) -> Composed | None:
+    """Return the distortion in the first of several maps that states one: a list, single numbers, or two lists.
+
+    The two lists are those of radial and of tangential coefficients. ``maps`` have their dotted names.
+    """
     for name, table in maps:
         low = {key.lower(): key for key in table}
         for spelling in sorted(_LENSES & set(low)):
@@ -247,6 +258,12 @@ def _lens(maps: list[_Named], fisheye: bool) -> Composed | None:
                 _number(table[low[coefficient]]) if coefficient in names else 0.0 for coefficient in order[:count]
             ]
             return Composed(np.array(numbers), tuple(dotted(name, low[coefficient]) for coefficient in names), table)
+        radial, tangential = (next((key for key in keys if key in table), "") for keys in _RADIAL_TANGENTIAL)
+        k, p = vector(table.get(radial)), vector(table.get(tangential, [0.0, 0.0]), 2)
+        if k is not None and p is not None and 1 <= len(k) <= 3:
+            k1, k2, k3 = [*k, 0.0, 0.0][:3]
+            sources = tuple(dotted(name, source) for source in (radial, tangential) if source)
+            return Composed(np.array([k1, k2, *p, k3]), sources, table)
     return None
 
 

@@ -24,14 +24,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.sensor.calibration_eyes import eyes_of, usual_values
+from mitsim.sensor.calibration_eyes import eyes_of, lens_in, usual_values
+from mitsim.sensor.calibration_names import USUAL_NAMES
 from mitsim.sensor.calibration_numbers import Composed, dotted, vector
 from mitsim.sensor.calibration_poses import inverse
 from mitsim.sensor.calibration_qualifiers import rectified_pair
 from mitsim.sensor.calibration_quaternions import with_rotations
+from mitsim.sensor.lens_models import is_fisheye
 
 #: endings of names in MATLAB's toolbox and similar programs: one camera, the cameras of a pair, camera and projector
 _ENDINGS = ("", "_left", "_right", "_cam", "_proj", "_camera", "_projector")
+
+#: names of the distortion of a camera or projector
+_DISTORTIONS = [name for names in USUAL_NAMES["distortion"] for name in names if "+" not in name]
 
 #: number of maps around a structure of MATLAB, beyond the first, that are searched; chosen
 _DEEPEST = 3
@@ -48,10 +53,27 @@ _MESSAGE = {
 def with_usual_names(tree: dict[str, Any]) -> dict[str, Any]:
     """Return the tree of one file, with composed values under names that begin with a plus."""
     tree = _of_old_orb_slam(with_rotations(tree))
-    out = _of_message(tree)
+    out = _of_message(_with_lenses(tree))
     out |= usual_values(eyes_of(out)) | _bouguet(out)
     out |= _orb_slam(out)
+    if "+D1" not in out and (lens := _lens_beside_matrix(tree)) is not None:
+        out["+D1"] = lens
     return out | _toolbox(tree, out)
+
+
+def _with_lenses(tree: dict[str, Any]) -> dict[str, Any]:
+    """Return the tree; coefficients in a map under a usual name, such as ``distortion``, are a list."""
+    fisheye = is_fisheye(tree)
+    lenses = {name: lens_in([("", tree[name])], fisheye) for name in _DISTORTIONS if isinstance(tree.get(name), dict)}
+    return tree | {name: lens.value for name, lens in lenses.items() if lens is not None}
+
+
+def _lens_beside_matrix(tree: dict[str, Any]) -> Composed | None:
+    """Return the distortion that stands in single numbers or two lists, in no map, beside a matrix."""
+    if not any(vector(tree.get(name), 9) is not None for name in USUAL_NAMES["matrix"][0]):
+        return None
+    lens = lens_in([("", tree)], is_fisheye(tree))
+    return lens if lens is not None and len(lens.sources) > 1 else None
 
 
 def _toolbox(tree: dict[str, Any], out: dict[str, Any]) -> dict[str, Any]:

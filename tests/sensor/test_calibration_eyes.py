@@ -40,7 +40,8 @@ FILES = {
     "zivid": {"CameraIntrinsics": {"CameraMatrix": CAPITALS, "Distortion": {k.upper(): v for k, v in SINGLES.items()}}},
     "librealsense": OF_LIBREALSENSE | {"model": "distortion.brown_conrady", "coeffs": D},
     "nested librealsense": {"intrinsics": OF_LIBREALSENSE | {"coeffs": D}, "depth_scale": 0.001},
-    "nerf": {"fl_x": FX, "fl_y": FY, "cx": CX, "cy": CY, "w": 640, "h": 480, **SINGLES},
+    # as COLMAP writes them for instant-ngp and nerfstudio: the centre of the first pixel is at 0.5, 0.5
+    "nerf": {"fl_x": FX, "fl_y": FY, "cx": CX + 0.5, "cy": CY + 0.5, "w": 640, "h": 480, **SINGLES},
     "lists of two": {"focal_length": [FX, FY], "principal_point": [CX, CY], "distortion": D},
     "euroc": {
         "camera_model": "pinhole",
@@ -56,6 +57,11 @@ FILES = {
     "a size in a map": {"intrinsics": NUMBERS, "distortion": SINGLES, "resolution": {"width": 640, "height": 480}},
     "texts": {name: str(value) for name, value in {**NUMBERS, **SINGLES}.items()},
     "a list of one": {"cameras": [{"name": "only", **NUMBERS, "dist_coeffs": D}]} | {"rms": 0.1},
+    "coefficients in a map": {"K": K.tolist(), "distortion": SINGLES},
+    "coefficients beside": {"K": K.tolist(), **SINGLES},
+    "radial and tangential": {**NUMBERS, "radial_distortion": [*D[:2], D[4]], "tangential_distortion": D[2:4]},
+    "both in a map": {"camera_matrix": K.tolist(), "dist": {"radial": [*D[:2], D[4]], "tangential": D[2:4]}},
+    "both beside": {"camera_matrix": K.tolist(), "radial_distortion": [*D[:2], D[4]], "tangential_distortion": D[2:4]},
     "equal frames": {"frames": {f"frame_{number}": {**NUMBERS, **SINGLES} for number in range(3)}},
 }
 
@@ -251,6 +257,7 @@ def test_a_map_named_in_a_sensor_file(tmp_path):
         ({"fx": float("nan")}, r"fx, fy, ppx, ppy: found \[\[nan"),
         ({"fx": "600,5"}, r"fx, fy, ppx, ppy: found \[\[nan"),
         ({"coeffs": [0.1] * 6}, "coeffs: found an array of 6"),
+        ({"skew": 1.5}, r"matrix of camera: found a skew of 1\.5 px"),
         ({"fx": 10**400}, r"fx, fy, ppx, ppy: found \[\[nan"),
     ],
 )
