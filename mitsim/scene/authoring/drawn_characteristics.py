@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 #: note of a tolerance whose zone is not centred on the surface
 UNEQUAL = "its zone lies unequally about the surface"
 
+#: note of a tolerance whose zone lies outside the feature
+PROJECTED = "its zone is projected out of the feature"
+
 
 @dataclass(frozen=True)
 class DrawnTarget:

@@ -7,18 +7,23 @@ each zone -> kind of measurement and names of the datums, or a sentence with the
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
 from characterisation.tasks.places import mid_plane
 from characterisation.tasks.zones import Datum, frame_fault
-from mitsim.scene.authoring.drawn_characteristics import UNEQUAL, GeometricTolerance
+from mitsim.scene.authoring.drawn_characteristics import PROJECTED, UNEQUAL, GeometricTolerance
 from mitsim.scene.authoring.face import Face
 
 #: two sides belong to a slot or a web if their normals are opposite within this cosine
 _OPPOSITE = -0.9999
+
+_PLANES = "between two planes"
+
+#: forms of zones, by a part of their names in a file (ISO 10303-47)
+_FORMS = {"spher": "within a sphere", "cylind": "within a cylinder", "circ": "within a cylinder", "plane": _PLANES}
 
 
 @dataclass(frozen=True)
@@ -89,6 +94,8 @@ def zones(tolerance: GeometricTolerance, faces: Sequence[Face], datum_faces: Map
             continue
         zone = _zone(tolerance, side, datums)
         if isinstance(zone, Zone):
+            zone = _with_form(zone, tolerance)
+        if isinstance(zone, Zone):
             out.zones.append(zone)
         else:
             out.left_out.append((side.name, zone))
@@ -102,18 +109,36 @@ def _side(faces: Sequence[Face]) -> Side | None:
     return middle(faces)
 
 
+def _with_form(zone: Zone, tolerance: GeometricTolerance) -> Zone | str:
+    """Return the zone if it has the form that the file states, with a remark if it states none; else the reason."""
+    if zone.kind in ("flatness", "cylindricity"):
+        return zone
+    stated = next((note.casefold() for note in tolerance.notes if note.startswith("zone:")), "")
+    form, of_task = next((form for word, form in _FORMS.items() if word in stated), None), _form(zone)
+    if form not in (None, of_task):
+        return f"its zone lies {form}, and that of a task {of_task}"
+    if stated or of_task == _PLANES:
+        return zone
+    return replace(zone, remarks=(*zone.remarks, f"the file states no form of its zone: it is taken {of_task}"))
+
+
+def _form(zone: Zone) -> str:
+    """Return the form of a zone of position or orientation in a task."""
+    if isinstance(zone.of.surface, Sphere):
+        return "within a sphere"
+    flat_datum = bool(zone.datums) and isinstance(zone.datums[0].surface, Plane)
+    across = {"symmetry": True, "parallelism": flat_datum, "perpendicularity": not flat_datum}.get(zone.kind, False)
+    return _PLANES if isinstance(zone.of.surface, Plane) or across else "within a cylinder"
+
+
 def _zone(tolerance: GeometricTolerance, side: Side, datums: Sequence[Side | None]) -> Zone | str:
     """Return the zone of one side, or the reason why a task has none."""
     surface = side.surface
     flat, axis = isinstance(surface, Plane), isinstance(surface, Cylinder | Cone)
     if UNEQUAL in tolerance.notes:
         return f"{UNEQUAL}, and those of a task lie equally about it"
-    if (
-        axis
-        and tolerance.kind != "symmetry"
-        and any(note.startswith("zone:") and "plane" in note for note in tolerance.notes)
-    ):
-        return "its zone lies between two planes, and those of an axis in a task are cylinders"
+    if PROJECTED in tolerance.notes:
+        return f"{PROJECTED}, and those of a task lie at it"
     match tolerance.kind:
         case "flatness" if flat:
             return Zone("flatness", side)

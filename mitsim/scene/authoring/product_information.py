@@ -13,6 +13,7 @@ from collections import defaultdict
 from typing import Any
 
 from mitsim.scene.authoring.drawn_characteristics import (
+    PROJECTED,
     UNEQUAL,
     Dimension,
     DrawnTarget,
@@ -95,13 +96,23 @@ class _Reader:
             if isinstance(of, Reference) and band is not None:
                 self.limits[of.number] = band
         self.zones: dict[int, str] = {}  # form of the zone, by tolerance
+        definitions = [
+            definition.of("TOLERANCE_ZONE_DEFINITION", "PROJECTED_ZONE_DEFINITION") or (None,)
+            for definition in text.all("PROJECTED_ZONE_DEFINITION")
+        ]
+        projected = {values[0].number for values in definitions if values and isinstance(values[0], Reference)}
+        self.projected: set[int] = set()  # tolerances
         for zone in text.all("TOLERANCE_ZONE"):
             of, form = (None, None, *(zone.of("TOLERANCE_ZONE") or ()))[-2:]
             shape = text.follow(form)
             zone_form = shape.of("TOLERANCE_ZONE_FORM") if shape else None
             for member in of if isinstance(of, tuple) else ():
-                if isinstance(member, Reference) and zone_form and isinstance(zone_form[0], str):
+                if not isinstance(member, Reference):
+                    continue
+                if zone_form and isinstance(zone_form[0], str):
                     self.zones[member.number] = zone_form[0]
+                if zone.number in projected:
+                    self.projected.add(member.number)
 
     def target(self, reference: Any) -> DrawnTarget:
         """Return the object of a shape aspect, through its members and the aspects it was derived from."""
@@ -226,6 +237,8 @@ class _Reader:
             notes.append("all around")
         if entity.number in self.zones:
             notes.append(f"zone: {self.zones[entity.number]}")
+        if entity.number in self.projected:
+            notes.append(PROJECTED)
         letters = self.letters(named, 0)
         return GeometricTolerance(
             entity.number, name, kind, self.measure(values[2]), self.target(values[3]), letters, tuple(notes)

@@ -69,3 +69,57 @@ def test_an_angle_of_a_face_and_an_axis_is_that_of_the_face_not_of_its_normal(dr
         "front_at_y18mm": ("plane_axis_angle", 90, pytest.approx((-0.2, 0.2))),
         "bore_12mm_left": ("axis_angle", 0, None),
     }
+
+
+#: kind, face, datums, form of the zone in the file, and whether a task has a zone of this form (ISO 1101)
+FORMS = [
+    ("POSITION", "seat_18mm", "ABC", "within a sphere", True),
+    ("POSITION", "seat_18mm", "ABC", "within two parallel planes", False),
+    ("POSITION", "seat_18mm", "ABC", "cylindrical or circular", False),
+    ("POSITION", "bore_12mm_left", "ABC", "cylindrical or circular", True),
+    ("POSITION", "bore_12mm_left", "ABC", "within two parallel planes", False),
+    ("POSITION", "bore_12mm_left", "ABC", "spherical", False),
+    ("POSITION", "front", "ABC", "within two parallel planes", True),
+    ("POSITION", "front", "ABC", "cylindrical or circular", False),
+    ("PARALLELISM", "bore_12mm_left", "B", "within two parallel planes", True),
+    ("PARALLELISM", "bore_12mm_left", "B", "cylindrical or circular", False),
+    ("PARALLELISM", "bore_12mm_left", "D", "cylindrical or circular", True),
+    ("PARALLELISM", "bore_12mm_left", "D", "within two parallel planes", False),
+    ("PERPENDICULARITY", "bore_12mm_left", "A", "cylindrical or circular", True),
+    ("PERPENDICULARITY", "bore_12mm_left", "A", "within two parallel planes", False),
+    ("COAXIALITY", "bore_12mm_left", "D", "within two parallel planes", False),
+    ("SYMMETRY", "boss_20mm", "C", "within two parallel planes", True),
+]
+
+
+def test_a_zone_has_the_form_that_the_file_states_or_is_left_out(drawn):
+    """Before, planes had zones of cylinders, spheres those of planes, and axes parallel to a plane had none."""
+    path, drawing, face = drawn
+    named = zip("ABCD", ("bottom", "back", "left", "bore_12mm_right"), strict=True)
+    datums = {letter: drawing.datum(letter, face[name]) for letter, name in named}
+    expected = {}
+    for number, (kind, name, letters, form, known) in enumerate(FORMS, 1):
+        system = drawing.system(*(datums[letter] for letter in letters))
+        made = drawing.tolerance(kind, drawing.measure(number / 100), drawing.aspect(face[name]), system)
+        zone = drawing.add(f"TOLERANCE_ZONE_FORM('{form}')")
+        drawing.add(f"TOLERANCE_ZONE('',$,#{drawing.shape},.F.,(#{made}),#{zone})")
+        if known:
+            expected[number / 100] = (kind.lower(), name)
+    task = task_of(path, drawing)
+    assert {one.tolerance: (one.kind, one.features[0]) for one in task.measurements.values()} == expected
+
+
+def test_a_projected_zone_is_left_out_and_a_form_that_is_not_stated_is_told(drawn):
+    path, drawing, face = drawn
+    datums = [drawing.datum(letter, face[n]) for letter, n in zip("ABC", ("bottom", "back", "left"), strict=True)]
+    bores = [drawing.aspect(face[f"bore_12mm_{side}"]) for side in ("left", "right")]
+    made, _ = (drawing.tolerance("POSITION", drawing.measure(0.1), one, drawing.system(*datums)) for one in bores)
+    form = drawing.add("TOLERANCE_ZONE_FORM('cylindrical or circular')")
+    zone = drawing.add(f"TOLERANCE_ZONE('',$,#{drawing.shape},.F.,(#{made}),#{form})")
+    ends = drawing.aspect(face["top_at_z12mm"])
+    drawing.add(f"PROJECTED_ZONE_DEFINITION(#{zone},(#{ends}),#{ends},#{drawing.measure(30.0)})")
+    path.write_text(drawing.whole())
+    found = read_part(path).drawing
+    assert set(found.measurements) == {"bore_12mm_right_position"}
+    assert any("bore_12mm_left: its zone is projected" in one for one in found.left_out)
+    assert any("bore_12mm_right: the file states no form" in one for one in found.in_part)
