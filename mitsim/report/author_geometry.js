@@ -122,13 +122,65 @@ function already(kind, names) {
   return [...measurements].find(([, one]) => same(one))?.[0];
 }
 
+// Return the points of a face's mesh [mm]; a mid-plane has those of its two faces.
+function pointsOf(name) {
+  const one = features.get(name), number = faces.findIndex((face) => face.name === name), used = new Set();
+  if (one?.kind === 'mid_plane') return one.of.flatMap(pointsOf);
+  owner.forEach((each, i) => { if (each === number) triangles.subarray(3 * i, 3 * i + 3).forEach((corner) => used.add(corner)); });
+  return [...used].map((i) => [vertices[i], vertices[count + i], vertices[2 * count + i]]);
+}
+
+const extent = (points, way) => {
+  let [low, high] = [Infinity, -Infinity];
+  for (const point of points) {
+    const at = point.reduce((sum, value, i) => sum + value * way[i], 0);
+    [low, high] = [Math.min(low, at), Math.max(high, at)];
+  }
+  return high - low;
+};
+
+// Return the convex hull of points in a plane, by Andrew's monotone chain.
+function hull(points) {
+  const sorted = [...points].sort((a, b) => a[0] - b[0] || a[1] - b[1]);
+  const half = (list) => list.reduce((chain, p) => {
+    const left = ([a, b]) => (b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0]) > 0;
+    while (chain.length > 1 && !left(chain.slice(-2))) chain.pop();
+    chain.push(p);
+    return chain;
+  }, []).slice(0, -1);
+  return [...half(sorted), ...half(sorted.reverse())];
+}
+
+// Return the longer side of the smallest rectangle around a face, the diameter of a disk, or the length of an axis [mm].
+function longerSide(name) {
+  const one = geometry(name), points = pointsOf(name), way = along(one ?? {});
+  if (!FLAT.has(one?.kind)) return extent(points, way);
+  const first = unit(cross(way, Math.abs(way[2]) < 0.9 ? [0, 0, 1] : [1, 0, 0])), second = cross(way, first);
+  const corners = hull(points.map((point) => [dot(point, first), dot(point, second)]));
+  const sides = corners.map((a, i) => {
+    const b = corners[(i + 1) % corners.length], size = Math.hypot(b[0] - a[0], b[1] - a[1]), u = [(b[0] - a[0]) / size, (b[1] - a[1]) / size];
+    return [extent(corners, u), extent(corners, [-u[1], u[0]])];
+  });
+  return Math.max(...sides.reduce((least, each) => (each[0] * each[1] < least[0] * least[1] ? each : least), [Infinity, Infinity]));
+}
+
+// Return the leg of a feature's angle with another [mm]: of a face its extent across their edge, of an axis its length.
+function leg(name, other) {
+  const one = geometry(name), way = along(one), across = add(along(geometry(other)), way, -dot(along(geometry(other)), way));
+  return FLAT.has(one.kind) && length(across) > 0.02 ? extent(pointsOf(name), unit(across)) : longerSide(name);
+}
+
 // Return the general tolerance of a measurement by the classes of a drawing's note, as ISO 2768; undefined without one.
 function generalTolerance({ kind, nominal: value, features: names }, dimensions, zones) {
-  const at = (table, name, size) => table?.[name]?.[table.to_mm.findIndex((end) => size <= end)] ?? undefined;
-  const sizes = names.map((name) => Math.max(...(faces.find((face) => face.name === name)?.size ?? [0])));
-  const longest = Math.max(...sizes), shorter = Math.min(...sizes), { unit: of, zone } = data.kinds[kind], general = data.general;
-  if (zone) return at(general.zones[kind], zones, kind === 'perpendicularity' ? shorter : longest);
-  if (of === 'deg') return Number.isFinite(shorter) && at(general.angles, dimensions, shorter) ? Math.round(at(general.angles, dimensions, shorter) / 60 * 1e4) / 1e4 : undefined;
+  // sizes of the mesh are rounded, so that a side of 100 mm is one of up to 100 mm
+  const at = (table, name, size) => table?.[name]?.[table.to_mm.findIndex((end) => Math.round(size * 100) / 100 <= end)] ?? undefined;
+  const { unit: of, zone } = data.kinds[kind], general = data.general;
+  const shorter = () => Math.min(leg(names[0], names[1]), leg(names[1], names[0]));
+  if (zone) return general.zones[kind] && at(general.zones[kind], zones, kind === 'perpendicularity' ? shorter() : Math.max(...names.map(longerSide)));
+  if (of === 'deg') {
+    const wide = names.length === 2 ? at(general.angles, dimensions, shorter()) : undefined;
+    return wide && Math.round(wide / 60 * 1e4) / 1e4;
+  }
   if (value < 0.5) return undefined; // to be given on the drawing
   const half = kind === 'radius' ? 2 : 1, wide = at(general.linear, dimensions, half * value); // half that of the diameter
   return wide === undefined ? undefined : wide / half;

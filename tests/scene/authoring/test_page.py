@@ -23,7 +23,7 @@ from mitsim.study import open_study
 from tests.quick_process import QuickProcess
 from tests.report.chromium import BROWSER
 from tests.scene.authoring.author import Author
-from tests.scene.authoring.bracket import bracket, write_step
+from tests.scene.authoring.bracket import bracket, edge_at, write_step
 from tests.shell import mitsim_here
 
 needs_step = pytest.mark.skipif(not step_installed(), reason="OpenCASCADE, which reads STEP, is not installed")
@@ -281,11 +281,11 @@ def test_rims_tolerance_classes_and_a_coat_are_given_by_a_click(step_file, step_
         "kind": "circle", "of": ["top_at_z12mm"], "point_mm": [-35, -8, 12], "radius_mm": 6
     }  # fmt: skip
     tolerances = {one["kind"]: (one["nominal"], one["tolerance"]) for one in written["measurements"].values()}
-    # ISO 2768-mK: 12 mm, 70 mm, a shorter leg of 100 mm, a plane of 100 mm; the radius keeps its own
+    # ISO 2768-mK: 12 mm, 70 mm, a shorter leg of 47 mm, a plane of 100 mm; the radius keeps its own
     assert tolerances == {
         "diameter": (12, 0.2),
         "axis_distance": (70, 0.3),
-        "plane_angle": (90, pytest.approx(20 / 60, abs=1e-4)),
+        "plane_angle": (90, 0.5),
         "flatness": (0, 0.2),
         "radius": (10, 0.5),
     }
@@ -334,6 +334,48 @@ def test_the_plane_midway_between_the_sides_of_a_wall_is_measured(step_file, ste
     (name,) = {one.features[0] for one in task.measurements.values()}
     assert task.nominal(name).point[1] == 24
     assert {place[1] for place in task.features[name].outline_mm} == {24}
+
+
+@needs_step
+@pytest.mark.browser
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
+def test_general_tolerances_go_by_sides_and_legs_not_by_the_box(step_here, browser, tmp_path):
+    """ISO 2768-mK of a plate of 100 x 70 x 8 mm turned by 30 deg, whose box is 122 mm long, with a chamfer of 7 mm."""
+    from OCP.BRepBuilderAPI import BRepBuilderAPI_Transform
+    from OCP.BRepFilletAPI import BRepFilletAPI_MakeChamfer
+    from OCP.BRepPrimAPI import BRepPrimAPI_MakeBox
+    from OCP.gp import gp_Ax1, gp_Dir, gp_Pnt, gp_Trsf
+
+    box = BRepPrimAPI_MakeBox(100, 70, 8).Shape()
+    chamfered = BRepFilletAPI_MakeChamfer(box)
+    chamfered.Add(5.0, edge_at(box, (50, 70, 8), (1, 0, 0)))
+    motion = gp_Trsf()
+    motion.SetRotation(gp_Ax1(gp_Pnt(0, 0, 0), gp_Dir(0, 0, 1)), np.deg2rad(30))
+    plate = BRepBuilderAPI_Transform(chamfered.Shape(), motion).Shape()
+    made = tmp_path / "made"
+    mitsim_here("part", write_step([("plate", plate, None)], tmp_path / "plate.step"), "-o", made)
+    mitsim_here("check", made / "made.xml", "--task", made / "task.toml", "--html", tmp_path / "page.html")
+    page = Author(browser, (tmp_path / "page.html").as_uri())
+    normals = {
+        name: one["direction"] for name, one in tomllib.loads((made / "task.toml").read_text())["features"].items()
+    }
+    chamfer = next(name for name, way in normals.items() if abs(way[2]) == pytest.approx(np.sqrt(0.5), abs=1e-3))
+    end = next(name for name, way in normals.items() if np.allclose(way, [np.cos(np.pi / 6), 0.5, 0], atol=1e-3))
+    for names, kind in (
+        ((chamfer, "top"), "plane_angle"),
+        (("bottom",), "flatness"),
+        ((end, "bottom"), "perpendicularity"),
+    ):
+        page.choose(*names)
+        page.measure(kind, "")
+    browser.tell("document.getElementById('author-give').click()")
+    written = tomllib.loads(page.downloaded()[1])["measurements"]
+    # legs of up to 10 mm; a side of 100 mm; legs of 8 and 100 mm
+    assert {one["kind"]: one["tolerance"] for one in written.values()} == {
+        "plane_angle": 1.0,
+        "flatness": 0.2,
+        "perpendicularity": 0.4,
+    }
 
 
 @needs_step
