@@ -13,6 +13,7 @@ import numpy as np
 from characterisation.statements.one_sided import OneSidedErrors
 from characterisation.statements.statement import Statement, statement
 from characterisation.statements.tolerance import tolerance_of
+from characterisation.tasks.definitions import DEFINITIONS
 from mitsim.running.time_limit import TimeLimit
 from mitsim.study.session import Session
 from mitsim.study.virtual.drawn_numbers import related, statement_trials
@@ -50,18 +51,34 @@ def state_mean(session: Session, view: View, captures: int, count: int, limit: T
     rows = [trials.errors_of_parts(view.number, [Trial(day, k) for day in whole]) for k in range(captures)]
     common = related([Trial(day) for day in whole])
     return [
-        statement(name, asked.unit, _mean([row[m] for row in rows]), tolerance_of(study.task, name), (), None, common)
+        statement(
+            name,
+            asked.unit,
+            mean_errors([row[m] for row in rows], DEFINITIONS[asked.kind].of == "form"),
+            tolerance_of(study.task, name),
+            (),
+            None,
+            common,
+        )
         for m, (name, asked) in enumerate(study.task.measurements.items())
     ]
 
 
-def _mean(captures: list[np.ndarray | OneSidedErrors]) -> np.ndarray | OneSidedErrors:
-    """Return the mean errors (n,) of days from those of each capture."""
+def mean_errors(captures: list[np.ndarray | OneSidedErrors], form: bool) -> np.ndarray | OneSidedErrors:
+    """Return the mean errors (n,) of days from those of each capture.
+
+    The last deviation of a ``form`` is a standard deviation, that of its noise
+    (:func:`~characterisation.tasks.deviations.form_size`), which differs from capture to capture.
+    """
     first = captures[0]
-    if isinstance(first, OneSidedErrors):
-        vectors = np.array([capture.vectors for capture in captures if isinstance(capture, OneSidedErrors)])
-        return replace(first, vectors=_known_mean(vectors))
-    return _known_mean(np.array(captures))
+    if not isinstance(first, OneSidedErrors):
+        return _known_mean(np.array(captures))
+    vectors = np.array([capture.vectors for capture in captures if isinstance(capture, OneSidedErrors)])
+    mean = _known_mean(vectors)
+    if form:
+        noise = vectors[:, :, -1]
+        mean[:, -1] = np.sqrt(_known_mean(noise**2) / np.maximum(np.isfinite(noise).sum(axis=0), 1))
+    return replace(first, vectors=mean)
 
 
 def _known_mean(values: np.ndarray) -> np.ndarray:
