@@ -1,14 +1,16 @@
 """Poses and statements that a task is measured with: what is read, and what is refused."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from characterisation.files.errors import InputError
 from characterisation.tasks.result import Result
+from characterisation.tasks.task_file import Task
 from mitsim.sensor.transforms import Transform, look_at
-from mitsim.study.task_measurement import corrected, read_pose, read_view_statement
+from mitsim.study.task_measurement import corrected, measure_task, read_pose, read_view_statement
 
 POSE = look_at([0, -450, 250], [0, 0, 0], [0, 0, 1])
 
@@ -38,6 +40,34 @@ def test_a_corrected_zone_is_not_negative(statement):
     one = corrected(Result("gap", "mm", 0.1, deviations=np.zeros((1, 3))), read_view_statement(statement))
     assert one.value == 0 and one.bias == 0.3
     assert corrected(Result("gap", "mm", 0.1), read_view_statement(statement)).value == pytest.approx(-0.2)
+
+
+def test_a_corrected_angle_of_lines_is_at_most_90_deg(statement, monkeypatch):
+    """Two planes that read 89.98 deg, with a bias of -0.05 deg, are no 90.03 deg apart; a cone's angle can be."""
+    table = json.loads(statement.read_text())
+    table["measurements"] = {
+        name: {"unit": "deg", "bias": -0.05, "bias_uncertainty": 0.01, "standard_uncertainty": 0.02}
+        for name in ("corner", "cone")
+    }
+    statement.write_text(json.dumps(table))
+    plane = {"kind": "plane", "point_mm": [0, 0, 0]}
+    cone = {"kind": "cone", "point_mm": [0, 0, 0], "direction": [0, 0, 1], "radius_mm": 5, "half_angle_deg": 45}
+    asked = {"nominal": 90, "unit": "deg"}
+    task = Task.model_validate(
+        {
+            "features": {"a": plane | {"direction": [1, 0, 0]}, "b": plane | {"direction": [0, 1, 0]}, "c": cone},
+            "measurements": {
+                "corner": asked | {"kind": "plane_angle", "features": ("a", "b")},
+                "cone": asked | {"kind": "cone_angle", "features": ("c",)},
+            },
+        }
+    )
+    read = {name: Result(name, "deg", 89.98, 0.01, "fit") for name in ("corner", "cone")}
+    monkeypatch.setattr("mitsim.study.task_measurement._labelled", lambda *_: None)
+    monkeypatch.setattr("characterisation.tasks.evaluation.measure", lambda *_: read)
+    cloud = SimpleNamespace(sensor="ensenso-n10")
+    values = [one.value for one in measure_task(cloud, task, None, POSE, read_view_statement(statement))]
+    assert values == [90.0, pytest.approx(90.03)]
 
 
 def test_a_statement_of_another_sensor_or_view_is_refused(statement):

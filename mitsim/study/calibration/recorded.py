@@ -17,6 +17,7 @@ with the camera's.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -57,6 +58,8 @@ _STUCK = 1e9
 #: residuals of corners [px], median of the poses, above which the model of the lens is wrong; *assumed*: corners of
 #: real boards scatter by 0.05 to 1 px
 _MOST_NOISE_PX = 3.0
+#: the usual cause of corners that no rig sees
+_ORDER = "are the corners of all cameras in the order of --board, COLUMNSxROWS, and of the same pose?"
 #: least angle [deg] between board normals for which a missing tilt is not named as the cause of a failure; *assumed*
 _TILTED_DEG = 15.0
 #: least number of poses: two views of a plane leave the focal length to the prior
@@ -129,11 +132,15 @@ def calibrate_recorded(
     for _ in range(_ROUNDS):
         rig, poses, normal = observed.adjusted(rig, poses, noise, rig_prior(rig, sizes))
         noise = observed.noise(rig, poses, normal)
-    if (typical := float(np.median(noise[:, 0]))) > _MOST_NOISE_PX:
+    typical = float(np.median(noise[:, 0]))
+    if not typical <= _MOST_NOISE_PX:  # NaN of a lens that folds
         hint = (
-            "a lens of more than about 90 deg needs another model; leave out corners far from the middle of the image"
+            f"{_ORDER} A lens of more than about 90 deg needs another model; leave out corners far from the middle of "
+            "the image"
         )
-        residuals = f"residuals of {typical:.1f} px of the corners"
+        residuals = (
+            "corners that the fitted lens cannot see" if math.isnan(typical) else f"residuals of {typical:.1f} px"
+        )
         raise InputError(
             "boards", "", residuals, f"{_MOST_NOISE_PX:g} px or less, of a lens with k1, k2, p1, p2, k3", hint
         )
@@ -258,9 +265,7 @@ class _Observations:
             if gained < _SMALL_GAIN * cost and float(step @ normal @ step) < _SMALL_STEP:
                 return rig, poses, normal
         failure = f"an adjustment that does not converge in {_MOST_STEPS} steps"
-        hint = tilt_hint(poses) or (
-            "are the corners of all cameras in the order of --board, COLUMNSxROWS, and of the same pose?"
-        )
+        hint = tilt_hint(poses) or _ORDER
         raise InputError("boards", "", failure, "poses that determine it", hint)
 
     def _normal(
