@@ -101,7 +101,14 @@ function rim(names) {
   const centre = onAxis(face.point_mm, along(face), tube).map((value) => Math.round(value * 1e4) / 1e4);
   const ends = (tube.outline_mm ?? []).map((one) => Math.abs(dot(less(one, centre), along(tube))));
   if (ends.length && Math.min(...ends) > 0.05 * tube.radius_mm + 0.05) return null; // it ends elsewhere
-  return { name: `${round}_rim_${plane}`.slice(0, 78), feature: { kind: 'circle', of: [plane], point_mm: centre, radius_mm: tube.radius_mm } };
+  return { name: cut(`${round}_rim_${plane}`), feature: { kind: 'circle', of: [plane], point_mm: centre, radius_mm: tube.radius_mm } };
+}
+
+// Return a name that the page and a task allow with a number after it: 80 characters, 100 bytes.
+function cut(name) {
+  const letters = [...name].slice(0, 76);
+  while (new TextEncoder().encode(letters.join('')).length > 96) letters.pop();
+  return letters.join('');
 }
 
 // Return the plane midway between two nearly parallel faces, of a slot or a rib, as a feature; null if there is none.
@@ -110,7 +117,7 @@ function midway(names) {
   if (names.length !== 2 || p?.kind !== 'plane' || q?.kind !== 'plane' || lineAngle(along(p), along(q)) > MOST_ASKEW) return null;
   const middle = midPlane(p, q), there = [...features].find(([, one]) => one.kind === 'mid_plane' && names.every((name) => one.of.includes(name)));
   const spread = (p.outline_mm ?? q.outline_mm)?.map((one) => add(one, middle.direction, -dot(less(one, middle.point_mm), middle.direction)).map((v) => Math.round(v * 1e4) / 1e4));
-  const base = `middle_of_${names.join('_and_')}`.slice(0, 74);
+  const base = cut(`middle_of_${names.join('_and_')}`);
   let name = there?.[0] ?? base, n = 1;
   while (!there && features.has(name)) name = `${base}_${++n}`;
   return { name, feature: { kind: 'mid_plane', of: names, ...(spread ? { outline_mm: spread } : {}) } };

@@ -281,7 +281,7 @@ function measurePanel() {
     if (allowed === null) return say(wrongTolerance(tolerance.value, zone), true);
     const before = already(offer.kind, offer.features);
     if (before) return say(`${before} measures the same: change its tolerance in the list below`, true);
-    const base = `${offer.features.slice(0, 2).join('_to_')}_${offer.kind}`.slice(0, 78);
+    const base = cut(`${offer.features.slice(0, 2).join('_to_')}_${offer.kind}`);
     let name = base, n = 1;
     while (measurements.has(name)) name = `${base}_${++n}`;
     measurements.set(name, { kind: offer.kind, features: offer.features, nominal: offer.nominal, unit: offer.unit, ...(allowed === undefined ? {} : { tolerance: allowed }) });

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
+from characterisation.files.documents import LONGEST_NAME
 from characterisation.tasks.definitions import (
     axis_angle,
     axis_distance,
@@ -26,6 +27,7 @@ from characterisation.tasks.definitions import (
 from mitsim.scene.authoring.drawn_characteristics import Dimension, DrawnTarget, GeometricTolerance, ProductInformation
 from mitsim.scene.authoring.drawn_zones import Side, zones
 from mitsim.scene.authoring.face import Face
+from mitsim.scene.authoring.naming import identifier
 
 #: difference between the drawing and its own model above which it is reported [mm, deg]
 _AGREE = 0.005
@@ -240,8 +242,9 @@ class _TaskBuilder:
 
 
 def _unique(name: str, taken: Collection[str]) -> str:
-    """Return a name, with a number if it is taken."""
-    base, count = name, 1
+    """Return a name, cut to the length that a task allows, and with a number if it is taken."""
+    name = base = identifier(name, LONGEST_NAME - len("_1000"))
+    count = 1
     while name in taken:
         count += 1
         name = f"{base}_{count}"

@@ -1,6 +1,7 @@
 """Zones and dimensions of a drawing on the right features: mid-planes, axes and planes of the bracket."""
 
 import math
+import re
 
 import pytest
 
@@ -123,3 +124,22 @@ def test_a_projected_zone_is_left_out_and_a_form_that_is_not_stated_is_told(draw
     assert set(found.measurements) == {"bore_12mm_right_position"}
     assert any("bore_12mm_left: its zone is projected" in one for one in found.left_out)
     assert any("bore_12mm_right: the file states no form" in one for one in found.in_part)
+
+
+@pytest.mark.parametrize(
+    "written", ["Functional surface of the {} for the sealing ring", "シール面シール面シール面シール面{}"]
+)
+def test_measurements_of_faces_with_long_names_have_names_that_a_task_allows(drawn, written):
+    """Two names of 60 bytes with a word between them made a task that no command read."""
+    path, drawing, face = drawn
+    for name in ("bore_12mm_left", "bore_12mm_right", "back", "front"):
+        record = rf"(#{face[name]}\s*=\s*ADVANCED_FACE\()''"
+        drawing.text = re.sub(record, rf"\1'{written.format(name)}'", drawing.text)
+    sides = (face["back"], face["front"])
+    drawing.tolerance("POSITION", drawing.measure(0.1), drawing.aspect(*sides))
+    for one, other in (("left", "right"), ("right", "left")):
+        ends = [drawing.aspect(face[f"bore_12mm_{side}"]) for side in (one, other)]
+        made = drawing.add(f"DIMENSIONAL_LOCATION('linear distance',$,#{ends[0]},#{ends[1]})")
+        drawing.values(made, drawing.measure(70.0, "nominal value"))
+    task = task_of(path, drawing)
+    assert sorted(one.kind for one in task.measurements.values()) == ["axis_distance", "axis_distance", "position"]
