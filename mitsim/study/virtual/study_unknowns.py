@@ -61,6 +61,8 @@ def study_unknowns(study: Study, varied: tuple[str, ...] = GROUPS) -> Unknowns:
         if name not in finishes:
             field = f"unknowns.finish.measured.{name}"
             raise InputError(study.path, field, "no bsdf of the scene", ", ".join(finishes), nearest(name, finishes))
+    if study.file.sprayed:  # the measured finish is under the spray
+        table = table.model_copy(update={"finish": table.finish.model_copy(update={"measured": {}})})
     folder = study.path.parent
     if not coated_shapes(study.scene, table.coat):
         varied = tuple(group for group in varied if group != "coat")

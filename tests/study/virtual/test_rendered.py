@@ -35,6 +35,7 @@ from mitsim.study.virtual import rendered
 from mitsim.study.virtual.displacement import displaced
 from mitsim.study.virtual.drawn_finish import finish_deviation
 from mitsim.study.virtual.drawn_numbers import drawn_numbers
+from mitsim.study.virtual.drawn_part import DrawnPart
 from mitsim.study.virtual.influences import influences
 from mitsim.study.virtual.plan import measurements_of, race_rendering, trial_digest
 from mitsim.study.virtual.race import Job
@@ -192,6 +193,15 @@ def test_a_sprayed_part_expands_as_its_metal():
         study_unknowns(study_of("ensenso-n10", scene="two_pillars.xml", sprayed=white)) for white in (False, True)
     )
     assert bare.expansion == sprayed.expansion == EXPANSION_PER_KELVIN["aluminium"]
+
+
+def test_a_spray_is_as_white_on_a_measured_finish():
+    measured = {"finish": {"measured": {"plane_finish": {"reflectance": (-2.0, 0.0)}}}}
+    study = study_of("ensenso-n10", scene="two_pillars.xml", sprayed=True, unknowns=measured)
+    scene, albedos = DrawnPart(study, study_unknowns(study)).in_finish(-1)
+    assert np.allclose(albedos[scene.names.index("plane")], 0.85, atol=0.01)  # of a matt white
+    bare = study_unknowns(study_of("ensenso-n10", scene="two_pillars.xml", unknowns=measured))
+    assert finish_deviation(bare, -1, "plane_finish").reflectance == -2
 
 
 def test_finishes_are_loaded_with_the_alpha_that_was_drawn():
