@@ -35,14 +35,26 @@ def _lit(table: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def _sizes(table: Mapping[str, Any]) -> Iterator[str]:
     for key, value in table.items():
-        if isinstance(value, Mapping):
+        if key == "measured":
+            yield from _measured(value)
+        elif isinstance(value, Mapping):
             yield from (f"{name} {size:g} mm" for name, size in value.items() if isinstance(size, int | float) and size)
         elif isinstance(value, str) and key != "covariance":
             yield f"{key} {value}"
-        elif isinstance(value, int | float) and not isinstance(value, bool) and value and (key, value) != ("scale", 1):
+        elif key == "scale":
+            yield from [] if value == 1 else [_size(key, f"{value:g}")]
+        elif isinstance(value, int | float) and not isinstance(value, bool) and value:
             yield _size(key, f"{value:g}")
         elif isinstance(value, list | tuple) and len(value) == 2 and value[1]:
             yield _size(key, f"{value[0]:g} to {value[1]:g}")
+
+
+def _measured(finishes: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+    """Yield the measured properties of finishes: ``alpha of plate 1.4 ± 0.2``."""
+    for finish, properties in finishes.items():
+        for key, pair in properties.items():
+            if pair is not None:
+                yield f"{key.replace('_', ' ')} of {finish} {pair[0]:g} ± {pair[1]:g}"
 
 
 def _size(key: str, number: str) -> str:

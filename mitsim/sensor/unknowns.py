@@ -44,6 +44,18 @@ OddBlock = Annotated[int, Field(ge=3, le=31), AfterValidator(odd)]
 ROOMS = {"office": 500.0, "dark cell": 0.0}
 
 
+#: keys of the drift of sensors that triangulate, by their words in a list of influences
+TRIANGULATION_DRIFT = {
+    "row_mrad": "row error",
+    "vergence_mrad": "vergence",
+    "roll_mrad": "roll",
+    "focal_relative": "focal length",
+}
+
+#: the same of one camera that measures time of flight
+FLIGHT_DRIFT = {"focal_relative": "focal length", "path_offset_mm": "offset of the path"}
+
+
 class CalibrationUnknowns(Document):
     """Deviation of the sensor's true geometry from the calibration that decodes its images.
 
@@ -71,6 +83,11 @@ class CalibrationUnknowns(Document):
             temperature_k=0.0,
             path_offset_mm=self.path_offset_mm,
         )
+
+    def drifting(self, flight: bool) -> list[str]:
+        """Return the keys of the drift that a sensor has, with or without time of flight, and that is not zero."""
+        keys = FLIGHT_DRIFT if flight else TRIANGULATION_DRIFT
+        return [key for key in keys if self.scale * getattr(self, key) > 0]
 
 
 Scale = Annotated[float, Field(ge=0, le=1)]

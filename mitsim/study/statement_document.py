@@ -20,7 +20,11 @@ def statement_document(session: Session, stated: StatedView) -> dict[str, Any]:
     """Return the statement as JSON values; see docs/reference/formats/statement.md."""
     study, unknowns, view = session.study, session.unknowns, stated.view
     declared = influences(
-        unknowns.table, session.source, study.file.measure.light_path_depth, "coat" in unknowns.varied
+        unknowns.table,
+        session.source,
+        study.file.measure.light_path_depth,
+        "coat" in unknowns.varied,
+        study.sensor.technology == "time_of_flight",
     )
     used = unknowns.table.temperature.model_copy(update={"expansion_per_kelvin": unknowns.expansion})
     exposed = {} if stated.planned is None else {"exposure": asdict(stated.planned)}

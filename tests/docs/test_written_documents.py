@@ -38,7 +38,7 @@ def stated():
 def test_keys_of_a_statement(stated):
     study = SimpleNamespace(
         path=Path("study.toml"),
-        sensor=SimpleNamespace(name="ensenso-n10"),
+        sensor=SimpleNamespace(name="ensenso-n10", technology="active_stereo"),
         performance_map=None,
         file=SimpleNamespace(seed=1, measure=SimpleNamespace(light_path_depth=2)),
         task=SimpleNamespace(measurements={"radius": SimpleNamespace(unit="deg")}),

@@ -20,6 +20,7 @@ from mitsim.report.page import write_report
 from mitsim.report.sheet import sheet_figures, write_sheet
 from mitsim.report.sheet_layout import text_width, wrapped
 from mitsim.report.unknowns_words import unknowns_in_words
+from mitsim.sensor.unknowns import MeasuredFinish
 from mitsim.study.choice_document import PoseEntry
 from mitsim.study.scene_geometry import read_scene_geometry
 from mitsim.study.statement_file import read_statement
@@ -297,6 +298,13 @@ def test_sizes_of_unknowns_have_units_and_meanings():
     ]
     assert unknowns_in_words({"calibration": {"scale": 0.5}, "decoder": {"known": True}}) == (
         "calibration: scale 0.5 times all of these"
+    )
+    assert unknowns_in_words({"calibration": {"vergence_mrad": 0.2, "scale": 0.0}}) == (
+        "calibration: vergence 0.2 mrad, scale 0 times all of these"
+    )
+    plate = MeasuredFinish(alpha=(1.4, 0.2), wide_angle=(-0.5, 0)).model_dump(mode="json")
+    assert unknowns_in_words({"finish": {"alpha": 0.0, "measured": {"plate": plate}}}) == (
+        "finish, shares of its range: alpha of plate 1.4 ± 0.2, wide angle of plate -0.5 ± 0"
     )
     dark = {"room_factor": 1.6, "daylight": 0.2, "power_relative": 0.05}
     assert unknowns_in_words({"light": {"room": 0.0} | dark}) == "light: power 0.05 relative"

@@ -24,7 +24,7 @@ from characterisation.files.errors import InputError
 from characterisation.statements.statement import Statement
 from mitsim.running.time_limit import TimeLimit
 from mitsim.scene.load import bounds_of
-from mitsim.sensor.drift import Drift
+from mitsim.sensor.unknowns import FLIGHT_DRIFT, TRIANGULATION_DRIFT
 from mitsim.sensor.working_volume import nearest_standoff
 from mitsim.study import ExposureTable, SetTable, StatementTable, finishes_of_features
 from mitsim.study.remedies.bounds import EXPOSURE, Effect, can_fit, least_shares, least_uncertainty
@@ -216,10 +216,8 @@ def _room(now: Shortfall) -> Iterator[Change]:
 
 
 def _fresh_calibration(now: Shortfall) -> Iterator[Change]:
-    drift = now.study.unknowns.calibration.drift()
-    names = ("vergence_mrad", "row_mrad", "roll_mrad", "focal_relative", "path_offset_mm")
-    if any(getattr(drift, name) > 0 for name in names):
-        keys = {"unknowns": {"calibration": {name: getattr(Drift.none(), name) for name in names}}}
+    if now.study.unknowns.calibration.drifting(now.study.sensor.technology == "time_of_flight"):
+        keys = {"unknowns": {"calibration": dict.fromkeys(TRIANGULATION_DRIFT | FLIGHT_DRIFT, 0.0)}}
         expected = possible(now, Effect({"calibration": 0.0}))
         yield _of_study(now, "calibration", "calibrated just before, without drift", keys, expected, "fresh")
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mitsim.sensor.unknowns import UnknownsTable
+from mitsim.sensor.unknowns import FLIGHT_DRIFT, TRIANGULATION_DRIFT, UnknownsTable
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,9 @@ class Influence:
 _OTHER_PARTS = "not in the map; drawn with the size found on other parts, see effects outside the map"
 
 
-def influences(table: UnknownsTable, source: str, depth: int, sprayed: bool = False) -> list[Influence]:
+def influences(
+    table: UnknownsTable, source: str, depth: int, sprayed: bool = False, flight: bool = False
+) -> list[Influence]:
     """Return the influences of a statement.
 
     Parameters
@@ -42,17 +44,24 @@ def influences(table: UnknownsTable, source: str, depth: int, sprayed: bool = Fa
         Number of surfaces on a light path.
     sprayed
         Whether a face of the part has a coat.
+    flight
+        Whether the sensor measures time of flight.
     """
     rendered = source == "render"
     form, pose, temperature, light = table.form.features, table.pose, table.temperature, table.light
+    drift = [(TRIANGULATION_DRIFT | FLIGHT_DRIFT)[key] for key in table.calibration.drifting(flight)]
     low, high = table.coat.thickness_um
     coat = f"drawn: mean thickness {low:g} to {high:g} um, {100 * table.coat.spread:.0f} % from place to place"
     return [
-        Influence("calibration of the sensor", True, "drawn from the covariance of the calibration"),
+        Influence(
+            "calibration of the sensor",
+            table.calibration.scale > 0,
+            "drawn from the covariance of the calibration" if table.calibration.scale > 0 else "exact: its scale is 0",
+        ),
         Influence(
             "drift since the calibration",
-            any(table.calibration.drift().numbers().values()),
-            "drawn: row error, vergence, roll, focal length",
+            bool(drift),
+            f"drawn: {', '.join(drift)}" if drift else "none: the sensor is calibrated just before",
         ),
         Influence("temperature of the sensor", temperature.sensor_kelvin > 0, "drawn; expands the baseline evenly"),
         Influence("temperature of the part", temperature.part_kelvin > 0, "drawn; expands the part evenly"),

@@ -239,6 +239,8 @@ def budget_groups(unknowns: Unknowns, source: str, sensor: Sensor) -> list[str]:
     idle = {"light", "unit", "decoder"} if source == "map" else {BEYOND}
     if not decoder_is_drawn(sensor, table.decoder):
         idle.add("decoder")
+    if not table.calibration.scale > 0:
+        idle.add("calibration")
     if not any(size > 0 for size in table.form.features.values()):
         idle.add("form")
     if source != "map" and not table.finish.varies:

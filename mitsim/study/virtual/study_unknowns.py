@@ -86,7 +86,7 @@ def calibration_covariance(sensor: Sensor, table: CalibrationUnknowns, folder: P
     return replace(
         covariance,
         covariance=table.scale**2 * covariance.covariance,
-        source=f"{covariance.source}; times {table.scale:g}",
+        source=f"{table.scale:g} times {covariance.source}",
     )
 
 

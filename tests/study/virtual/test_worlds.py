@@ -8,13 +8,16 @@ from scipy.stats import kstest
 
 from characterisation.files.errors import InputError
 from mitsim.scene.surface.scatter import Deviation
+from mitsim.sensor.drift import with_drift
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.preset_covariance import preset_covariance
+from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import parameter_names
 from mitsim.sensor.room_light import room_irradiance
 from mitsim.sensor.unknowns import MeasuredFinish, UnknownsTable, unknowns_of
 from mitsim.study.virtual.drawn_finish import DRAWN, finish_deviation, finish_numbers
 from mitsim.study.virtual.influences import influences
+from mitsim.study.virtual.stated import budget_groups
 from mitsim.study.virtual.world import (
     FRESH,
     GROUPS,
@@ -69,6 +72,41 @@ def test_a_finish_that_is_drawn_is_listed_as_included(source, sizes, included):
         if one.name == "finish of the part"
     )
     assert found.included == included
+
+
+@pytest.mark.parametrize(
+    ("calibration", "flight", "drawn"),
+    [
+        ({}, False, {"row error", "vergence", "roll", "focal length"}),
+        ({}, True, {"focal length", "offset of the path"}),
+        ({"vergence_mrad": 0, "roll_mrad": 0, "focal_relative": 0}, False, {"row error"}),
+        ({"vergence_mrad": 0, "row_mrad": 0, "roll_mrad": 0, "focal_relative": 0}, False, set()),
+        ({"scale": 0}, False, set()),
+    ],
+)
+def test_the_drift_that_is_drawn_is_listed(calibration, flight, drawn):
+    """A covariance without errors of its own has those of the drift that is listed."""
+    table = UnknownsTable.model_validate({"calibration": calibration})
+    listed = {one.name: one for one in influences(table, "render", 1, flight=flight)}
+    drift = listed["drift since the calibration"]
+    assert drift.included == bool(drawn) and (not drawn or drift.how == "drawn: " + ", ".join(drift_in_order(drawn)))
+    assert listed["calibration of the sensor"].included == ("scale" not in calibration)
+    sensor = load_sensor("kinect-v2" if flight else "ensenso-n10")
+    nothing = RigCovariance((), np.zeros((0, 0)), "exact")
+    kinds = {
+        name.rpartition(".")[2].partition("_")[0]
+        for name in with_drift(nothing, sensor, table.calibration.drift()).names
+    }
+    if "scale" not in calibration:
+        assert kinds == set().union(
+            *({"focal length": {"focal"}, "offset of the path": {"offset"}}.get(one, {"rotation"}) for one in drawn)
+        )
+    unknowns = Unknowns(table, sensor.rig, nothing, 850.0, 0.0, np.zeros(3), 7)
+    assert ("calibration" in budget_groups(unknowns, "render", sensor)) == ("scale" not in calibration)
+
+
+def drift_in_order(drawn):
+    return [one for one in ("row error", "vergence", "roll", "focal length", "offset of the path") if one in drawn]
 
 
 def test_a_trial_decides_its_world(unknowns):
