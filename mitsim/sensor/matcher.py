@@ -26,8 +26,16 @@ def _odd_or_none(size: int) -> int:
 #: that overflow have up to 0.49 (tests/benchmarks/sgbm_overflow.py)
 SGBM_COST_PER_CAP = 0.5
 
+#: largest number of 16 bits, the costs of OpenCV's SGBM
+SGBM_LARGEST_COST = 32767
+
 OddSum = Annotated[int, Field(ge=1, le=31), AfterValidator(odd)]
 ContrastWindow = Annotated[int, Field(ge=0, le=101), AfterValidator(_odd_or_none)]
+
+
+def sgbm_cost(block_size: int, p2: float, prefilter_cap: int) -> float:
+    """Return the largest cost that OpenCV's SGBM may sum."""
+    return block_size**2 * (p2 + SGBM_COST_PER_CAP * prefilter_cap)
 
 
 class MatcherSettings(DepthSettings):
@@ -95,9 +103,11 @@ class MatcherSettings(DepthSettings):
         if self.block_size < 3 and self.method != "census":
             raise ValueError(f"block_size from 3 for method {self.method}")
         other = ("equiangular",) if self.method == "sgbm" else ("opencv",)
-        most = self.block_size**2 * (self.p2 + SGBM_COST_PER_CAP * self.prefilter_cap)
-        if self.method == "sgbm" and most > 32767:
-            what = f"block_size^2 (p2 + prefilter_cap / 2) of at most 32767 for method sgbm, not {most:.0f}"
+        most = sgbm_cost(self.block_size, self.p2, self.prefilter_cap)
+        if self.method == "sgbm" and most > SGBM_LARGEST_COST:
+            what = (
+                f"block_size^2 (p2 + prefilter_cap / 2) of at most {SGBM_LARGEST_COST} for method sgbm, not {most:.0f}"
+            )
             raise ValueError(f"{what}: OpenCV's costs have 16 bits")
         if self.sub_pixel in other:
             raise ValueError(f"another sub_pixel than {self.sub_pixel} for method {self.method}")

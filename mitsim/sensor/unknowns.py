@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from characterisation.files.documents import Document
+from characterisation.files.documents import Document, validate
 from mitsim.sensor.drift import Drift
 from mitsim.sensor.matcher import ContrastWindow, OddSum, odd
 
@@ -276,10 +276,16 @@ class UnknownsTable(Document):
 
 
 def unknowns_of(*tables: UnknownsTable) -> UnknownsTable:
-    """Merge tables: a later table's keys override an earlier one's; keys in none have their defaults."""
+    """Merge tables: a later table's keys override an earlier one's; keys in none have their defaults.
+
+    Raises
+    ------
+    InputError
+        If keys of two tables contradict one another.
+    """
     merged: dict[str, dict[str, Any]] = {}
     for table in tables:
         for group in table.model_fields_set:
             section = getattr(table, group)
             merged.setdefault(group, {}).update({key: getattr(section, key) for key in section.model_fields_set})
-    return UnknownsTable.model_validate(merged)
+    return validate("the unknowns of sensor and study together", merged, UnknownsTable)

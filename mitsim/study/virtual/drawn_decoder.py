@@ -11,13 +11,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
+from characterisation.files.errors import InputError
 from mitsim.capture.decoding import Settings
 from mitsim.sensor.decoder_settings import DecoderSettings
-from mitsim.sensor.matcher import MatcherSettings
+from mitsim.sensor.matcher import SGBM_LARGEST_COST, MatcherSettings, sgbm_cost
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.unknowns import DecoderUnknowns
 
@@ -50,6 +52,30 @@ def drawn_decoder(sensor: Sensor, unknowns: DecoderUnknowns, seed: int) -> Setti
     )
 
 
+def check_decoder(sensor: Sensor, unknowns: DecoderUnknowns, where: str | Path) -> None:
+    """Check that the costs of OpenCV's SGBM hold every decoder that can be drawn.
+
+    Raises
+    ------
+    InputError
+        If not; it names ``where``.
+    """
+    settings = sensor.settings
+    if not isinstance(settings, MatcherSettings) or not decoder_is_drawn(sensor, unknowns):
+        return
+    block = max(unknowns.blocks_px, default=settings.block_size)
+    cap = max(unknowns.prefilter_caps, default=settings.prefilter_cap)
+    p2 = unknowns.p1[1] * unknowns.p2_over_p1[1]
+    if "sgbm" in _methods(sensor, settings, unknowns) and sgbm_cost(block, p2, cap) > SGBM_LARGEST_COST:
+        raise InputError(
+            where,
+            "unknowns.decoder: blocks_px, p1, p2_over_p1, prefilter_caps",
+            f"a block of {block} px with p2 of {p2:g} and a cap of {cap}, as they can be drawn together",
+            f"block^2 (p2 + cap / 2) of at most {SGBM_LARGEST_COST} for method sgbm, whose costs have 16 bits",
+            "leave out large blocks, or lower the upper ends of p1 and p2_over_p1",
+        )
+
+
 #: part of the seeds of this module's random numbers
 _STREAM = 9
 
@@ -71,16 +97,22 @@ class _Draw:
 
     def log_between(self, ends: tuple[float, float]) -> float:
         """Return a number from a range over 0, whose logarithm is uniform."""
-        return math.exp(self.between((math.log(ends[0]), math.log(ends[1]))))
+        number = math.exp(self.between((math.log(ends[0]), math.log(ends[1]))))
+        return min(max(number, ends[0]), ends[1])
+
+
+def _methods(sensor: Sensor, settings: MatcherSettings, unknowns: DecoderUnknowns) -> list[str]:
+    """Return the methods that are drawn, those that can decode the sensor's images."""
+    pair = sensor.technology == "active_stereo"
+    able = [name for name in unknowns.methods if pair and (name != "sgbm" or sensor.frames == 1)]
+    return [*able] or [settings.method]
 
 
 def _matcher(
     sensor: Sensor, settings: MatcherSettings, unknowns: DecoderUnknowns, draw: _Draw, factor: float
 ) -> dict[str, Any]:
     """Return the drawn settings of a matcher, without its least contrast."""
-    pair = sensor.technology == "active_stereo"
-    able = [name for name in unknowns.methods if pair and (name != "sgbm" or sensor.frames == 1)]
-    method = draw.one_of(able, settings.method)
+    method = draw.one_of(_methods(sensor, settings, unknowns), settings.method)
     # the sensor's own block suits the density of its pattern, if its method is correlation; 5 px suits the others
     own_block = settings.block_size if settings.method == "correlation" else 5
     least, most = (own_block * factor_of_block for factor_of_block in unknowns.block_factor)
@@ -101,7 +133,7 @@ def _matcher(
         "block_size": max(blocks[method], 3 if method != "census" else 1),
         "census_window_px": draw.one_of(unknowns.census_windows_px, settings.census_window_px),
         "p1": p1,
-        "p2": p1 * ratio,
+        "p2": min(p1 * ratio, unknowns.p1[1] * unknowns.p2_over_p1[1]),
         "uniqueness_percent": uniqueness,
         "left_right_px": draw.between(unknowns.left_right_px),
         "contrast_window_px": draw.one_of(unknowns.contrast_windows_px, settings.contrast_window_px),

@@ -23,6 +23,7 @@ from mitsim.sensor.unknowns import CalibrationUnknowns, FormUnknowns, Temperatur
 from mitsim.study import Study
 from mitsim.study.calibration.virtual_calibration import calibrate
 from mitsim.study.virtual.coat import coated_shapes
+from mitsim.study.virtual.drawn_decoder import check_decoder
 from mitsim.study.virtual.form import drawn_form
 from mitsim.study.virtual.world import GROUPS, Unknowns, warmed
 
@@ -47,8 +48,8 @@ def study_unknowns(study: Study, varied: tuple[str, ...] = GROUPS) -> Unknowns:
     Raises
     ------
     InputError
-        If a file is missing or belongs to another sensor, if a feature with a form deviation is not in the scene, or
-        if a measured finish is not.
+        If a file is missing or belongs to another sensor, if a feature with a form deviation or a measured finish is
+        not in the scene, or if a decoder can be drawn that OpenCV's costs do not hold.
     """
     table, sensor = study.unknowns, study.sensor
     for name in table.form.features:
@@ -61,6 +62,7 @@ def study_unknowns(study: Study, varied: tuple[str, ...] = GROUPS) -> Unknowns:
         if name not in finishes:
             field = f"unknowns.finish.measured.{name}"
             raise InputError(study.path, field, "no bsdf of the scene", ", ".join(finishes), nearest(name, finishes))
+    check_decoder(sensor, table.decoder, study.path)
     if study.file.sprayed:  # the measured finish is under the spray
         table = table.model_copy(update={"finish": table.finish.model_copy(update={"measured": {}})})
     folder = study.path.parent

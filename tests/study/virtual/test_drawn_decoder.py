@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from characterisation.files.errors import InputError
 from mitsim.sensor.preset import load_sensor, presets
-from mitsim.sensor.unknowns import DecoderUnknowns, unknowns_of
-from mitsim.study.virtual.drawn_decoder import decoder_is_drawn, decoder_numbers, drawn_decoder
+from mitsim.sensor.unknowns import DecoderUnknowns, UnknownsTable, unknowns_of
+from mitsim.study.virtual.drawn_decoder import check_decoder, decoder_is_drawn, decoder_numbers, drawn_decoder
 
 SEEDS = range(1, 121)
 
@@ -49,6 +50,36 @@ def test_drawn_matchers_lie_inside_the_stated_ranges(name):
     middle = np.mean([math.log(one.p1) for one in drawn])
     spread = math.log(ranges.p1[1] / ranges.p1[0]) / math.sqrt(12)
     assert abs(middle - np.mean(np.log(ranges.p1))) < 4 * spread / math.sqrt(len(drawn))
+
+
+@pytest.mark.parametrize(
+    ("keys", "fits"),
+    [
+        ({"blocks_px": [15]}, False),
+        ({"blocks_px": [15], "p1": (4, 9)}, True),
+        ({"blocks_px": [31], "methods": ["census", "correlation"]}, True),
+        ({"blocks_px": [], "p1": (10, 125), "p2_over_p1": (1, 8)}, True),
+        ({"p1": (125, 125), "p2_over_p1": (8, 8)}, False),
+        ({"p1": (125, 125), "p2_over_p1": (8, 8), "methods": ["census"]}, True),
+    ],
+)
+def test_ranges_that_opencv_cannot_sum_are_rejected_and_no_other(keys, fits):
+    sensor, table = load_sensor("ensenso-n10"), DecoderUnknowns.model_validate(keys)
+    if fits:
+        check_decoder(sensor, table, "study.toml")
+        assert all(drawn_decoder(sensor, table, seed).p2 <= 1000 for seed in SEEDS)
+    else:
+        with pytest.raises(InputError, match=r"study.toml: unknowns.decoder: blocks_px.*32767.*lower the upper ends"):
+            check_decoder(sensor, table, "study.toml")
+    for name in presets():
+        preset = load_sensor(name)
+        check_decoder(preset, preset.unknowns.decoder, name)
+
+
+def test_ranges_of_sensor_and_study_that_contradict_one_another_are_an_error_of_input():
+    high, steep = ({"decoder": {key: ends}} for key, ends in (("p1", (4, 100)), ("p2_over_p1", (2, 12))))
+    with pytest.raises(InputError, match="p1 times p2_over_p1 up to 1000"):
+        unknowns_of(UnknownsTable.model_validate(high), UnknownsTable.model_validate(steep))
 
 
 def test_several_frames_and_one_camera_keep_methods_that_decode_them():
