@@ -212,14 +212,15 @@ def _map_draws(
 def moved_by_calibration(cloud: PointCloud, sensor: Sensor, drawn: DrawnValues) -> NDArray[np.float32]:
     """Return points (H, W, 3) [mm] as the nominal calibration places them if the drawn rig is the true one.
 
-    Parameters of a time-of-flight path are excluded; :func:`mitsim.study.virtual.displacement.displaced` applies them.
+    The second camera of the true rig has the misalignment of the sensor file, as in a rendered measurement. Parameters
+    of a time-of-flight path are excluded; :func:`mitsim.study.virtual.displacement.displaced` applies them.
     """
     valid = cloud.valid
     points = cloud.points[valid].astype(float)
     if len(points) < 4:
         return cloud.points
     sample = points[:: max(1, len(points) // _POINTS)]
-    moves = measured_points(sensor, sample, drawn.rig) - measured_points(sensor, sample, sensor.rig)
+    moves = measured_points(sensor, sample, sensor.misaligned(drawn.rig)) - measured_points(sensor, sample, sensor.rig)
     fine = np.isfinite(moves).all(axis=1)
     if fine.sum() < 40:
         return cloud.points

@@ -78,7 +78,10 @@ def effects_of(study: Study, unknowns: Unknowns, limit: TimeLimit | None = None)
 
 
 def shared_errors(study: Study, unknowns: Unknowns) -> SharedErrors:
-    """Return displacement fields of the errors of calibration and sensor temperature, over the volume of the views."""
+    """Return displacement fields of the errors of calibration and sensor temperature, over the volume of the views.
+
+    The misalignment of a sensor file is one more field.
+    """
     sensor, calibration, temperature = study.sensor, unknowns.calibration, unknowns.table.temperature
     points = _places(study)
     values, vectors = np.linalg.eigh(calibration.correlation)
@@ -91,6 +94,8 @@ def shared_errors(study: Study, unknowns: Unknowns) -> SharedErrors:
         measured_points(sensor, points, moved(sensor.rig, names, step), path_error(names, step)) - nominal
         for names, step in causes
     ]
+    if sensor.true_rig is not sensor.rig:
+        moves.append(measured_points(sensor, points, sensor.true_rig) - nominal)
     return independent_fields(points, np.array(moves))
 
 

@@ -10,6 +10,8 @@ from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
 from characterisation.tasks.folded import folded_value
+from mitsim.maps.prediction.shared_errors import terms
+from mitsim.sensor.sensor_file import MisalignmentTable
 from mitsim.sensor.transforms import Transform
 from mitsim.study import MINIMUM_POINTS, StudyFile, open_study
 from mitsim.study.calibration.accuracy import measured_points
@@ -18,6 +20,7 @@ from mitsim.study.virtual.mapped import MappedMeasurements, drawn_map, moved_by_
 from mitsim.study.virtual.plan import measured_by, measurements_of, trial_digest
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.rendered import RenderedMeasurements
+from mitsim.study.virtual.screening import shared_errors
 from mitsim.study.virtual.stated import budget_groups
 from mitsim.study.virtual.study_unknowns import study_unknowns
 from mitsim.study.virtual.world import BEYOND, Trial
@@ -65,6 +68,25 @@ def test_points_move_as_the_decoder_would_place_them(drawn):
     error = np.abs(moved.reshape(-1, 3)[some] - expected)
     assert size > 0.005  # there is something to follow
     assert np.median(error) < 0.02 * size and np.percentile(error, 99) < 0.1 * size + 2e-4
+
+
+def test_a_misaligned_camera_moves_points_of_a_map_and_its_screening():
+    """A camera that rolls by e moves a point at height y / z by z^2 y e / (b z) in depth."""
+    study = study_of("ensenso-n10")
+    view = min(study.views, key=lambda one: abs(one.elevation_deg - 45))
+    rolled = replace(study, sensor=replace(study.sensor, misalignment=MisalignmentTable(roll_mrad=1.0)))
+    maker, straight = (measurements_of(one, study_unknowns(one, ("noise",))) for one in (rolled, study))
+    cloud, world, _, _ = maker._take(Job(view, Trial(0)))
+    assert np.array_equal(moved_by_calibration(cloud, study.sensor, world), cloud.points, equal_nan=True)
+    change = (moved_by_calibration(cloud, rolled.sensor, world) - cloud.points)[..., 2][cloud.valid]
+    _, y, z = cloud.points[cloud.valid].T
+    expected = 1e-3 * y * z / 100.775
+    assert np.abs(expected).max() > 0.1
+    assert np.abs(change - expected).max() < 0.1 * np.abs(expected).max()
+    points = cloud.points[cloud.valid].astype(float)
+    fields = [shared_errors(one.study, one.unknowns).coefficients for one in (maker, straight)]
+    size, without = (((terms(points) @ field)[..., 2] ** 2).sum(axis=0) for field in fields)
+    assert np.sqrt(np.mean(size - without)) == pytest.approx(np.sqrt(np.mean(expected**2)), rel=0.1)
 
 
 def test_a_longer_baseline_shrinks_what_is_measured(drawn):
