@@ -1,13 +1,12 @@
 """Narrow the prior of a finish by captures of a coupon, for ``[unknowns.finish.measured]`` of a study.
 
-Signal chain: blocks of the views -> fits of alpha, power and wide-angle share at several tails of the lobe -> weight of
-each tail, from its prior and its chi-square -> mean and standard deviation of alpha, wide-angle share and tail, in
-one-sigma ranges of their priors.
+Signal chain: blocks of the views -> likelihood of alpha and wide-angle share at several tails of the lobe, the power
+fitted at each -> blurred by the errors that the jackknife finds beyond the covariance -> times the priors that trials
+draw from -> mean and standard deviation of alpha, wide-angle share and tail, in one-sigma ranges of their priors.
 
-The tail is not among the parameters of a fit (:mod:`mitsim.twin.finish.estimate`), since few captures determine it. The
-fits here keep the weights of the fit at the best estimate of the tail. Alpha depends on the tail: its variance is the
-mean of the variances of the fits plus the variance of the fitted values. Images show the product of power and
-reflectance, so the prior of the reflectance stays.
+The likelihood is computed on a grid, since it is not normal: shares end at 0, and a lobe that no view shows leaves a
+ridge of alpha and share. The weights of the blocks are those of the fit at the best estimate of the tail. Images show
+the product of power and reflectance, so the prior of the reflectance stays.
 """
 
 from __future__ import annotations
@@ -19,18 +18,33 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from characterisation.files.arrays import Floats
-from mitsim.scene.surface.processes import LARGEST_WIDE_ANGLE
 from mitsim.scene.surface.scatter import LARGEST_DEVIATION, Deviation, Scatter
-from mitsim.twin.finish.estimate import Fit, best_values, refine
-from mitsim.twin.finish.finish import MetalFinish
+from mitsim.twin.finish.estimate import Fit, FittedQuantity, best_values, refine
+from mitsim.twin.finish.finish import LOG_ALPHA_RANGE, MetalFinish
 from mitsim.twin.finish.observation import CouponView
 from mitsim.twin.finish.problem import Problem
 
 #: Beckmann shares that are fitted [1]; chi-square and results are smooth between them
 _SHARES = (0.0, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 
-#: standard deviation that is written at least; a posterior is no better than the model of the lobe. Assumed
+#: standard deviation of alpha and wide-angle share at least; a posterior is no better than the model of the lobe.
+#: Assumed
 _LEAST_SIZE = 0.05
+
+#: deviations from the best estimate in which a finish is drawn; the steps are a fifth of the least standard deviation
+_GRID = np.linspace(-LARGEST_DEVIATION, LARGEST_DEVIATION, 601)
+
+#: prior of a deviation on the grid
+_PRIOR = np.exp(-0.5 * _GRID**2)
+
+#: apparent deviations of the share: likelihoods are narrower than posteriors; chosen
+_FINE_GRID = np.linspace(-LARGEST_DEVIATION, LARGEST_DEVIATION, 1201)
+
+#: places of alpha at which the likelihood is computed: over the prior, and about the fit; chosen
+_PLACES = 25
+
+#: standard uncertainties about the fit that the second of them span; chosen
+_AROUND = 5.0
 
 
 @dataclass(frozen=True)
@@ -74,40 +88,100 @@ def finish_posterior(
     assert fit.log_alpha is not None and fit.wide_angle is not None and prior.beckmann_range is not None
     problem = Problem(views, finish)
     start, variance, _ = best_values(problem)
-    scale = max(fit.reduced_chi_square, 1.0)
-    results, cost = [], []
+    low, high = prior.wide_angle_range
+    alpha_known, share_known = prior.alpha_factor <= 1, not 0 < low < prior.wide_angle < high
+    alphas = np.log(prior.alpha_u) + (np.zeros(1) if alpha_known else _GRID * np.log(prior.alpha_factor))
+    shares, apparent = (
+        np.array([Deviation(wide_angle=z).share(prior.wide_angle, prior.wide_angle_range) for z in grid.tolist()])
+        for grid in ((np.zeros(1), np.zeros(1)) if share_known else (_GRID, _FINE_GRID))
+    )
+    if not share_known:
+        apparent = np.concatenate([-apparent[::-1], apparent])  # errors also lead to a share under 0
+    places, costs = [], []
     for share in _SHARES:
         other = Problem(views, finish.with_beckmann(share))
-        values = refine(other, start, variance, np.ones(other.count, bool))
-        results.append(other.results(values)[0][1:3])
-        cost.append(float(np.sum(other.residual(values, variance) ** 2)) / scale)
-    grid = np.linspace(-LARGEST_DEVIATION, LARGEST_DEVIATION, 601)
-    shares = np.array([Deviation(tail=tail).beckmann(prior.beckmann, prior.beckmann_range) for tail in grid.tolist()])
-    chi_square = CubicSpline(_SHARES, np.array(cost))(shares)
-    weight = np.exp(-0.5 * (chi_square - chi_square.min() + grid**2))
-    weight /= weight.sum()
-    log_alpha, wide = CubicSpline(_SHARES, np.array(results))(shares).T
-    alpha_pair = wide_pair = None
-    if prior.alpha_factor > 1:
-        unit = np.log(prior.alpha_factor)
-        alpha_pair = _moments((log_alpha - np.log(prior.alpha_u)) / unit, weight, fit.log_alpha.uncertainty / unit)
-    low, high = prior.wide_angle_range
-    if 0 < low < prior.wide_angle < high:
-        unit = (_log_odds(np.array(high)) - _log_odds(np.array(low))) / 2
-        off = (_log_odds(wide) - _log_odds(np.array(prior.wide_angle))) / unit
-        value = float(np.clip(fit.wide_angle.value, 1e-3, LARGEST_WIDE_ANGLE - 1e-3))
-        slope = LARGEST_WIDE_ANGLE / (value * (LARGEST_WIDE_ANGLE - value))
-        wide_pair = _moments(off, weight, fit.wide_angle.uncertainty * slope / float(unit))
-    return FinishPosterior(name, alpha_pair, wide_pair, _moments(grid, weight, 0.0))
+        fitted = refine(other, start, variance, np.ones(other.count, bool))[0]
+        around = fitted + _AROUND * fit.log_alpha.by_covariance * np.linspace(-1, 1, _PLACES)
+        every = np.concatenate([np.linspace(alphas[0], alphas[-1], _PLACES), np.clip(around, alphas[0], alphas[-1])])
+        places.append(np.unique(np.clip(every, *LOG_ALPHA_RANGE)))
+        costs.append(_chi_square(other, variance, places[-1], apparent) / max(fit.reduced_chi_square, 1.0))
+    of_share = _errors(shares, _blur(fit.wide_angle, shares), apparent)
+    logarithms, moments = [], []
+    for place, cost in zip(places, costs, strict=True):
+        of_alpha = _errors(alphas, _blur(fit.log_alpha, alphas), place)
+        joint = of_alpha @ np.exp(-0.5 * (cost - cost.min())) @ of_share.T
+        if not alpha_known:
+            joint = joint * _PRIOR[:, None]
+        if not share_known:
+            joint = joint * _PRIOR
+        logarithms.append(np.log(joint.sum()) - 0.5 * cost.min())
+        moments.append([*_mean_and_variance(joint.sum(axis=1)), *_mean_and_variance(joint.sum(axis=0))])
+    by_tail = np.array([Deviation(tail=z).beckmann(prior.beckmann, prior.beckmann_range) for z in _GRID.tolist()])
+    logarithm = CubicSpline(_SHARES, np.array(logarithms))(by_tail)
+    weight = _PRIOR * np.exp(logarithm - logarithm.max())
+    alpha_mean, alpha_variance, share_mean, share_variance = CubicSpline(_SHARES, np.array(moments))(by_tail).T
+    return FinishPosterior(
+        name,
+        None if alpha_known else _moments(alpha_mean, weight, alpha_variance),
+        None if share_known else _moments(share_mean, weight, share_variance),
+        _moments(_GRID, weight, np.zeros(len(_GRID))),
+    )
 
 
-def _log_odds(share: Floats) -> Floats:
-    inside = np.clip(share, 1e-3, LARGEST_WIDE_ANGLE - 1e-3)
-    return np.asarray(np.log(inside / (LARGEST_WIDE_ANGLE - inside)))
+def _chi_square(problem: Problem, variance: Floats, log_alphas: Floats, shares: Floats) -> Floats:
+    """Return chi-square (alphas, shares) of lobes and wide-angle shares, each with its best power and room light."""
+    weight = 1 / np.sqrt(variance)
+    measured, wide, *room = weight * np.stack([problem.measured, *problem.linear_means.T])
+    out = []
+    for x in log_alphas.tolist():
+        lobe = weight * problem.means(problem.specular(x)[0])
+        mixed = np.stack([lobe, wide - lobe, measured])
+        found = _left(mixed @ mixed.T, shares)[0]
+        for light in room:
+            along = mixed @ light / np.linalg.norm(light)
+            left, power = _left(mixed @ mixed.T - np.outer(along, along), shares)
+            lit = along[2] > power * (along[0] + shares * along[1])  # the room adds light
+            found = np.where(lit, left, found)
+        out.append(found)
+    return np.array(out)
 
 
-def _moments(values: Floats, weight: Floats, uncertainty: float) -> tuple[float, float]:
-    """Return mean and standard deviation of values of a standard ``uncertainty``, in the range of a study."""
-    mean = float(weight @ values)
-    size = float(np.sqrt(weight @ (values - mean) ** 2 + uncertainty**2))
+def _left(products: Floats, shares: Floats) -> tuple[Floats, Floats]:
+    """Return the squares that the best power leaves, and that power, of shares (n,) of a mixture.
+
+    ``products`` (3, 3) are those of the lobe, of the difference of wide light from the lobe, and of the measured means.
+    """
+    square = products[0, 0] + 2 * shares * products[0, 1] + shares**2 * products[1, 1]
+    power = np.maximum((products[0, 2] + shares * products[1, 2]) / square, 0.0)
+    return products[2, 2] - power**2 * square, power
+
+
+def _blur(fitted: FittedQuantity, values: Floats) -> Floats:
+    """Return the standard deviations (n,) of errors at values of a deviation that the covariance does not contain."""
+    beyond = max(fitted.by_jackknife**2 - fitted.by_covariance**2, 0.0)
+    least = _LEAST_SIZE * np.gradient(values, _GRID) if len(values) > 1 else np.zeros(1)
+    return np.sqrt(beyond + least**2)
+
+
+def _errors(true: Floats, sigma: Floats, apparent: Floats) -> Floats:
+    """Return the probabilities (n, m) of apparent values, ascending, that normal errors make of true ones."""
+    square = ((apparent - true[:, None]) / np.maximum(sigma, 1e-12)[:, None]) ** 2
+    weight = np.exp(-0.5 * (square - square.min(axis=1, keepdims=True)))
+    if len(apparent) > 1:
+        weight *= np.gradient(apparent)
+    return np.asarray(weight / weight.sum(axis=1, keepdims=True))
+
+
+def _mean_and_variance(weight: Floats) -> tuple[float, float]:
+    """Return mean and variance of a deviation with weights on the grid; 0 of one that is known."""
+    if len(weight) == 1:
+        return 0.0, 0.0
+    mean = float(weight @ _GRID / weight.sum())
+    return mean, float(weight @ (_GRID - mean) ** 2 / weight.sum())
+
+
+def _moments(values: Floats, weight: Floats, variance: Floats) -> tuple[float, float]:
+    """Return mean and standard deviation of values with their variances, all by tail, in the range of a study."""
+    mean = float(weight @ values / weight.sum())
+    size = float(np.sqrt(weight @ ((values - mean) ** 2 + np.maximum(variance, 0.0)) / weight.sum()))
     return float(np.clip(mean, -LARGEST_DEVIATION, LARGEST_DEVIATION)), float(np.clip(size, _LEAST_SIZE, 3.0))

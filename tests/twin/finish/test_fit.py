@@ -290,12 +290,52 @@ def test_a_posterior_covers_the_truth_and_is_narrower_than_its_prior(plain_views
     assert told.finish.centres_and_sizes("plate")["alpha"] == pytest.approx(found.alpha, abs=1e-3)
 
 
-def test_views_without_information_leave_the_prior_of_the_tail(plain_views, ground):
+def seen_with(views, ground, alpha, share):
+    """The views of a coupon with another width of its lobe and another wide-angle share."""
+    lobe, out = SpecularLobe(ground.index), []
+    for view in views:
+        specular = lobe.reflectance(
+            ground.scatter(math.log(alpha)), Directions(view.toward_camera, view.toward_projector)
+        )
+        mixed = (1 - share) * specular + share * ground.normal_reflectance
+        out.append(replace(view, electrons=TRUE_POWER * view.unit * mixed))
+    return out
+
+
+@pytest.mark.parametrize(("alpha_off", "share"), [(0.6, 0.004), (-1.0, 0.03), (1.5, 0.2), (0.6, 0.0)])
+def test_posteriors_cover_known_finishes(plain_views, ground, alpha_off, share):
+    """Before, shares were cut at .001, so that an interval of a share near 0 had the width of the cut."""
+    prior = machined(MachinedFace("aluminium", "ground", 0.37), 850.0)
+    scale = np.linspace(-3, 3, 2401)
+    shares = [Deviation(wide_angle=z).share(prior.wide_angle, prior.wide_angle_range) for z in scale.tolist()]
+    off = np.interp(share, shares, scale)
+    views = noisy(seen_with(plain_views, ground, prior.alpha_u * prior.alpha_factor**alpha_off, share), 0.0, 2)
+    found = finish_posterior(views, ground, prior, fit_views(views, ground), "plate")
+    assert abs(found.alpha[0] - alpha_off) < 3 * found.alpha[1] and found.alpha[1] < 0.6
+    if share:
+        assert abs(found.wide_angle[0] - off) < 3 * found.wide_angle[1] < 2.0
+    else:
+        assert found.wide_angle[0] < -2.2 and found.wide_angle[1] < 0.4  # the trials draw no share under that of -3
+
+
+def test_a_width_that_one_view_hardly_shows_is_not_wider_than_its_prior(plain_views, ground):
+    """Before, a width without its prior: 1.5 +- 3.0 (and the share 1.4 +- 3.0) of a view at 40 deg, for a true -1.0."""
+    prior = machined(MachinedFace("aluminium", "ground", 0.37), 850.0)
+    alpha = prior.alpha_u / prior.alpha_factor
+    for seed in (1, 2):
+        views = noisy(seen_with(plain_views[-1:], ground, alpha, 0.03), 0.0, seed)
+        found = finish_posterior(views, ground, prior, fit_views(views, ground), "plate")
+        for (centre, size), true in ((found.alpha, -1.0), (found.wide_angle, -0.87)):
+            assert abs(centre - true) < 2 * size and 0.05 < size < 1.1
+
+
+def test_views_without_information_leave_the_priors(plain_views, ground):
     """Views whose noise is that of a night: mean 0 and standard deviation 1, inside +-3."""
     dark = [replace(view, noise=PixelNoise(1e14, 0.0, 0.0, 0.0, 0.0, 0.01)) for view in plain_views]
     prior = machined(MachinedFace("aluminium", "ground", 0.37), 850.0)
-    found = finish_posterior(dark, ground, prior, fit_views(plain_views, ground), "plate")
-    assert found.tail[0] == pytest.approx(0.0, abs=0.05) and found.tail[1] == pytest.approx(0.987, abs=0.03)
+    found = finish_posterior(dark, ground, prior, fit_views(dark, ground), "plate")
+    for centre, size in (found.tail, found.alpha, found.wide_angle):
+        assert centre == pytest.approx(0.0, abs=0.05) and size == pytest.approx(0.987, abs=0.03)
 
 
 def test_poses_that_do_not_show_the_lobe_leave_its_width_open(plain_views, ground):
