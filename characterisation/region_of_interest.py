@@ -85,6 +85,11 @@ class Roi:
         right, bottom = min(self.right, other.right), min(self.bottom, other.bottom)
         return Roi.between(left, top, right, bottom) if left < right and top < bottom else None
 
+    def joined(self, other: Roi) -> Roi:
+        """Return the smallest region that contains both."""
+        left, top = min(self.left, other.left), min(self.top, other.top)
+        return Roi.between(left, top, max(self.right, other.right), max(self.bottom, other.bottom))
+
     def fits(self, width: int, height: int) -> bool:
         """Return whether the region holds a pixel and lies in an image of this size [px]."""
         return 0 <= self.left < self.right <= width and 0 <= self.top < self.bottom <= height

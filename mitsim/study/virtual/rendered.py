@@ -104,8 +104,12 @@ class RenderedMeasurements:
         self.geometry = sensor_geometry(study.sensor)
         self.predictor = Predictor.of_sensor(study.sensor, self.geometry)
         self.hull = corners = hull_corners(study.scene)
-        reach = _PLACEMENTS * unknowns.table.pose.placement_mm if "pose" in unknowns.varied else 0.0
+        pose, sizes = unknowns.table.pose, _PLACEMENTS if "pose" in unknowns.varied else 0.0
+        reach = sizes * pose.placement_mm
         self.corners = np.concatenate([corners + step for step in reach * _CUBE_CORNERS])
+        arms = np.linalg.norm(corners - unknowns.centre, axis=1, keepdims=True)
+        reaches = reach + sizes * np.radians(pose.placement_deg) * arms
+        self.turned_corners = np.concatenate([corners + reaches * step for step in _CUBE_CORNERS])
         self.part, self.views = DrawnPart(study, unknowns), LightOfViews()
         self.faces = RealFaces(study.scene, unknowns.table)
 
@@ -266,7 +270,7 @@ class RenderedMeasurements:
     def _shared(self, simulated: SimulatedSensor, pose: Transform, view: View, keeps_paths: bool) -> ViewLight:
         """Return regions and seen surfaces from a pose of a view, and the paths of interreflections."""
         scene = self.study.scene
-        rois = regions(simulated, view.world_from_sensor.inverse(), self.corners)
+        rois = regions(simulated, view.world_from_sensor.inverse(), self.corners, self.turned_corners)
         kept = {}
         if keeps_paths:
             numbers = (-1, *_PROBING_FINISHES) if "finish" in self.unknowns.varied else (-1,)

@@ -49,13 +49,32 @@ class ViewLight:
         )
 
 
-def regions(simulated: SimulatedSensor, sensor_from_world: Transform, corners: Floats) -> dict[str, Roi]:
-    """Return the region of each camera's image around the corners (n, 3) [mm] of a part, world frame."""
-    around = sensor_from_world.points(corners)
-    cameras = simulated.sensor.rig.cameras
-    return {
-        name: roi_around(camera, around, _MARGIN_PX) or simulated.rays[name].whole for name, camera in cameras.items()
-    }
+def regions(
+    simulated: SimulatedSensor, sensor_from_world: Transform, corners: Floats, turned: Floats
+) -> dict[str, Roi]:
+    """Return the region of each camera's image around a part.
+
+    Parameters
+    ----------
+    simulated, sensor_from_world
+        Sensor and its pose.
+    corners
+        (n, 3) [mm] of the part at all positions, world frame; a margin is added.
+    turned
+        (m, 3) [mm] the same if it also rotates; without the margin, within which small parts turn.
+
+    See Also
+    --------
+    seen_surfaces : what the regions show
+    """
+    out = {}
+    for name, camera in simulated.sensor.rig.cameras.items():
+        around, wider = (
+            roi_around(camera, sensor_from_world.points(points), margin)
+            for points, margin in ((corners, _MARGIN_PX), (turned, 0))
+        )
+        out[name] = around.joined(wider) if around is not None and wider is not None else simulated.rays[name].whole
+    return out
 
 
 def seen_surfaces(

@@ -546,6 +546,21 @@ def test_unknowns_of_a_study_are_checked(tmp_path):
         read_toml(file, StudyFile)
 
 
+def test_the_rendered_region_contains_parts_that_turn():
+    """Before, a placement of 5 deg turned the part out of the region, in which only positions counted."""
+    studies = [study_of("ensenso-n10", unknowns={"pose": {"placement_deg": degrees}}) for degrees in (5.0, 0.0)]
+    makers = [measurements_of(study, replace(study_unknowns(study), varied=("pose",))) for study in studies]
+    view, camera = studies[0].views[0], studies[0].sensor.rig.reference
+    regions = [maker._view_light(view).rois["left"] for maker in makers]
+    outside = np.zeros(2, int)
+    for day in range(100):
+        placed = makers[0].unknowns.draw(Trial(day)).placed
+        pixels = camera.project((view.world_from_sensor.inverse() @ placed).points(makers[0].hull))
+        pixels = np.clip(pixels, 0, [camera.width - 1, camera.height - 1])
+        outside += [((pixels < [roi.left, roi.top]) | (pixels > [roi.right, roi.bottom])).any() for roi in regions]
+    assert outside[0] == 0 < outside[1]
+
+
 def test_shared_interreflections_follow_the_part(coarse_n10, monkeypatch):
     """Against interreflections that are rendered at the drawn pose; direct light is the same in both."""
     given = {"measure": {"light_path_depth": 2, "samples_per_pixel": 1}, "unknowns": {"pose": {"placement_mm": 4.0}}}
