@@ -142,10 +142,7 @@ def sensor_(
     sensor_fit = fit_sensor(captures or [], sensor, off=off or [], dark=dark or [], roi=roi, seed=seed)
     write_sensor(sensor_fit, sensor, output)
     print(fit_table(sensor_fit), end="")
-    say(
-        f"sensor: {output}, {len(sensor_fit.estimates)} fitted parameters, {len(sensor_fit.undetermined)} not "
-        "determined"
-    )
+    say(f"sensor: {output}, {sensor_fit.count_in_words}")
     say(f"verdict: {sensor_fit.verdict.word}: {sensor_fit.verdict.why}")
     if journey is None:
         return

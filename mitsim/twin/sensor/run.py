@@ -74,6 +74,13 @@ class SensorFit:
         return tuple({capture.images_sha256: capture for capture in (*self.sensor.fitted_to, *captures)}.values())
 
     @property
+    def count_in_words(self) -> str:
+        """Return how many numbers the captures determine, and how many they do not, as the table says of each."""
+        fitted = sum(estimate.determined for estimate in self.estimates)
+        others = len(self.estimates) - fitted + len(self.undetermined)
+        return f"{fitted} fitted parameters, {others} not determined"
+
+    @property
     def verdict(self) -> Verdict:
         """Return whether the fitted file reproduces the captures."""
         return verdict_of(self.agreements)

@@ -103,6 +103,14 @@ def test_a_file_of_ones_own_camera(recorded, tmp_path, monkeypatch):
     # the noise of repeats contains that of rows: the 6 e- of the preset beside it would count twice
     assert mine.imager.row_noise == 0.0
     assert "| imager.row_noise_e | 0, before 6 |" in result.stdout
+    # the count is that of the table, whose rows say which numbers are not determined
+    fitted, others = map(int, re.search(r"(\d+) fitted parameters, (\d+) not determined", result.stderr).groups())
+    estimates = re.findall(
+        r"(?m)^\| (?!number)[\w.\[\]]+ \| [^|]+ \| ([^|]+) \| [^|]* \| [^|]+ \| [^|]+ \|$", result.stdout
+    )
+    absent = [interval == "not determined" for interval in estimates]
+    assert any(absent) and fitted == len(absent) - sum(absent)
+    assert others >= sum(absent) + 1  # and the row noise
     # nothing is called kept that the preset does not have
     assert "imager.smoothing_px (repeats of one pose)" not in re.sub(r"(?m)^Not determined.*$", "", result.stdout)
     assert not re.search(r"(?m)^\| [\w.]+ \| 0, kept ", result.stdout)
