@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mitsim.cli import options
 from mitsim.running.progress import say
+
+if TYPE_CHECKING:
+    from mitsim.capture.capture import Capture
 
 
 def decode(
@@ -69,3 +72,17 @@ def decode(
         say(f"no pixel has a point, for the reasons above; {output} is empty")
         raise typer.Exit(1)
     say(f"cloud: {output}; next: mitsim measure {shlex.quote(str(output))} --picture look.png")
+
+
+def decoding_step(capture: Capture, folder: Path, sensor: str | None) -> str:
+    """Return what to do next with a capture in a folder, whose sensor file may be known: the command that decodes it.
+
+    mitsim does not know a code of the user's own, and a capture does not hold the user's own mask of one camera.
+    """
+    named = ""
+    if capture.decoding.pattern is not None and capture.decoding.pattern.kind == "images":
+        if capture.technology == "structured_light":
+            return "ms.triangulate(capture, columns), with the projector columns from your own decoder"
+        if capture.technology == "reference_stereo":
+            named = f" --sensor {shlex.quote(sensor or 'FILE')}"
+    return f"mitsim decode {shlex.quote(str(folder))}{named} -o cloud.ply"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,6 +11,7 @@ import typer
 
 from characterisation.files.errors import InputError
 from mitsim.cli import options
+from mitsim.cli.decode import decoding_step
 from mitsim.cli.folder_lock import remove_partial_beside
 from mitsim.running.progress import say
 
@@ -177,7 +177,7 @@ def import_(
         say(f"capture: {folder}, finished before")
         return
     write_capture(capture, folder, vendor=imported.originals)
-    say(f"capture: {folder}; next: mitsim decode {shlex.quote(str(folder))} -o cloud.ply")
+    say(f"capture: {folder}; next: {decoding_step(capture, folder, sensor)}")
 
 
 def _posed(capture: Capture, window: tuple[int, int, int, int], where: str) -> Capture:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,6 +10,7 @@ import typer
 
 from characterisation.files.errors import InputError
 from mitsim.cli import options
+from mitsim.cli.decode import decoding_step
 from mitsim.cli.folder_lock import remove_partial_beside
 from mitsim.running.progress import say
 
@@ -140,7 +140,7 @@ def render(
     if unseen:
         say(f"warning: {unseen}")
     say("; ".join(filter(None, [str(residual), advice(residual, rendering)])))
-    say(f"capture: {output}; next: mitsim decode {shlex.quote(str(output))} -o cloud.ply")
+    say(f"capture: {output}; next: {decoding_step(capture, output, sensor)}")
 
 
 def _render_many(

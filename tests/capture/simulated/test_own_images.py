@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import re
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import mitsim as ms
 from characterisation.point_cloud import Status
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.recordings.image_folder import read_image_folder
 from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.cli.program import app
 from mitsim.decoding.cloud import capture_cloud, decoder_settings, sensor_geometry
 from mitsim.decoding.structured_light.decoder import decode_coordinates
 from mitsim.sensor.pattern import another_mask
@@ -120,6 +123,28 @@ def test_an_own_mask_of_one_camera_is_decoded_with_the_sensor_that_has_it(tmp_pa
         ms.decode(capture)
     with pytest.raises(ms.InputError, match="one, the mask"):
         own.with_patterns(np.stack([mask, mask]))
+
+
+@pytest.mark.parametrize("technology", ["reference_stereo", "structured_light"])
+def test_the_next_step_after_a_rendering_can_be_taken(technology, tmp_path):
+    """It named a command that fails on images of one's own."""
+    (tmp_path / "code").mkdir()
+    text = coded(OWN)
+    if technology == "reference_stereo":
+        text = re.sub(r"(?ms)^\[pattern\].*?(?=^\[)", OWN + "\n", reference_stereo())
+    scene = ROOT / "scenes/two_pillars/matt_white.xml"
+    size = ms.load_sensor(written(tmp_path, coded(GRAY))).patterns().shape[1:]
+    path = written(tmp_path, text)
+    (tmp_path / "code" / "1.png").write_bytes(encode_png((np.indices(size).sum(axis=0) % 7 < 3).astype(np.uint8) * 255))
+    command = f"render {scene} --sensor {path} --position 0 -300 400 --samples 1 --depth 1 -o {tmp_path}/one"
+    done = CliRunner().invoke(app, command.split(), catch_exceptions=False)
+    step = re.search("next: (.*)", done.stderr).group(1)
+    if technology == "structured_light":
+        assert step.startswith("ms.triangulate(capture, columns)")
+        return
+    assert step.startswith("mitsim decode ")
+    taken = shlex.split(step)[1:-1]
+    assert CliRunner().invoke(app, [*taken, f"{tmp_path}/cloud.ply"], catch_exceptions=False).exit_code in (0, 1)
 
 
 def test_units_of_one_camera_know_their_own_masks(tmp_path):
