@@ -22,11 +22,13 @@ from characterisation.point_cloud import Status
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.decoding.cloud import decoder_settings, imager_of_bits
+from mitsim.decoding.cloud import Settings, decoder_settings, imager_of_bits, settings_in_words
 from mitsim.running.numbers import NONE, rounded, two_digits
 from mitsim.running.progress import say
 from mitsim.sensor.fitted_to import recorded_in, shows_the_fit
 from mitsim.sensor.imager import Imager
+from mitsim.sensor.pattern import RandomDots
+from mitsim.sensor.sensor import Sensor
 from mitsim.twin.compare.compare_captures import ComparedRow, Comparison, compare_captures
 from mitsim.twin.compare.plain_image import plain_image
 from mitsim.twin.compare.rebuild import check_technology, projector_was_on, rebuild
@@ -114,21 +116,23 @@ def validate_captures(
     twin_sensor = None if simulated is not None else sensor_of(recorded, sensor, real)
     if twin_sensor is not None:
         check_technology(recorded, twin_sensor, str(real))  # before the capture is decoded
-    settings, imager = decoder_settings(recorded)
+    given = None if simulated is None else read_capture(simulated)
+    on = projector_was_on(recorded, cast(Literal["on", "off"] | None, projector), str(real))
+    settings, imager, decoder = _decoder(recorded, given, twin_sensor, on)
     recorded = _with_imager(recorded, imager)
     specimen = find_specimen(recorded, settings, roi, str(real))
-    on = projector_was_on(recorded, cast(Literal["on", "off"] | None, projector), str(real))
     say(f"specimen: a plane at {_distance(specimen):.0f} mm, with {specimen.off_plane:.2g} mm rms deviation")
     if twin_sensor is not None:
         other, where = (
             rebuild(recorded, twin_sensor, specimen, str(real), projector_on=on, seed=seed),
             str(output / "simulated"),
         )
+        other = replace(other, decoding=other.decoding.model_copy(update={"decoder": settings}))
         write_capture(other, output / "simulated", overwrite=True)
         say(f"rebuilt: {where}")
     else:
-        assert simulated is not None
-        other, where = read_capture(simulated), str(simulated)
+        assert given is not None
+        other, where = given, str(simulated)
     comparison = compare_captures(
         recorded, _with_imager(other, imager), specimen, settings, where, projector_on=on, seed=seed
     )
@@ -137,9 +141,47 @@ def validate_captures(
     write_json(output / "comparison.json", comparison.numbers() | {"fitted": fitted})
     shown = _shown(_whose(recorded), recorded, specimen, comparison.real)
     sides = shown, _shown("simulated", other, specimen, comparison.simulated)
-    preamble = _preamble(recorded, other, specimen, comparison, real, on)
+    preamble = _preamble(recorded, other, specimen, comparison, real, on, decoder)
     preamble += f"\n**{fitted}.**\n" if fitted else ""
     return CaptureValidation(comparison, table, preamble, sides, fitted)
+
+
+def _decoder(
+    recorded: Capture, given: Capture | None, twin_sensor: Sensor | None, on: bool
+) -> tuple[Settings, Imager | None, str]:
+    """Return the settings that decode both captures, their imager, and whose they are, in words.
+
+    Those of the simulated sensor, within the depths that ``recorded`` states: its decoder is part of it. If
+    ``recorded`` has other images than it takes, those of ``recorded``: a matcher of four shifted patterns has 40 times
+    the noise of another on one of them, and one of dots 20 times on a print with the projector off.
+
+    Parameters
+    ----------
+    recorded
+        The real capture.
+    given
+        The simulated capture, if the user names one.
+    twin_sensor
+        The sensor to simulate otherwise.
+    on
+        Whether the projector was on in ``recorded``.
+    """
+    stated = recorded.decoding
+    device = None if stated.near_mm is None or stated.far_mm is None else (stated.near_mm, stated.far_mm)
+    range_mm = stated.range_mm or device
+    if given is not None:
+        settings, imager = decoder_settings(given, None, range_mm)
+        return settings, imager, settings_in_words(given, settings)
+    assert twin_sensor is not None
+    count, pattern = len(next(iter(recorded.images.values()))), twin_sensor.pattern
+    why = "" if on else f"that of {twin_sensor.name} is for images with the projector on"
+    if isinstance(pattern, RandomDots) and pattern.frames != count:
+        why = f"that of {twin_sensor.name} is for {pattern.frames} images, and the recording has {count}"
+    if why:
+        settings, imager = decoder_settings(recorded)
+        return settings, imager, f"that of the recording, {settings.near_mm:g} to {settings.far_mm:g} mm; {why}"
+    settings, imager = decoder_settings(recorded, twin_sensor, range_mm)
+    return settings, imager, settings_in_words(recorded, settings, twin_sensor.name)
 
 
 def rendered_here(capture: Capture) -> bool:
@@ -189,14 +231,21 @@ def _distance(specimen: Specimen) -> float:
 
 
 def _preamble(
-    real: Capture, simulated: Capture, specimen: Specimen, comparison: Comparison, where: Path, on: bool
+    real: Capture,
+    simulated: Capture,
+    specimen: Specimen,
+    comparison: Comparison,
+    where: Path,
+    on: bool,
+    decoder: str,
 ) -> str:
     rebuilt = simulated.settings.get("rebuilt", {})
     power = rebuilt.get("power_times_reflectance_w")
     serial = f" (serial {real.serial})" if real.serial else ""
     words = [
         f"{_whose(real).capitalize()}: `{where}`, {real.sensor}{serial}, source {real.source}. Simulated: "
-        f"{simulated.sensor}, source {simulated.source}. Projector {'on' if on else 'off'}.",
+        f"{simulated.sensor}, source {simulated.source}. Projector {'on' if on else 'off'}. "
+        f"Decoder of both: {decoder}.",
         f"Specimen: a plane at {_distance(specimen):.0f} mm; the cloud deviates by {rounded(specimen.off_plane, 2)} mm "
         f"rms. Patches of {PATCH_PX} px: {comparison.image_patches} of the image, {comparison.cloud_patches} of the "
         f"cloud; a margin of {MARGIN_PX:g} px inside the specimen's outline is excluded. Contrast in windows of "

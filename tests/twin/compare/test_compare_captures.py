@@ -10,6 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from characterisation.files.errors import InputError
+from characterisation.point_cloud import Status
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
@@ -17,11 +18,13 @@ from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.cli.program import app
+from mitsim.decoding.cloud import capture_cloud
 from mitsim.decoding.matching.stereo import stereo_geometry
 from mitsim.scene.test_targets import plate
 from mitsim.sensor.fitted_to import FittedCapture, images_digest
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
+from mitsim.twin.compare import captures_run
 from mitsim.twin.compare import compare_captures as compare_module
 from mitsim.twin.compare.captures_run import validate_captures
 from mitsim.twin.compare.compare_captures import compare_captures
@@ -392,3 +395,34 @@ def test_a_cloud_of_the_device_says_how_to_compare_clouds():
     cloud = Capture("mine", "point_map", "device", sensor.rig, {})
     with pytest.raises(InputError, match="measure acceptance CLOUD --plane NAME --simulated realsense-d435"):
         check_technology(cloud, sensor, "captures/mine")
+
+
+def test_the_decoder_of_the_simulated_sensor_decodes_both_captures(n10_module, real, tmp_path, monkeypatch):
+    """A recording that states no decoder was decoded by the default matcher, whatever the sensor's."""
+    strict = replace(n10_module, matcher=n10_module.matcher.model_copy(update={"minimum_contrast_dn": 25.0}))
+    monkeypatch.setattr(captures_run, "sensor_of", lambda *_: strict)
+    path = write_capture(replace(real, sensor="MY-SENSOR"), tmp_path / "real")
+    found = validate_captures(path, None, tmp_path / "out", "strict", None, None, 1)
+    assert f"Decoder of both: 400 to 560 mm; settings of {strict.name}." in found.preamble
+    shares = {row.quantity: row for row in found.comparison.rows}["share low_modulation"]
+    specimen = find_specimen(real, strict.settings, None, "real")
+    status = capture_cloud(real, strict.settings).status[image_mask(specimen, real.rig.reference, 15)]
+    assert shares.real == pytest.approx(np.mean(status == Status.LOW_MODULATION), abs=0.05)
+    assert shares.real > 0.2 and shares.simulated > 0.2
+    given = validate_captures(path, tmp_path / "out" / "simulated", tmp_path, None, None, "on", 1)
+    rows = {row.quantity: row for row in given.comparison.rows}
+    assert rows["share low_modulation"].real == shares.real
+    assert "settings of ensenso-n10" in given.preamble
+
+
+def test_a_recording_of_other_images_than_the_sensor_takes_keeps_its_decoder(n10_module, real):
+    """The N35 correlates four shifted patterns: on one of them its matcher has 9.3 mm of noise, the other 0.26 mm."""
+    pattern = n10_module.pattern.model_copy(update={"shifts_px": [(0.0, 0.0), (9.0, 4.0)]})
+    shifted = replace(n10_module, pattern=pattern, matcher=n10_module.matcher.model_copy(update={"block_size": 3}))
+    settings, _, words = captures_run._decoder(real, None, shifted, True)
+    assert settings.block_size != 3
+    assert "that of the recording" in words and "that of ensenso-n10 is for 2 images, and the recording has 1" in words
+    one = replace(shifted, pattern=n10_module.pattern)
+    assert captures_run._decoder(real, None, one, True)[0].block_size == 3
+    settings, _, words = captures_run._decoder(real, None, one, False)
+    assert settings.block_size != 3 and "that of ensenso-n10 is for images with the projector on" in words
