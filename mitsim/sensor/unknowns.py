@@ -134,7 +134,7 @@ class FinishUnknowns(Document):
 
 
 class FormUnknowns(Document):
-    """Form deviation of the real part, one sigma along the normal [mm], by feature."""
+    """Form deviation of the real part about its least-squares features, a quarter of its zone [mm], by feature."""
 
     features: dict[str, NotNegative] = Field(default_factory=dict)
 

@@ -41,6 +41,29 @@ def triangles_by_shape(scene: Scene) -> dict[str, Floats]:
     return {name: _of_shape(shape) for name, shape in named if _solid(shape)}
 
 
+def places_over(corners: Floats, longest: float) -> tuple[Floats, Floats]:
+    """Return places (n, 3) on triangles (t, 3, 3), and the area (n,) that each of them stands for [mm^2].
+
+    Triangles are halved until no edge is longer than ``longest`` [mm]. Their corners have a twelfth of their area each,
+    and their centres the rest: the sum over a flat triangle is exact for polynomials of degree 2.
+    """
+    while True:
+        edges = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
+        long = edges.max(axis=1) > longest
+        if not long.any():
+            break
+        turn = (edges[long].argmax(axis=1)[:, None] + np.arange(3)) % 3
+        a, b, c = np.take_along_axis(corners[long], turn[:, :, None], axis=1).transpose(1, 0, 2)
+        middle = (a + b) / 2
+        halves = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+        corners = np.concatenate([corners[~long], halves])
+    first, second, third = corners.transpose(1, 0, 2)
+    area = np.linalg.norm(np.cross(second - first, third - first), axis=1) / 2
+    everywhere = np.concatenate([corners.mean(axis=1), first, second, third])
+    places, number = np.unique(everywhere, axis=0, return_inverse=True)
+    return places, np.bincount(number.ravel(), np.concatenate([0.75 * area, np.tile(area / 12, 3)])).astype(float)
+
+
 def hull_corners(scene: Scene) -> Floats:
     """Return the corners (k, 3) [mm], world frame, of the convex hull of all solid surfaces but lamps."""
     corners = np.unique(triangles(scene, lamps=False).reshape(-1, 3), axis=0)

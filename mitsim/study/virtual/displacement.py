@@ -14,26 +14,27 @@ from numpy.typing import NDArray
 
 from characterisation.files.arrays import Floats
 from characterisation.point_cloud import PointCloud
+from characterisation.tasks.task_file import Task
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.raycast import Surfaces
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.unknowns import UnknownsTable
 from mitsim.study.virtual.coat import coated, coated_shapes
-from mitsim.study.virtual.form import form_deviation
+from mitsim.study.virtual.form import form_deviation, forms_of_faces
 from mitsim.study.virtual.world import DrawnValues
 
 
 class RealFaces:
     """Faces of a part with the form and the coat of a draw."""
 
-    def __init__(self, scene: Scene, table: UnknownsTable) -> None:
+    def __init__(self, scene: Scene, task: Task, table: UnknownsTable) -> None:
         self.scene, self.table = scene, table
-        self._has_form = any(table.form.features.values())
+        self.forms = forms_of_faces(scene, task, table.form.features)
         self._has_coat = bool(coated_shapes(scene, table.coat))
 
     def deviate(self, drawn: DrawnValues) -> bool:
         """Return whether the faces of a draw have a form deviation."""
-        return bool(self._has_form and drawn.form)
+        return bool(self.forms and drawn.form)
 
     def lie_off(self, drawn: DrawnValues) -> bool:
         """Return whether the faces of a draw lie off their nominal places, by form or coat."""
@@ -68,8 +69,8 @@ class RealFaces:
         scene, table = self.scene, self.table
         points = displaced(cloud, drawn, assumed, scene.centre)
         if surfaces is not None:
-            form = table.form.features if drawn.form and with_form else {}
-            points = form_deviation(points, surfaces, scene, form, assumed, cloud.grid, drawn.form)
+            forms = self.forms if drawn.form and with_form else []
+            points = form_deviation(points, surfaces, scene, forms, assumed, cloud.grid, drawn.form)
             if drawn.coat:
                 points = coated(points, surfaces, scene, table.coat, assumed, cloud.grid, drawn.coat)
         return replace(cloud, points=points, feature=labels, feature_names=scene.names)

@@ -1,32 +1,42 @@
 """Form deviation of a real part: a smooth random deviation of its faces from their nominal geometry.
 
-Signal chain: position on a face -> smooth random height with a given standard deviation -> displacement of the point
-along its ray, by the distance that matches the height along the normal.
+Signal chain: position on a face -> smooth random height -> less its least-squares plane, cylinder, sphere or cone over
+the whole face -> scaled to a zone of a given width -> displacement of the point along its ray, by the distance that
+matches the height along the normal.
 
 The field is a sum of plane waves with random directions and phases. Their wavelengths are between half and twice the
 extent of the face, since form, as opposed to waviness, is the deviation over the whole extent (ISO 1101, ISO 12781-1).
 Each face has its own field.
 
-A face whose flatness or cylindricity has a tolerance deviates by a quarter of it, one sigma, unless the study says
-otherwise: the zone of the drawing then holds 95 % of the deviations. The form itself is measured without that
-deviation, since its statement is about a part at the limit of the tolerance
-(:mod:`characterisation.statements.one_sided`).
+Distances, angles and radii are those of the least-squares features of the real faces (ISO 17450-1). A height with a
+mean or a tilt over a face would move its feature: the part would have another true value, and a sensor that measures
+that value would be charged with the difference. The true value of every trial is the nominal one, because the heights
+have no such part. A sensor that sees only a part of a face does not find the feature of the whole, and has an error.
+
+The zone of a form tolerance, unless the study says otherwise, is filled by every trial: its width is the tolerance of
+flatness or cylindricity. The form itself is measured without that deviation, since its statement is about a part at
+the limit of the tolerance (:mod:`characterisation.statements.one_sided`).
 """
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.features.fits import LEAST_GATE_MM
+from characterisation.features.surfaces import Surface, distances, dots
+from characterisation.files.arrays import Floats
 from characterisation.point_cloud import ViewGrid
 from characterisation.tasks.definitions import DEFINITIONS
 from characterisation.tasks.result import Result
 from characterisation.tasks.task_file import Task
 from mitsim.scene.load import Scene, bounds_of
 from mitsim.scene.ray_casting.raycast import Surfaces
+from mitsim.scene.ray_casting.triangles import places_over, triangles_by_shape
 from mitsim.sensor.transforms import Transform
 
 #: number of plane waves of a field; chosen
@@ -35,18 +45,22 @@ _WAVES = 24
 #: smallest cosine between normal and view ray, which bounds the displacement along the ray; chosen
 _GRAZING = 0.1
 
-#: width of the zone of a form tolerance, in standard deviations of the form. Assumed
-_ZONE_SIGMAS = 4.0
+#: width of the zone of a form in units of its size: that of 95 % of normal heights, in standard deviations
+_ZONE_SIZES = 4.0
+
+#: longest edge, in extents of a face, of the triangles on which its feature and zone are found: an eighth of the
+#: shortest wave; chosen
+_LONGEST_EDGE = 1 / 16
 
 
 def drawn_form(task: Task, stated_sizes: Mapping[str, float]) -> dict[str, float]:
-    """Return the form deviation [mm], one sigma, by face: as stated, else a quarter of the tolerance of its form."""
+    """Return a quarter of the zone of the form [mm], by face: as stated, else that of the tolerance of its form."""
     sizes = dict[str, float]()
     for name in form_measurements(task):
         asked = task.measurements[name]
         if asked.tolerance_size is not None:
             face = asked.features[0]
-            sizes[face] = min(asked.tolerance_size / _ZONE_SIGMAS, sizes.get(face, np.inf))
+            sizes[face] = min(asked.tolerance_size / _ZONE_SIZES, sizes.get(face, np.inf))
     return sizes | dict(stated_sizes)
 
 
@@ -81,11 +95,58 @@ def measured_with_form(
     return {name: results[name] for name in task.measurements}
 
 
+@dataclass(frozen=True)
+class FaceForm:
+    """Form deviation of a face of any draw: a zone about its least-squares feature.
+
+    - ``name`` of the face, and its nominal ``surface``, part frame.
+    - ``zone``: width [mm], from the lowest to the highest place of the face.
+    - ``extent`` of the face [mm].
+    - ``places`` (n, 3) [mm] all over the face, part frame, and the ``areas`` (n,) that they stand for.
+    """
+
+    name: str
+    surface: Surface
+    zone: float
+    extent: float
+    places: Floats
+    areas: Floats
+
+    def heights(self, positions: NDArray[np.floating], seed: int) -> Floats:
+        """Return heights (n,) [mm] along the normals of the nominal surface at positions (n, 3) [mm], part frame."""
+        everywhere = np.concatenate([self.places, positions])
+        rng = np.random.default_rng([seed, zlib.crc32(self.name.encode())])
+        field = random_field(everywhere, self.extent, rng)
+        _, changes, _ = self.surface.linearised(np.zeros(self.surface.parameter_count), everywhere, None)
+        count, weights = len(self.places), np.sqrt(self.areas)
+        feature = np.linalg.lstsq(weights[:, None] * changes[:count], weights * field[:count], rcond=None)[0]
+        field -= changes @ feature
+        return np.asarray(field[count:] * (self.zone / np.ptp(field[:count])))
+
+
+def forms_of_faces(scene: Scene, task: Task, sizes: Mapping[str, float]) -> list[FaceForm]:
+    """Return the forms of the faces of a task that deviate, by their quarters of a zone [mm]; no other is measured."""
+    sizes = {name: size for name, size in sizes.items() if size > 0 and name in task.shapes}
+    corners = triangles_by_shape(scene) if sizes else {}
+    forms = []
+    for name, size in sizes.items():
+        if name not in corners:  # it reflects no light
+            continue
+        surface = task.features[name].nominal()
+        extent = float(np.linalg.norm(np.ptp(bounds_of(scene.shapes[scene.names.index(name)]), axis=0)))
+        places, areas = places_over(corners[name], extent * _LONGEST_EDGE)
+        near = np.abs(distances(surface, places, None)[0]) <= LEAST_GATE_MM
+        if near.any():  # a shape may have other faces, too
+            places, areas = places[near], areas[near]
+        forms.append(FaceForm(name, surface, _ZONE_SIZES * size, extent, places, areas))
+    return forms
+
+
 def form_deviation(
     points: NDArray[np.float32],
     surfaces: Surfaces,
     scene: Scene,
-    sizes: Mapping[str, float],
+    forms: Iterable[FaceForm],
     world_from_sensor: Transform,
     grid: ViewGrid,
     seed: int,
@@ -100,8 +161,8 @@ def form_deviation(
         Shape and normal that each pixel of the grid meets, sensor frame.
     scene
         Scene with the shapes.
-    sizes
-        Standard deviation of the form [mm] by name of a shape.
+    forms
+        Forms of the faces that deviate.
     world_from_sensor
         Pose of the sensor.
     grid
@@ -110,15 +171,15 @@ def form_deviation(
         Selects the form; each face has its own field.
     """
     out = points
-    for name, size in sizes.items():
-        index = scene.names.index(name)
-        here = (surfaces.shape == index) & np.isfinite(points[..., 2])
+    for form in forms:
+        here = (surfaces.shape == scene.names.index(form.name)) & np.isfinite(points[..., 2])
         if not here.any():
             continue
         positions = world_from_sensor.points(points[here].astype(float))
-        extent = float(np.linalg.norm(np.ptp(bounds_of(scene.shapes[index]), axis=0)))
-        height = size * random_field(positions, extent, np.random.default_rng([seed, zlib.crc32(name.encode())]))
-        out = along_rays(out, here, height, surfaces, grid)
+        toward_sensor = world_from_sensor.directions(surfaces.normal[here].astype(float))
+        # a sheet that rises on one side falls on the other
+        side = np.where(dots(form.surface.meet(positions, None).normal, toward_sensor) < 0, -1.0, 1.0)
+        out = along_rays(out, here, side * form.heights(positions, seed), surfaces, grid)
     return out
 
 

@@ -73,7 +73,7 @@ class MappedMeasurements:
         self.geometry = sensor_geometry(study.sensor)
         self.predictor = Predictor.of_sensor(study.sensor, self.geometry)
         self._characterised: dict[int, CharacterisedScene] = {}
-        self.faces = RealFaces(study.scene, unknowns.table)
+        self.faces = RealFaces(study.scene, study.task, unknowns.table)
         self._beyond_sizes = beyond_map().of(study.sensor) if BEYOND in unknowns.varied else None
         self._predicted: dict[int, dict[str, float]] = {}
         self._folded = folded_values(study.task)

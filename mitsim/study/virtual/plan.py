@@ -32,6 +32,9 @@ from mitsim.study.virtual.world import BEYOND, Unknowns
 #: part of the digest of a trial; increased if the same draw gives a different measurement
 TRIAL_VERSION = 7
 
+#: the same of a study whose faces have a form
+FORM_VERSION = 2
+
 #: keys of a task that concern the verdict, not the measurement
 _NO_PART_OF_A_TRIAL: Any = {"decision": True, "measurements": {"__all__": {"decision"}}}
 
@@ -193,6 +196,8 @@ def trial_digest(
         content["files"] = named
     if file.sprayed:
         content["sprayed"] = True
+    if any(unknowns.table.form.features.values()):
+        content["form"] = FORM_VERSION
     if separate_light:
         content["apart"] = True
     if source == "map":

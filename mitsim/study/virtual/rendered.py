@@ -111,7 +111,7 @@ class RenderedMeasurements:
         reaches = reach + sizes * np.radians(pose.placement_deg) * arms
         self.turned_corners = np.concatenate([corners + reaches * step for step in _CUBE_CORNERS])
         self.part, self.views = DrawnPart(study, unknowns), LightOfViews()
-        self.faces = RealFaces(study.scene, unknowns.table)
+        self.faces = RealFaces(study.scene, study.task, unknowns.table)
 
     def exposed_as(self, planned: PlannedExposure | None) -> RenderedMeasurements:
         """Return the same measurements with other exposures than the sensor's own; prepared data is shared."""
