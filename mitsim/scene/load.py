@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from characterisation.files.errors import InputError, nearest
 from mitsim.scene import backend
 from mitsim.scene.materials import Finish, loading, register
+from mitsim.scene.mirrored import face_normals_side
 from mitsim.scene.scene_errors import explain_error
 from mitsim.scene.surface.scatter import NOMINAL, Deviation
 from mitsim.scene.xml_check import check_rotations, checked_trees
@@ -286,6 +287,7 @@ def _wrap(scene: Any, finishes: dict[str, Finish], where: str) -> Scene:
     if not 1.0 <= size <= 1e5:
         hint = "lengths are in mm; a part modelled in metres needs <scale value='1000'/>"
         raise InputError(where, "shape", f"a scene {size:g} mm across", "1 mm to 100 m", hint)
+    face_normals_side(scene)
     _share_kernels(scene)
     names = tuple(shape.id() or f"shape_{i}" for i, shape in enumerate(shapes))
     for name, shape in zip(names, shapes, strict=True):
