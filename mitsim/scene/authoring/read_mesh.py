@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from collections import defaultdict
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,7 @@ from mitsim.sensor.calibration_qualifiers import LENGTHS_MM, UNITS_MM
 STEP = (".step", ".stp", ".p21")
 _MESHES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf", ".3mf")
 
-#: formats with polygons, which trimesh divides into fans
+#: formats with polygons, which are divided into fans
 _POLYGONS = (".obj", ".ply", ".off")
 
 #: cosine of the angle between the normals of triangles that fold back on one another
@@ -83,6 +85,8 @@ def _load(path: Path) -> Any:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
+            if path.suffix.lower() == ".obj":
+                return trimesh.Scene(_obj_mesh(path.read_bytes()))
             return trimesh.load_scene(path, process=False)  # else it leaves out vertices that are not numbers
     except ImportError as error:
         package = getattr(error, "name", None) or str(error)
@@ -93,6 +97,25 @@ def _load(path: Path) -> Any:
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         allowed = f"a file of the format {path.suffix.lower().lstrip('.').upper()}"
         raise InputError(path, "", f"an unreadable file ({reason})", allowed, "save the part as STL or STEP") from None
+
+
+def _obj_mesh(data: bytes) -> trimesh.Trimesh:
+    """Return the polygons of an OBJ file, divided into fans.
+
+    trimesh counts relative numbers from the last vertex of the file instead of the last one before the polygon, and
+    skips lines that begin with a blank.
+    """
+    vertices: list[list[float]] = []
+    triangles: list[tuple[int, int, int]] = []
+    for line in re.sub(rb"\\\r?\n", b" ", data).splitlines():
+        keyword, *words = line.partition(b"#")[0].split() or [b""]
+        if keyword == b"v":
+            vertices.append([float(word) for word in words[:3]])
+        elif keyword == b"f":
+            numbers = [int(word.partition(b"/")[0]) for word in words]
+            first, *others = [number - 1 if number >= 0 else len(vertices) + number for number in numbers]
+            triangles += [(first, *pair) for pair in pairwise(others)]
+    return trimesh.Trimesh(vertices, triangles, process=False)
 
 
 def _scale(path: Path, scene: Any, units: str | None) -> tuple[float, tuple[str, ...]]:
