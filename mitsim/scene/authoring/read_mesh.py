@@ -18,6 +18,7 @@ from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError, nearest
 from mitsim.scene.authoring.face import Ints
 from mitsim.scene.authoring.units import commented_unit, unit_assumed, unit_words
+from mitsim.scene.authoring.unread_mesh import GLTF, unread
 from mitsim.sensor.calibration_qualifiers import LENGTHS_MM, UNITS_MM
 
 STEP = (".step", ".stp", ".p21")
@@ -28,6 +29,9 @@ _POLYGONS = (".obj", ".ply", ".off")
 
 #: cosine of the angle between the normals of triangles that fold back on one another
 _FOLDED = -0.99999
+
+#: takes coordinates of glTF, whose y is up (glTF 2.0, section 3.4), to those of a part, whose z is up
+_Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 _LARGEST_FILE = 1024**3
 
@@ -50,14 +54,21 @@ def read_mesh(path: str | Path, units: str | None = None) -> Mesh:
     Raises
     ------
     InputError
-        If the file is missing, does not match its suffix, contains no triangles, or needs a package that is absent.
+        If the file is missing, does not match its suffix, contains no triangles, or more than can be read, or needs a
+        package that is absent.
     """
     path = Path(path)
     check_part_file(path, units)
+    if found := unread(path):
+        hint = "save the part alone, as plain triangles, or as STL or STEP"
+        raise InputError(path, "", found, "triangles of the part's surface", hint)
     scene = _load(path)
     scale, remarks = _scale(path, scene, units)
     mesh = _gathered(path, scene, scale)
-    return Mesh(mesh.vertices, mesh.triangles, remarks)
+    if path.suffix.lower() not in GLTF:
+        return Mesh(mesh.vertices, mesh.triangles, remarks)
+    remarks += (f"{path.name} has y up, as glTF defines it: turned, so that z is up",)
+    return Mesh(mesh.vertices @ _Z_UP_FROM_Y_UP.T, mesh.triangles, remarks)
 
 
 def check_part_file(path: Path, units: str | None) -> None:
@@ -133,7 +144,7 @@ def _scale(path: Path, scene: Any, units: str | None) -> tuple[float, tuple[str,
 def _stated_unit(path: Path, scene: Any) -> float | None:
     """Return the unit of length [mm] that a mesh file states, None without one."""
     kind = path.suffix.lower()
-    if kind in (".glb", ".gltf"):
+    if kind in GLTF:
         return LENGTHS_MM["m"]
     if kind == ".3mf":
         word = str(scene.metadata.get("units", "millimeter")).strip().lower()
