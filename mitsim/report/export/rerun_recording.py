@@ -69,7 +69,7 @@ def _log_view(rerun: Any, stream: Any, scene: RunScene, view: ShownView) -> None
     if grid is not None:
         pinhole = rerun.Pinhole(
             focal_length=(grid.fx, grid.fy),
-            principal_point=(grid.cx, grid.cy),
+            principal_point=(grid.cx + 0.5, grid.cy + 0.5),  # the first pixel's centre is (0.5, 0.5) for Rerun
             width=grid.width,
             height=grid.height,
             camera_xyz=rerun.ViewCoordinates.RDF,

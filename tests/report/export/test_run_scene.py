@@ -116,6 +116,11 @@ def test_rerun_recording_is_read_by_rerun(scene, tmp_path):
     np.testing.assert_allclose(variance, (cloud.sigma[cloud.valid][:, None] * rays) ** 2, rtol=1e-5)
     (status,) = chunks[f"{place}/grid/predicted_status", "buffer"]
     assert np.array_equal(np.reshape(status, cloud.status.shape), cloud.status)
+    (matrix,) = chunks[f"{place}/grid", "image_from_camera"]
+    row, column = np.nonzero(cloud.valid)
+    inside = (cloud.points[cloud.valid] - cloud.grid.origin) @ cloud.grid.rotation
+    shown = inside / inside[:, 2:] @ np.reshape(matrix, (3, 3))  # Rerun writes columns, and shows pixel k at k to k + 1
+    np.testing.assert_allclose(shown[:, :2], np.column_stack([column, row]) + 0.5, atol=1e-3)
     (translation,) = chunks[place, "translation"]
     np.testing.assert_allclose(translation, view.part_from_sensor.translation, rtol=1e-6)
     (context,) = [value for (path, name), value in chunks.items() if path == "/views" and name == "context"]
