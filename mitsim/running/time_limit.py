@@ -9,11 +9,13 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeVar
 
 from mitsim.running.progress import say
+
+Item = TypeVar("Item")
 
 #: whether the user has asked the command to end
 _stopped = False
@@ -51,6 +53,14 @@ class TimeLimit:
         if self.end is None:
             return TimeLimit()
         return TimeLimit(share * max(0.0, self.left - reserve))
+
+
+def in_time(items: Iterable[Item], over: Callable[[], bool], least: int = 1) -> Iterator[Item]:
+    """Yield items until time is over, but at least some: a consumer that works ahead begins none after that."""
+    for done, item in enumerate(items):
+        if done >= least and over():
+            return
+        yield item
 
 
 def stopped_by_user() -> bool:

@@ -148,7 +148,7 @@ def run_within(
     clock.lap("race")
     leaders = list(dict.fromkeys(raced.leaders().values()))
     stated, rest_limit = None, plan.rest_limit(limit)
-    if leaders:
+    if leaders and (not limit.over() or session.trials.known(leaders[0])):  # a first trial may take minutes
         statement_limit = plan.statement_limit(limit)
         stated = session.state(
             study.view(leaders[0]), None, statement_limit, lambda stated_view: answers.improve(raced, stated_view)

@@ -11,6 +11,7 @@ that time did not reach counts as one that cannot measure.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -47,8 +48,8 @@ from mitsim.maps.prediction import (
     performance,
     together,
 )
-from mitsim.running.progress import track
-from mitsim.running.time_limit import TimeLimit
+from mitsim.running.progress import say, track
+from mitsim.running.time_limit import TimeLimit, in_time
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
 from mitsim.sensor.transforms import Transform
@@ -66,6 +67,9 @@ _STATISTICS = ("n", "sigma", "n_white", "sigma_white", "n_only")
 
 #: fewest views that are scored within a limit of time: as many as the corners of an icosahedron
 FEWEST_VIEWS = 12
+
+#: views after which the time of the screening is told; chosen
+_TIMED_VIEWS = 3
 
 #: R_f below which a lack of points is attributed to occlusion
 OCCLUDED = 0.75
@@ -163,11 +167,14 @@ def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above 
     order = scoring_order(views, limit)
     by_index = dict[int, _ViewScore]()
     # the tracked scores come first, so that the last line of progress is printed when they end
-    scoring = track(one_ahead([views[i] for i in order], cast, score), "score views", len(views))
+    limit = TimeLimit() if limit is None else limit
+    began = time.monotonic()
+    in_limit = in_time([views[i] for i in order], limit.over, FEWEST_VIEWS)
+    scoring = track(one_ahead(in_limit, cast, score), "score views", len(views))
     for (_, view_score), index in zip(scoring, order, strict=False):
         by_index[index] = view_score
-        if limit is not None and limit.over() and len(by_index) >= FEWEST_VIEWS:
-            break
+        if len(by_index) == _TIMED_VIEWS:
+            _say_expected((time.monotonic() - began) / _TIMED_VIEWS, limit, len(views))
     scored = [by_index.get(index) or _not_scored(by_index[order[0]]) for index in range(len(views))]
     columns = (np.array([getattr(view_score, key) for view_score in scored]) for key in _STATISTICS)
     statistics = view_statistics(names, *columns)
@@ -209,6 +216,13 @@ def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above 
     scores["tolerance"] = ("measurement", tolerances, {"units": "mm or deg"})
     scores["unit"] = ("measurement", [m.unit for m in measurements])
     return with_poses(scores, views), [view_score.inputs for view_score in scored]
+
+
+def _say_expected(each_s: float, limit: TimeLimit, views: int) -> None:
+    """Say how many views there will be time for, if not for all, from the time that a view takes."""
+    if limit.left < each_s * (views - _TIMED_VIEWS):
+        count = max(FEWEST_VIEWS, _TIMED_VIEWS + int(limit.left / each_s))
+        say(f"a view takes {each_s:.1f} s: about {count} of {views} views are screened, in {each_s * count:.0f} s")
 
 
 def not_scored_in_words(scores: xr.Dataset) -> str:

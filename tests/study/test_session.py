@@ -48,6 +48,16 @@ def test_to_screen_needs_neither_a_folder_nor_the_measurements(study, monkeypatc
     assert scores.sizes["view"] == len(inputs) == len(study.views)
 
 
+def test_screening_says_how_many_views_it_has_time_for_once_some_have_told_the_time(study, capsys):
+    """The plan said 6 s of the screening of a part of 100 faces, which took 93 s; nothing said so before."""
+    views = study.file.views.model_copy(update={"subdivisions": 1, "rolls_deg": [0.0, 90.0]})
+    many = open_study(SCENES / "study.toml", study.file.model_copy(update={"views": views}))
+    Session(many).screen(limit=TimeLimit(1.0, time.monotonic() - 2.0))
+    assert f"about {FEWEST_VIEWS} of {len(many.views)} views are screened" in capsys.readouterr().err
+    Session(study).screen(limit=TimeLimit(1e6))
+    assert "are screened" not in capsys.readouterr().err
+
+
 def test_screening_within_a_limit_scores_views_that_lie_far_apart_and_says_how_many(study):
     views = study.file.views.model_copy(update={"subdivisions": 1, "rolls_deg": [0.0, 90.0]})
     many = open_study(SCENES / "study.toml", study.file.model_copy(update={"views": views}))

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from characterisation.files.arrays import Floats
 from characterisation.statements.selection import Standing, joint_samples, judge
 from mitsim.running.progress import say, say_progress, track
+from mitsim.running.time_limit import in_time
 from mitsim.study import RaceTable
 from mitsim.study.virtual.trials import Outcome, TrialFolder
 from mitsim.study.virtual.world import Trial
@@ -96,7 +97,7 @@ def complete(
     missing = [job for job in jobs if job.trial not in trials.known(job.view.number)]
     if not missing:
         return
-    for job, outcome in track(runner.run(runner.in_order(missing)), label, len(missing)):
+    for job, outcome in track(runner.run(in_time(runner.in_order(missing), over)), label, len(missing)):
         trials.add(job.view.number, job.trial, outcome)
         if over():
             break
@@ -234,7 +235,7 @@ def run_race(
         # the most promising views come first, so that they have trials when time is over, and the trials of each
         # follow each other, so that they share its light paths
         for first in range(0, len(jobs), _AT_ONCE):
-            for job, outcome in runner.run(jobs[first : first + _AT_ONCE]):
+            for job, outcome in runner.run(in_time(jobs[first : first + _AT_ONCE], over)):
                 trials.add(job.view.number, job.trial, outcome)
                 done += 1
                 if time.monotonic() - last > _SAY_EVERY_S:

@@ -12,8 +12,9 @@ import xarray as xr
 
 from characterisation.files.documents import validate
 from characterisation.tasks.task_file import Task
+from mitsim.maps.campaign.acquire import one_ahead
 from mitsim.study import RaceTable
-from mitsim.study.virtual.race import ALL, Job, run_race, shortlist
+from mitsim.study.virtual.race import ALL, Job, complete, run_race, shortlist
 from mitsim.study.virtual.race_tables import raced_errors, with_race
 from mitsim.study.virtual.trials import Outcome, TrialFolder
 from mitsim.study.virtual.world import Trial
@@ -114,6 +115,31 @@ def test_time_that_is_over_has_gone_to_the_most_promising_views(tmp_path):
     maker = KnownMaker(np.ones((2, 6)))
     raced = race(maker, scores_of(np.array([[3, 1, 6, 2, 5, 4]] * 2)), tmp_path, over=lambda: maker.made >= 3)
     assert raced.views[np.isfinite(raced.errors[0]).any(axis=1)].tolist() == [1, 3, 0]
+
+
+class OneAheadMaker(KnownMaker):
+    """Takes the next capture while it measures one, as the renderer does."""
+
+    def __init__(self, spreads):
+        super().__init__(spreads)
+        self.taken = 0
+
+    def run(self, jobs):
+        def take(job):
+            self.taken += 1
+            return job
+
+        return one_ahead(jobs, take, lambda _, job: next(KnownMaker(self.spreads).run([job]))[1])
+
+
+def test_no_capture_is_begun_when_time_is_over(tmp_path):
+    """Of a part of 100 faces, a first capture of a view takes a minute: the next one was made, and thrown away."""
+    maker = OneAheadMaker(np.ones((2, 6)))
+    raced = race(maker, scores_of(np.ones((2, 6))), tmp_path / "race", over=lambda: maker.taken >= 1)
+    assert raced.trials == maker.taken == 1
+    folder, other = TrialFolder(tmp_path / "stated", "digest", NAMES), OneAheadMaker(np.ones((2, 6)))
+    complete(folder, other, [Job(View(0), Trial(day)) for day in range(5)], "state", lambda: other.taken >= 1)
+    assert len(folder.known(0)) == other.taken == 1
 
 
 def test_the_first_round_tells_its_state_while_it_lasts(tmp_path, monkeypatch):
