@@ -335,16 +335,16 @@ def _make_room_for_texts(axes: Axes) -> None:
 
 
 def _renderer(figure: Any) -> Any:
-    return FigureCanvasAgg(figure.figure).get_renderer()
+    canvas: Any = FigureCanvasAgg(figure.figure)
+    return canvas.get_renderer()
 
 
-def _legend(figure: FigureBase, verdicts: Mapping[str, str], camera: str, columns: int | None) -> float:
+def _legend(figure: Any, verdicts: Mapping[str, str], camera: str, columns: int | None) -> float:
     """Draw the legend at the foot of a figure, and return its upper end as a share of the figure's height."""
     used = [verdict for verdict in VERDICTS if verdict in verdicts.values()]
     handles: list[Any] = [Patch(facecolor=VERDICTS[verdict], label=_LEGEND.get(verdict, verdict)) for verdict in used]
-    handles.append(Patch(facecolor=_NOT_ASKED, label="not measured"))
     seen = f"field of view of the {camera or 'first'} camera".replace("camera camera", "camera")
-    handles.append(Line2D([], [], color=INK, lw=0.8, ls="--", label=seen))
+    handles += [Patch(facecolor=_NOT_ASKED, label="not measured"), Line2D([], [], c=INK, lw=0.8, ls="--", label=seen)]
     layout: dict[str, Any] = {"ncols": columns or len(handles), "columnspacing": 1.4 if columns is None else 0.8}
     legend = figure.legend(handles=handles, loc="lower center", handlelength=1.2, **layout)
     return float(legend.get_window_extent(_renderer(figure)).transformed(figure.transSubfigure.inverted()).y1)
