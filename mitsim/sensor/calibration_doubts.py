@@ -16,6 +16,12 @@ _LARGEST_TANGENTIAL = 0.02
 #: principal points farther from the middle, in both axes, raise doubt [share of the sides]
 _FAR_FROM_MIDDLE = 0.2
 
+#: largest ratio of fx and fy that raises no doubt; pixels are square, or nearly so
+_MOST_ASPECT = 1.25
+
+#: largest angle between the axes of two eyes that raises no doubt [deg]; chosen
+_MOST_TURNED_DEG = 60.0
+
 
 def baseline_note(name: str, baseline_mm: float) -> str:
     """Return a warning about a distance between two eyes [mm] that suggests another unit; empty without doubt."""
@@ -46,21 +52,27 @@ def lens_note(name: str, distortion: NDArray[np.float64]) -> str:
     )
 
 
-def principal_note(name: str, matrix: NDArray[np.float64], size: tuple[int, int]) -> str:
-    """Return a warning about a principal point far from the middle of images of a size [px]; empty without doubt."""
-    centre, (width, height) = matrix[:2, 2], size
-    off = np.abs(centre - (np.array(size) - 1) / 2) / size
-    if off.min() <= _FAR_FROM_MIDDLE:
-        return ""
-    return (
-        f"{name}: the principal point {centre[0]:g}, {centre[1]:g} is far from the middle of images of {width} x "
-        f"{height} px: is the calibration that of images of another size, or does the point count from the middle?"
-    )
+def matrix_notes(name: str, matrix: NDArray[np.float64], size: tuple[int, int] | None) -> list[str]:
+    """Return warnings about a camera matrix that suggests another order of numbers, or images of another size [px]."""
+    notes = []
+    centre, (fx, fy) = matrix[:2, 2], np.diag(matrix)[:2]
+    if max(fx / fy, fy / fx) > _MOST_ASPECT:
+        notes.append(
+            f"{name}: focal lengths of {fx:g} and {fy:g} px differ by more than pixels do: are these fx and fy, and cx "
+            f"and cy {centre[0]:g} and {centre[1]:g}?"
+        )
+    if size is not None and (np.abs(centre - (np.array(size) - 1) / 2) / size).min() > _FAR_FROM_MIDDLE:
+        width, height = size
+        notes.append(
+            f"{name}: the principal point {centre[0]:g}, {centre[1]:g} is far from the middle of images of {width} x "
+            f"{height} px: is the calibration that of images of another size, or does the point count from the middle?"
+        )
+    return notes
 
 
 def facing_note(name: str, R: NDArray[np.float64]) -> str:
-    """Return a warning about two eyes that look in opposite directions; empty without doubt."""
+    """Return a warning about two eyes that look in very different directions; empty without doubt."""
     angle = math.degrees(math.acos(min(max(float(R[2, 2]), -1.0), 1.0)))
-    if angle <= 90:
+    if angle <= _MOST_TURNED_DEG:
         return ""
     return f"{name} looks {angle:.0f} deg away from the first camera: is its rotation in degrees, or another eye's?"

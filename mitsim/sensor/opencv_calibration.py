@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.files.documents import Document, validate
 from characterisation.files.errors import InputError, nearest
-from mitsim.sensor.calibration_doubts import baseline_note, board_unit_note, facing_note, lens_note, principal_note
+from mitsim.sensor.calibration_doubts import baseline_note, board_unit_note, facing_note, lens_note, matrix_notes
 from mitsim.sensor.calibration_eyes import size_of
 from mitsim.sensor.calibration_formats import beside
 from mitsim.sensor.calibration_names import USUAL_NAMES, Names
@@ -284,9 +284,9 @@ def _eye(values: _Values, name: str, index: int, sensor_keys: dict[str, Any]) ->
             K, size, note = of_images(K, size, read_out, stated or values.size)
             if note:
                 values.notes.append(f"calibration {matrix.file.name}: {name}: {note}")
-        seen = stated or size or values.size
-        if index < 2 and read_out is None and seen and (note := principal_note(name, K, seen)):
-            values.notes.append(f"calibration {matrix.file.name}: {note}")
+        if index < 2:
+            seen = None if read_out is not None else stated or size or values.size
+            values.notes += [f"calibration {matrix.file.name}: {note}" for note in matrix_notes(name, K, seen)]
         out |= {"focal_px": [float(K[0, 0]), float(K[1, 1])], "principal_px": [float(K[0, 2]), float(K[1, 2])]}
     if size is not None:
         out |= {"width": size[0], "height": size[1]}
@@ -348,9 +348,7 @@ def _pose(values: _Values, name: str, index: int, sensor_keys: dict[str, Any]) -
     baseline = float(np.linalg.norm(T))
     of_mc_calib = translation is not None and to_mm is stated is None and "camera_pose_matrix" in translation.name
     doubt = board_unit_note if of_mc_calib else baseline_note
-    for note in (doubt(name, baseline), facing_note(name, R)):
-        if note:
-            values.notes.append(f"calibration: {note}")
+    values.notes += [f"calibration: {note}" for note in (doubt(name, baseline), facing_note(name, R)) if note]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # at 90 deg about y the angles are not unique; any solution is valid
         turn = Rotation.from_matrix(R.T)

@@ -157,6 +157,8 @@ DOUBTS = {
     "has four coefficients, of which p1 and p2": {"K": K.tolist(), "D": [-0.05, 0.03, 0.06, -0.04]},
     "the principal point 100, 70 is far from the middle": NUMBERS | {"cx": 100.0, "cy": 70.0},
     "the principal point 2, -3 is far from the middle": NUMBERS | {"cx": 2.0, "cy": -3.0},
+    "focal lengths of 600 and 322 px differ": {"intrinsics": [600.0, 322.0, 602.0, 238.0], "resolution": [640, 480]},
+    "right looks 69 deg away": {"K1": K.tolist(), "K2": K2.tolist(), "R": [0.1, 1.2, -0.3], "T": [-60, 0, 0]},
     "right stands 1.2 mm": {"K1": K.tolist(), "K2": K2.tolist(), "R": np.eye(3).tolist(), "T": [-1.2, 0, 0]},
     "right looks 172 deg away": {"K1": K.tolist(), "K2": K2.tolist(), "R": [0.0, 3.0, 0.0], "T": [-60, 0, 0]},
 }
