@@ -24,7 +24,7 @@ from mitsim.capture.recordings.depthai_recording import calibration_beside, read
 from mitsim.capture.recordings.ensenso import ensenso_originals, image_sets, read_ensenso
 from mitsim.capture.recordings.image_folder import at_size_of_images, read_image_folder
 from mitsim.capture.recordings.organised_cloud import Axes, StoredCloud, read_organised_cloud
-from mitsim.capture.recordings.pose_file import read_pose
+from mitsim.capture.recordings.pose_file import read_pose, unit_note
 from mitsim.capture.recordings.recognise import NAMES, kind_of
 from mitsim.capture.recordings.recording_files import frame_of, needs_recordings, plain_name
 from mitsim.capture.recordings.robi import read_robi
@@ -290,6 +290,8 @@ def read_recording(path: str | Path, options: ReadOptions, kind: str | None = No
         if name not in capture.rig.cameras:
             raise InputError("--images", "", repr(name), ", ".join(capture.rig.cameras))
     pose, covariance = (None, None) if options.pose is None else read_pose(options.pose)
+    if pose is not None and (note := unit_note(pose, str(options.pose))):
+        records["warnings"] = [*capture.settings.get("warnings", []), note]
     capture = replace(
         capture,
         decoding=capture.decoding.model_copy(update=decoding),

@@ -18,6 +18,7 @@ from characterisation.files.checked_files import read_bounded
 from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
 from mitsim.capture.calibration import EXACT, PoseDocument
+from mitsim.capture.recordings.cloud_numbers import METRES_UNDER
 from mitsim.capture.recordings.json_fields import nearest_rotation, parsed_json
 from mitsim.sensor.calibration_numbers import vector
 from mitsim.sensor.calibration_qualifiers import UNIT_NAMES, unit_mm
@@ -81,6 +82,14 @@ def read_pose(file: str | Path) -> tuple[Transform, NDArray[np.float64] | None]:
     pose = document.transform()
     assert pose is not None  # checked above
     return pose, None if document.covariance is None else np.array(document.covariance)
+
+
+def unit_note(pose: Transform, where: str) -> str:
+    """Return a warning about a pose so near to the origin that it is rather in metres; empty without doubt."""
+    distance = float(np.linalg.norm(pose.translation))
+    if not 0 < distance < METRES_UNDER:
+        return ""
+    return f"{where}: the sensor is {distance:.3g} mm from the origin: if the matrix is in metres, write it in mm"
 
 
 def with_exact_rotation(rows: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -198,6 +198,16 @@ def test_poses_in_the_usual_files(tmp_path, text):
     assert covariance is None
 
 
+@pytest.mark.parametrize(("unit", "doubted"), [(1.0, False), (1e-3, True), (0.0, False)])
+def test_a_pose_in_metres_raises_a_doubt(pairs, unit, doubted):
+    """It was taken in mm in silence: a sensor 0.6 mm from the coupon."""
+    rows = POSE.matrix()
+    rows[:3, 3] *= unit
+    np.savetxt(pairs / "pose.txt", rows)
+    said = imported(pairs, "--frame", 0, "--pose", pairs / "pose.txt").output
+    assert ("the sensor is 0.61 mm from the origin" in said) == doubted
+
+
 @pytest.mark.parametrize("text", ["", "1 2 3", "{}", "[1]", "nothing", json.dumps((2 * POSE.matrix()).tolist()), "[[["])
 def test_what_is_no_pose_is_refused(tmp_path, text):
     (tmp_path / "pose").write_text(text)
