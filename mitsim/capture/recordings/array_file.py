@@ -19,6 +19,7 @@ from characterisation.files.errors import InputError
 from mitsim.capture.npy import NPY_MAGIC, numbers_of_npy
 from mitsim.capture.recordings.point_columns import check_points_first
 from mitsim.capture.recordings.recording_files import chosen_frame
+from mitsim.sensor.calibration_qualifiers import UNITS_MM
 
 #: most values of a point: x, y, z, normal and colour
 _MOST_VALUES = 9
@@ -26,6 +27,9 @@ _MOST_VALUES = 9
 #: names of arrays of points, and of others that have three values of a pixel as well
 _POINTS = re.compile(r"point|xyz|vert|cloud|location|pos", re.IGNORECASE)
 _NO_POINTS = re.compile(r"normal|colou?r|rgb|bgr|image|img|texture", re.IGNORECASE)
+
+#: names of disparities, and of inverse depths
+_DISPARITY = re.compile(r"disparit|(?<![a-z])disp(?![a-z])|(?:inv(?:erse)?[-_ ]?|(?<![a-z])i)depth", re.IGNORECASE)
 
 #: least number of values of a map or a cloud beside others: a calibration, a pose or a covariance has fewer; chosen
 _LEAST_VALUES = 100
@@ -104,8 +108,15 @@ def map_in(data: bytes, where: Path, frame: int | None = None) -> NDArray[Any]:
 
 
 def is_disparity(name: str) -> bool:
-    """Return whether a file or an array is named after disparities."""
-    return re.search(r"disparit|(?<![a-z])disp(?![a-z])", name.lower()) is not None
+    """Return whether a file or an array is named after disparities or inverse depths."""
+    return _DISPARITY.search(name) is not None
+
+
+def unit_of_depths(arrays: dict[str, NDArray[Any]]) -> float | None:
+    """Return the unit [mm] that the only array of depths has in its name, as ``depth_cm``; None without one."""
+    named = [name for name in _large(arrays) if "depth" in name.lower() and not is_disparity(name)]
+    match = re.search(r"[_.]([uµμcm]?m)$", named[0].lower()) if len(named) == 1 else None
+    return None if match is None else UNITS_MM[match[1]]
 
 
 def disparities(where: str | Path) -> InputError:

@@ -22,7 +22,7 @@ from mitsim.capture.decoding import Decoding
 from mitsim.capture.exr import EXR_MAGIC, exr_depths
 from mitsim.capture.grey_image import read_depths
 from mitsim.capture.npy import NPY_MAGIC
-from mitsim.capture.recordings.array_file import arrays_of_npz, disparities, is_disparity, map_in
+from mitsim.capture.recordings.array_file import arrays_of_npz, disparities, is_disparity, map_in, unit_of_depths
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
 from mitsim.capture.recordings.cloud_numbers import FAR_BEYOND, FARTHEST_MM, METRES_UNDER, NEITHER_ABOVE
 from mitsim.capture.recordings.stated_scale import check_scale, stated_scales
@@ -83,7 +83,8 @@ def read_depth_image(
     of_disparities = _DISPARITIES.match(path.resolve().parent.name) and "depth" not in path.stem.lower()
     if of_disparities or is_disparity(path.stem):
         raise disparities(path)
-    image, beside = _levels(path, frame)
+    image, beside, unit_mm = _levels(path, frame)
+    scale_mm = scale_mm or unit_mm
     if image.dtype == np.uint8:
         hint = "an 8-bit picture has lost its depths: save the device's 16 bits"
         raise InputError(path, "depth", "8 bits", "16 bits", hint)
@@ -151,8 +152,8 @@ def missing_depths(image: NDArray[Any], invalid: int = 0) -> tuple[NDArray[np.bo
     return missing, warnings
 
 
-def _levels(path: Path, frame: int | None) -> tuple[NDArray[Any], dict[str, float]]:
-    """Return the numbers (H, W) of an image or a file of NumPy, and the scales that stand beside them.
+def _levels(path: Path, frame: int | None) -> tuple[NDArray[Any], dict[str, float], float | None]:
+    """Return the numbers (H, W) of an image or a file of NumPy, the scales beside them, and their unit [mm] by name.
 
     Integers beyond 16 bits are floating point.
     """
@@ -164,10 +165,10 @@ def _levels(path: Path, frame: int | None) -> tuple[NDArray[Any], dict[str, floa
         values = exr_depths(path) if data.startswith(EXR_MAGIC) else read_depths(path)
     if values.ndim != 2 or not all(1 <= side <= LONGEST_SIDE_PX for side in values.shape):
         raise InputError(path, "shape", " x ".join(map(str, values.shape)), "depths of rows x columns")
-    beside = dict(stated_scales(arrays_of_npz(data, path))) if of_numpy and not data.startswith(NPY_MAGIC) else {}
+    arrays = arrays_of_npz(data, path) if of_numpy and not data.startswith(NPY_MAGIC) else {}
     if values.dtype.kind != "f" and values.dtype not in (np.uint8, np.uint16):
         values = values.astype(np.uint16 if values.min() >= 0 and values.max() < 1 << 16 else np.float64)
-    return values, beside
+    return values, dict(stated_scales(arrays)), unit_of_depths(arrays)
 
 
 def depth_capture(

@@ -32,6 +32,8 @@ def pinhole(folder):
     ("name", "depth", "message"),
     [
         ("left_disp.tif", np.full((48, 64), 66.0, np.float32), "found disparities, by the name"),
+        ("inverse_depth.tif", np.full((48, 64), 66.0, np.float32), "found disparities, by the name"),
+        ("idepth.png", np.full((48, 64), 660, np.uint16), "found disparities, by the name"),
         ("inverse.tif", np.full((48, 64), 0.0017, np.float32), r"depth: found a median of 0\.0017, in a unit"),
         ("um.tif", np.full((48, 64), 6e5, np.float32), r"depth: found a median of 6e\+05, in a unit"),
         ("levels.png", np.full((48, 64), 30000, np.uint16), r"depth: found a median of 3e\+04, in a unit"),
@@ -57,6 +59,18 @@ def test_disparities_are_told_by_the_folder(tmp_path):
                 read_depth_image(tmp_path / name, pinhole(tmp_path))
         else:
             assert read_depth_image(tmp_path / name, pinhole(tmp_path)).derived["depth"].max() == 12800
+
+
+@pytest.mark.parametrize(
+    ("name", "depth", "millimetres"),
+    [("depth_cm", 60.0, 600.0), ("depth_m", 25.0, 25000.0), ("depth_mm", 12.0, 12.0), ("depth.um", 6e5, 600.0)],
+)
+def test_the_unit_in_the_name_of_an_array(tmp_path, name, depth, millimetres):
+    """60 cm were 60 mm, 25 m were 25 mm, and 12 mm were 12 m."""
+    np.savez(tmp_path / "a.npz", **{name: np.full((48, 64), depth, np.float32)})
+    capture = read_depth_image(tmp_path / "a.npz", pinhole(tmp_path))
+    assert capture.derived["depth"].max() == pytest.approx(millimetres)
+    assert capture.settings["depth_scale_mm"] == pytest.approx(millimetres / depth)
 
 
 def test_disparities_beside_depths_are_left_out(tmp_path):
