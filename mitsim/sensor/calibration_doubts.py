@@ -42,10 +42,15 @@ def board_unit_note(name: str, baseline_mm: float) -> str:
 
 
 def lens_note(name: str, distortion: NDArray[np.float64]) -> str:
-    """Return a warning about coefficients without a model that suggest a fisheye lens; empty without doubt."""
-    if len(distortion) != 4 or np.abs(distortion[2:]).max() <= _LARGEST_TANGENTIAL:
+    """Return a warning about coefficients without a model that suggest another lens or order; empty without doubt."""
+    if len(distortion) < 4 or np.abs(distortion[2:4]).max() <= _LARGEST_TANGENTIAL:
         return ""
-    p1, p2 = distortion[2:]
+    p1, p2 = distortion[2:4]
+    if len(distortion) > 4:
+        return (
+            f"{name} has p1 and p2 of {p1:g} and {p2:g}, larger than those of lenses: OpenCV's order is k1, k2, p1, "
+            "p2, k3; is that of the file another, such as k1, k2, k3, p1, p2?"
+        )
     return (
         f"{name} has four coefficients, of which p1 and p2 would be {p1:g} and {p2:g}: if they are k1 to k4 of a "
         'fisheye lens, say so in a sensor file: [calibration] with model = "fisheye"'

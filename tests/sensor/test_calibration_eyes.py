@@ -155,6 +155,7 @@ def test_all_single_numbers_of_opencvs_lens_are_read(tmp_path):
 
 DOUBTS = {
     "has four coefficients, of which p1 and p2": {"K": K.tolist(), "D": [-0.05, 0.03, 0.06, -0.04]},
+    "has p1 and p2 of 0.08 and 0.001": {"K": K.tolist(), "D": [-0.2, 0.1, 0.08, 0.001, -0.0005]},
     "the principal point 100, 70 is far from the middle": NUMBERS | {"cx": 100.0, "cy": 70.0},
     "the principal point 2, -3 is far from the middle": NUMBERS | {"cx": 2.0, "cy": -3.0},
     "focal lengths of 600 and 322 px differ": {"intrinsics": [600.0, 322.0, 602.0, 238.0], "resolution": [640, 480]},
