@@ -90,6 +90,11 @@ def influences(
             else "as during the characterisation of the sensor",
         ),
         Influence("power of the projector", rendered and light.power_relative > 0, "drawn"),
+        Influence(
+            "step of the exposure",
+            rendered and light.exposure_relative > 0,
+            f"drawn within {100 * light.exposure_relative:g} %" if rendered else "as during the characterisation",
+        ),
         Influence("position of the part", pose.placement_mm > 0 or pose.placement_deg > 0, "drawn anew in every trial"),
         Influence("error of the assumed pose", pose.told_mm > 0 or pose.told_deg > 0, "drawn anew in every trial"),
         Influence("noise of the imager, speckle", True, "drawn anew in every trial"),

@@ -105,6 +105,18 @@ def test_the_drift_that_is_drawn_is_listed(calibration, flight, drawn):
     assert ("calibration" in budget_groups(unknowns, "render", sensor)) == ("scale" not in calibration)
 
 
+@pytest.mark.parametrize(("name", "included"), [("ensenso-n10", True), ("zivid-2-m70", False)])
+def test_exposures_that_are_drawn_are_listed(name, included):
+    sensor = load_sensor(name)
+    table = unknowns_of(sensor.unknowns)
+    nothing = RigCovariance((), np.zeros((0, 0)), "exact")
+    unknowns = Unknowns(table, sensor.rig, nothing, 850.0, 0.0, np.zeros(3), 7)
+    assert (np.ptp([unknowns.draw(Trial(day)).exposure for day in range(9)]) > 0) == included
+    for source in ("render", "map"):
+        listed = {one.name: one for one in influences(table, source, 1)}["step of the exposure"]
+        assert listed.included == (included and source == "render") and listed.simulated
+
+
 def drift_in_order(drawn):
     return [one for one in ("row error", "vergence", "roll", "focal length", "offset of the path") if one in drawn]
 
