@@ -7,8 +7,8 @@ about its x axis and roll.
 A camera rotated by w about x sees a point f w (1 + y^2) rows lower; one that rolls by r about its axis, f r x rows
 higher, with x and y the slopes of the ray. One specimen in one part of the field hardly separates the two. Each has a
 normal prior about 0, with the standard deviation of ``[unknowns.calibration]`` of the sensor. Rotation toward the other
-camera (vergence) causes no row error and cannot be measured here. Vergence is assumed as large as these two, since the
-mounts are the same.
+camera (vergence) causes no row error and cannot be measured here. Vergence is assumed at least as large as these
+two, since the mounts are the same (:mod:`mitsim.twin.sensor.write`).
 """
 
 from __future__ import annotations

@@ -114,9 +114,13 @@ def _entries(fit: SensorFit) -> dict[str, Entry]:
     if "misalignment.row_mrad" in entries:
         row, roll = (next(e for e in fit.estimates if e.key == f"misalignment.{key}_mrad") for key in ("row", "roll"))
         comment = "rotation of one unit's second camera off its calibration, assumed for the next unit too"
-        for key, fitted_key in (("row", row), ("roll", roll)):
-            size = float(np.hypot(fitted_key.value, fitted_key.uncertainty))
+        sizes = {key: float(np.hypot(one.value, one.uncertainty)) for key, one in (("row", row), ("roll", roll))}
+        for key, size in sizes.items():
             entries[f"unknowns.calibration.{key}_mrad"] = Entry(number(size), comment)
+        vergence = float(np.sqrt(np.mean(np.square(list(sizes.values())))))
+        if vergence > fit.sensor.unknowns.calibration.vergence_mrad:
+            comment = "causes no row error; assumed as large as the other two rotations, whose mounts are the same"
+            entries["unknowns.calibration.vergence_mrad"] = Entry(number(vergence), comment)
     return entries
 
 

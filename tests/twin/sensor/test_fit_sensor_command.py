@@ -24,7 +24,15 @@ from mitsim.twin.sensor import run, specimen_simulator
 from mitsim.twin.sensor.estimate import FittedKey
 from mitsim.twin.sensor.input_captures import read_input_captures, repeats
 from mitsim.twin.sensor.noise import ImagerFit
-from mitsim.twin.sensor.write import Entry, moved_paths, with_cameras, with_entries, with_exposure, write_sensor
+from mitsim.twin.sensor.write import (
+    Entry,
+    _entries,
+    moved_paths,
+    with_cameras,
+    with_entries,
+    with_exposure,
+    write_sensor,
+)
 from tests.smaller_sensors import coarse_sensor
 
 
@@ -52,6 +60,24 @@ def test_every_preset_takes_fitted_numbers_and_is_a_sensor_again(name, tmp_path)
         np.testing.assert_allclose(other.matrix, camera.matrix, rtol=1e-8)
         np.testing.assert_allclose(other.sensor_from_camera.matrix(), camera.sensor_from_camera.matrix(), atol=1e-6)
     assert again.imager.full_well == sensor.imager.full_well  # what is not determined is as it was
+
+
+@pytest.mark.parametrize(("row", "roll", "vergence"), [(-3.0, 4.0, 12.5**0.5), (0.1, -0.1, 0.24)])
+def test_a_camera_that_turned_may_have_turned_toward_the_other(row, roll, vergence, tmp_path):
+    """The second camera of a unit turned by 5 mrad in all; the next unit's vergence was still drawn with 0.24 mrad."""
+    turns = [
+        FittedKey(f"misalignment.{key}_mrad", value, 0.0, "mrad", ("sheet",), "row errors over the field")
+        for key, value in (("row", row), ("roll", roll))
+    ]
+    sensor = load_sensor("ensenso-n10")
+    assert sensor.unknowns.calibration.vergence_mrad == 0.24
+    path = run.sensor_path("ensenso-n10")
+    text = moved_paths(path.read_text(encoding="utf-8"), path.parent, tmp_path)
+    text = with_entries(text, _entries(run.SensorFit(sensor, (), tuple(turns), ())))
+    (tmp_path / "mine.toml").write_text(text, encoding="utf-8")
+    written = load_sensor(tmp_path / "mine.toml").unknowns.calibration
+    assert (written.row_mrad, written.roll_mrad) == (abs(row), abs(roll))
+    assert written.vergence_mrad == pytest.approx(vergence, rel=1e-4)
 
 
 @pytest.fixture(scope="module")
