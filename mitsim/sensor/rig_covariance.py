@@ -6,6 +6,7 @@ another rig is rejected. The fields are described in docs/reference/formats/rig-
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -27,13 +28,20 @@ from mitsim.sensor.rig_parameters import check_names, parameter_values
 _LEAST_EIGENVALUE = -1e-6
 
 
+#: digits of standard deviations and correlations in a digest: numbers of threads and processors change both by up to
+#: 5e-10 (N10, Zivid 2 M70, Kinect V2 with 1 and 2 threads of OpenBLAS and another kernel), and rounding to 1e-3 leaves
+#: a chance of 1 in 1000 that one of a thousand numbers changes. Chosen
+_ALIKE_SIGMA = ".3e"
+_ALIKE_CORRELATION = 3
+
+
 @dataclass(frozen=True)
 class RigCovariance:
     """Covariance of the deviations of a rig's true parameters from the nominal ones.
 
     ``names`` of the parameters (:func:`~mitsim.sensor.rig_parameters.parameter_names`); ``covariance`` (n, n) in
     their units; ``source``: the method that gave it; ``details``: its settings; ``fitted_to``: images of the board
-    that decided it.
+    that decided it; ``simulated``: computed in this process, not read, so that its last digits depend on the machine.
     """
 
     names: tuple[str, ...]
@@ -41,6 +49,7 @@ class RigCovariance:
     source: str
     details: Mapping[str, str | float] = field(default_factory=dict)
     fitted_to: tuple[FittedCapture, ...] = ()
+    simulated: bool = False
 
     def __post_init__(self) -> None:
         if self.covariance.shape != (len(self.names),) * 2:
@@ -58,6 +67,15 @@ class RigCovariance:
         out = self.covariance / np.outer(scale, scale)
         np.fill_diagonal(out, 1.0)
         return np.asarray(out)
+
+    @property
+    def digest(self) -> str:
+        """Return the SHA-256 of the covariance; of a simulated one, of the digits that all machines compute alike."""
+        content = self.covariance
+        if self.simulated:
+            sigma = [float(f"{value:{_ALIKE_SIGMA}}") for value in self.one_sigma.tolist()]
+            content = np.array([*sigma, *(self.correlation.round(_ALIKE_CORRELATION) + 0.0).ravel()])
+        return hashlib.sha256(content.tobytes()).hexdigest()
 
     def draw(self, rng: np.random.Generator) -> NDArray[np.float64]:
         """Draw one deviation of all parameters from nominal, (n,), normally distributed.

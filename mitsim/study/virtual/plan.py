@@ -179,7 +179,7 @@ def trial_digest(
         # a rendered trial does not depend on effects outside the map
         "varied": [group for group in unknowns.varied if group != BEYOND or source == "map"],
         "seed": unknowns.seed,
-        "covariance": hashlib.sha256(unknowns.calibration.covariance.tobytes()).hexdigest(),
+        "covariance": unknowns.calibration.digest,
         "expansion": unknowns.expansion,
         "scene": Path(study.scene.where).read_text(encoding="utf-8"),
         "parameters": file.parameters,

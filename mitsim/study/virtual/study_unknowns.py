@@ -114,7 +114,8 @@ def _unscaled_covariance(sensor: Sensor, table: CalibrationUnknowns, folder: Pat
         except InputError:
             pass  # a user's sensor with the name of a preset, but another rig
     say(f"{sensor.name}: no covariance of its calibration is given; it is simulated (see mitsim calibrate)")
-    return with_drift(calibrate(sensor, drift=Drift.none()).covariance, sensor, table.drift())
+    simulated = replace(calibrate(sensor, drift=Drift.none()).covariance, simulated=True)
+    return with_drift(simulated, sensor, table.drift())
 
 
 def _expansion(study: Study) -> float:

@@ -3,6 +3,7 @@
 import shutil
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import trimesh
 
@@ -130,6 +131,26 @@ def test_kept_trials_of_a_case_are_not_those_of_another_mesh(folder):
     ball(part / "right.ply", 9, 40)
     after = digests()
     assert not set(before.values()) & set(after.values())
+
+
+def test_last_digits_of_a_simulated_calibration_do_not_belong_to_it(folder):
+    """Before, trials were made again if the number of BLAS threads changed the covariance by some 1e-10."""
+    given = open_study(folder / "study.toml", StudyFile.model_validate(STUDY))
+    study = replace(given, sensor=replace(given.sensor, name="mine"))  # which has no covariance
+    unknowns = study_unknowns(study)
+    rng = np.random.default_rng(1)
+
+    def digest_of(relative, stated):
+        factor = 1 + relative * rng.standard_normal(unknowns.calibration.covariance.shape)
+        matrix = unknowns.calibration.covariance * (factor + factor.T) / 2
+        calibration = replace(unknowns.calibration, covariance=matrix, simulated=not stated)
+        return trial_digest(study, replace(unknowns, calibration=calibration), "render")
+
+    assert unknowns.calibration.simulated
+    assert digest_of(2e-10, False) == digest_of(2e-10, False) == trial_digest(study, unknowns, "render")
+    assert digest_of(0.1, False) != trial_digest(study, unknowns, "render")
+    assert digest_of(2e-10, True) != digest_of(2e-10, True)
+    assert not study_unknowns(given).calibration.simulated
 
 
 def test_workers_prepare_a_part_anew_if_its_mesh_has_changed(folder):
