@@ -12,6 +12,7 @@ import math
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import canonicalize
 
 import numpy as np
 
@@ -23,8 +24,10 @@ from mitsim.running.version import __version__
 from mitsim.scene.xml_check import named_digests
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.matcher import MatcherSettings
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.sensor_text import sensor_checksum
 from mitsim.study import Study
+from mitsim.study.virtual.drawn_decoder import decoder_is_drawn
 from mitsim.study.virtual.mapped import MappedMeasurements
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.world import BEYOND, Unknowns
@@ -35,8 +38,8 @@ TRIAL_VERSION = 7
 #: the same of a study whose faces have a form
 FORM_VERSION = 2
 
-#: keys of a task that concern the verdict, not the measurement
-_NO_PART_OF_A_TRIAL: Any = {"decision": True, "measurements": {"__all__": {"decision"}}}
+#: keys of a task that concern the verdict, not the measurement; the form that a tolerance gives is among the unknowns
+_NO_PART_OF_A_TRIAL: Any = {"decision": True, "measurements": {"__all__": {"decision", "tolerance"}}}
 
 #: standard deviation of the smoothing of interreflections [px], see mitsim/capture/simulated/indirect_light.py
 _SMOOTHING_PX = 1.5
@@ -138,11 +141,15 @@ def map_digest(study: Study) -> str:
     return "" if study.performance_map is None else study.performance_map.digest[:16]
 
 
-def _without_path(unknowns: Unknowns) -> dict[str, Any]:
-    """Return the table of unknowns with the names in the calibration's covariance in place of the path of its file."""
+def _effective(sensor: Sensor, unknowns: Unknowns) -> dict[str, Any]:
+    """Return the table of unknowns without what has no effect: the path of a file, tables of which nothing is drawn."""
     table = unknowns.table.model_dump(mode="json")
     if table["calibration"]["covariance"] is not None:
         table["calibration"]["covariance"] = list(unknowns.calibration.names)
+    if "coat" not in unknowns.varied:
+        del table["coat"]
+    if "decoder" not in unknowns.varied or not decoder_is_drawn(sensor, unknowns.table.decoder):
+        del table["decoder"]
     return table
 
 
@@ -175,13 +182,13 @@ def trial_digest(
         "mitsim": __version__,
         "source": source,
         "sensor": sensor_checksum(study.sensor),
-        "unknowns": _without_path(unknowns),
+        "unknowns": _effective(study.sensor, unknowns),
         # a rendered trial does not depend on effects outside the map
         "varied": [group for group in unknowns.varied if group != BEYOND or source == "map"],
         "seed": unknowns.seed,
         "covariance": unknowns.calibration.digest,
         "expansion": unknowns.expansion,
-        "scene": Path(study.scene.where).read_text(encoding="utf-8"),
+        "scene": canonicalize(Path(study.scene.where).read_text(encoding="utf-8"), strip_text=True),  # no comments
         "parameters": file.parameters,
         "task": study.task.model_dump(mode="json", exclude=_NO_PART_OF_A_TRIAL),
         "rendering": asdict(rendering or rendering_of(study)),

@@ -133,6 +133,35 @@ def test_kept_trials_of_a_case_are_not_those_of_another_mesh(folder):
     assert not set(before.values()) & set(after.values())
 
 
+def test_what_cannot_change_a_trial_does_not_belong_to_it(folder):
+    """Before, a tolerance, a comment in the scene or the ranges of a known decoder made all trials again."""
+    known = {"unknowns": {"decoder": {"known": True}}}
+    before, before_known = digest(folder), digest(folder, **known)
+    assert digest(folder, unknowns={"decoder": {"known": True, "p1": [5, 6]}}) == before_known != before
+    assert digest(folder, unknowns={"decoder": {"p1": [5, 6]}}) != before
+    (folder / "task.toml").write_text(TASK + "tolerance = 0.1\n")
+    (folder / "balls.xml").write_text(SCENE.replace("<path ", "<!-- the balls -->\n\n    <path "))
+    assert digest(folder) == before
+    (folder / "task.toml").write_text(TASK.replace("= 12\n", "= 13\n"))
+    assert digest(folder) != before
+    (folder / "task.toml").write_text(TASK)
+    (folder / "balls.xml").write_text(SCENE.replace('value="80"', 'value="81"'))
+    assert digest(folder) != before
+
+
+def test_a_tolerance_of_form_belongs_to_it_by_the_form_that_it_gives(folder):
+    flat = (
+        TASK.replace("sphere", "plane")
+        .replace("radius_mm = 12\n", "direction = [0, 0, 1]\n")
+        .replace('kind = "radius"', 'kind = "flatness"')
+        .replace("nominal = 12", "nominal = 0\ntolerance = 0.1")
+    )
+    (folder / "task.toml").write_text(flat)
+    before = digest(folder)
+    (folder / "task.toml").write_text(flat.replace("0.1", "0.2"))
+    assert digest(folder) != before
+
+
 def test_last_digits_of_a_simulated_calibration_do_not_belong_to_it(folder):
     """Before, trials were made again if the number of BLAS threads changed the covariance by some 1e-10."""
     given = open_study(folder / "study.toml", StudyFile.model_validate(STUDY))
