@@ -11,9 +11,13 @@ from mitsim.capture.capture import Capture
 from mitsim.decoding.cloud import decoder_settings
 from mitsim.decoding.image_context import ImageContext
 from mitsim.decoding.structured_light.decoder import triangulate_coordinate
-from mitsim.decoding.structured_light.geometry import structured_light_geometry
+from mitsim.decoding.structured_light.geometry import offset_from_projector, structured_light_geometry
 from mitsim.decoding.structured_light.projector_coordinate import ProjectorCoordinate
+from mitsim.sensor.camera import Camera
 from mitsim.sensor.image_role import Axis
+
+#: least share of the baseline across the coded axis: below, points have over ten times the noise of the other axis
+_LEAST_ACROSS = 0.1
 
 
 def triangulate(
@@ -54,8 +58,8 @@ def triangulate(
     Raises
     ------
     InputError
-        If there is no such camera, the coordinate has not the camera's size, the calibration has no projector, or the
-        coordinate does not change with depth.
+        If there is no such camera, the coordinate has not the camera's size, the calibration has no projector, camera
+        and projector do not lie apart across the axis, or the coordinate does not change with depth.
 
     Examples
     --------
@@ -81,6 +85,8 @@ def triangulate(
     for words, array in (("coordinate", value), ("sigma", spread)):
         if array.shape != size:
             raise InputError("triangulate", words, f"shape {array.shape}", f"{size}, the pixels of camera {name}")
+    if capture.rig.projector is not None:
+        _check_baseline(capture.rig.cameras[name], capture.rig.projector, axis)
     settings, _ = decoder_settings(capture, None, range_mm)
     geometry = structured_light_geometry(capture.rig, name, axis, settings.near_mm, settings.far_mm)
     finite = np.isfinite(value)
@@ -89,3 +95,14 @@ def triangulate(
     decoded = ProjectorCoordinate(np.where(finite, value, np.nan), spread.astype(np.float32), nothing, status)
     context = ImageContext(capture.sensor, capture.source, 2.0**capture.bits - 1)
     return triangulate_coordinate(decoded, geometry, context)
+
+
+def _check_baseline(camera: Camera, projector: Camera, axis: Axis) -> None:
+    """Raise an InputError if camera and projector do not lie apart across the columns or rows that are coded."""
+    apart = offset_from_projector(camera, projector)
+    across, whole = abs(float(apart[0 if axis == "columns" else 1])), float(np.linalg.norm(apart))
+    if across < _LEAST_ACROSS * whole:
+        other = "rows" if axis == "columns" else "columns"
+        found = f"{axis!r}, across which camera and projector lie {across:.2g} of {whole:.3g} mm apart"
+        hint = f"only this distance determines depth: give {other}, with axis = {other!r}"
+        raise InputError("triangulate", "axis", found, f"{_LEAST_ACROSS * whole:.2g} mm or more", hint)
