@@ -192,10 +192,11 @@ class _Reader:
         if described is not None:
             notes.append(" ".join(str(word) for word in described if word))
             return
-        span = entity.of("VALUE_RANGE")
-        if span is not None:
-            for bound in span[-1] if isinstance(span[-1], tuple) else ():
-                self.value(bound, measured, notes)
+        if entity.has("VALUE_RANGE"):  # its bounds stand in a list, which may name its type
+            for part in (value for part in entity.parts for value in part.values):
+                bounds = part.values[0] if isinstance(part, Typed) and part.values else part
+                for bound in bounds if isinstance(bounds, tuple) else ():
+                    self.value(bound, measured, notes)
             return
         name = next((v for part in entity.parts for v in part.values if isinstance(v, str)), "").lower()
         value = self.measure(reference)

@@ -134,6 +134,25 @@ def test_zones_that_a_task_does_not_have_are_left_out_with_the_reason(tmp_path, 
     assert any("of front: its zone lies unequally about the surface" in one for one in made.left_out)
 
 
+RANGES = ("VALUE_RANGE('',{})", "VALUE_RANGE('',SET_REPRESENTATION_ITEM({}))")
+COMPLEX = "( COMPOUND_REPRESENTATION_ITEM({}) REPRESENTATION_ITEM('') VALUE_RANGE() )"
+
+
+@pytest.mark.parametrize("form", [*RANGES, COMPLEX])
+def test_a_range_of_values_has_its_limits_however_it_is_written(tmp_path, form):
+    path = tmp_path / "range.step"
+    path.write_text(
+        "ISO-10303-21;\nDATA;\n#1=PRODUCT_DEFINITION_SHAPE('',$,$);\n#2=ADVANCED_BREP_SHAPE_REPRESENTATION('',(),$);\n"
+        "ENDSEC;\nEND-ISO-10303-21;\n"
+    )
+    drawing = Drawing(path.read_text())
+    low, high = drawing.measure(19.9, "lower limit"), drawing.measure(20.1, "upper limit")
+    drawing.size("diameter", items=(drawing.add(form.format(f"(#{low},#{high})")),))
+    path.write_text(drawing.whole())
+    (dimension,) = read_product_information(read_step_text(path)).dimensions
+    assert (dimension.nominal, dimension.limits) == (20.0, (19.9, 20.1))
+
+
 @needs_step
 def test_limits_of_a_drawing_count_from_the_model(tmp_path, step_here):
     """Both bores are 12 mm: a drawing that states 12.1 with limits about the model keeps these; 14 is a fault."""
