@@ -17,8 +17,11 @@ from mitsim.sensor.calibration_numbers import vector
 #: names of the scale, in small letters and without underscores
 _NAMES = re.compile(r"(?:png)?depth(?:map)?(?:scale|factor|units?)")
 
-#: smallest number of levels per metre, and largest of metres per level; chosen: numbers between are mm per level
-_LEVELS_PER_METRE, _METRES_PER_LEVEL = 100.0, 0.005
+#: smallest number of levels per metre; chosen: smaller ones are mm per level
+_LEVELS_PER_METRE = 100.0
+
+#: largest number of metres per level; chosen: larger ones are mm per level
+_METRES_PER_LEVEL = 0.005
 
 #: most maps around a number that are searched; chosen
 _DEEPEST = 8
