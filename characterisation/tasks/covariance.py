@@ -83,7 +83,7 @@ class ExpectedPoints:
 
     - ``point`` (n, 3) [mm] and ``ray`` (n, 3), unit, in the frame of the feature's surface.
     - ``pixel`` (n, 2): row and column; ``normal`` (n, 3) in the view frame.
-    - ``fraction`` F, ``fraction_error`` u(F).
+    - ``fraction`` F, ``fraction_error`` u(F), never NaN.
     - ``sigma`` [mm], ``area`` A [px^2], ``persistent`` p [mm], ``displaced`` b [mm]; ``distance`` |V| [mm].
     - ``thinning``: number of sensor pixels that each element stands for.
     - ``angular_pitch`` [rad] between neighbouring sensor pixels.
@@ -325,7 +325,7 @@ def _chance(expected: ExpectedPoints, minimum: float) -> float:
     count = float(fraction.sum() * thinning)
     clumps = np.maximum(expected.area + 1 - 1 / fraction, 1.0)  # random losses alone make the noise area 1 / F
     losses = float((fraction * (1 - fraction) * clumps).sum() * thinning)
-    spread = math.sqrt(losses + float(np.nan_to_num(expected.fraction_error).sum() * thinning) ** 2)
+    spread = math.sqrt(losses + float(expected.fraction_error.sum() * thinning) ** 2)
     if spread == 0:
         return float(count >= minimum)
     return float(ndtr((count - minimum) / spread))

@@ -139,7 +139,7 @@ def _figure(name: str, task: Task, expected: Mapping[str, ExpectedPoints]) -> Ex
         raise FitError(f"{count:.0f} crossings of the edge are expected, at least {LEAST_CROSSINGS} are required")
     covariance = edge_covariance(figure, pitch, count, fraction, reach)
     nothing = np.zeros((len(covariance), 1 + (0 if around.shared is None else around.shared.shape[1])))
-    doubt = float(np.nan_to_num(around.fraction_error[near]))
+    doubt = float(around.fraction_error[near])
     chance = float(ndtr((fraction - LEAST_FRACTION) / doubt)) if doubt > 0 else float(fraction >= LEAST_FRACTION)
     fit = ExpectedFit(covariance, nothing, count * fraction, chance, position, pitch)
     return ExpectedInput(fit, with_covariance(figure, covariance))

@@ -131,7 +131,8 @@ def expected_points(
         np.rint(pixel[possible] * np.sqrt(view.thinning)).astype(np.int64),
         normal[possible],
         fraction,
-        np.nan_to_num(fraction_error[possible]),
+        # an unknown error is the largest that a mean F allows: all of the points, or none
+        np.where(np.isfinite(fraction_error[possible]), fraction_error[possible], np.sqrt(fraction * (1 - fraction))),
         sigma,
         np.where(np.isfinite(area[possible]), area[possible], 1 / fraction),
         np.nan_to_num(persistent[possible]),

@@ -75,3 +75,16 @@ def white_view(name, scenes, shape):
     ideal, labels = predictor.ideal(surfaces), predictor.labels(scene, pose, surfaces)
     given = ViewPoints(ideal, labels, pose), scene, scene.names.index(shape), performance_map
     return ideal, given, expected_points(*given)
+
+
+def test_an_error_of_f_that_a_map_cannot_know_is_not_0(scenes):
+    """A map of the nearest and farthest distance alone: F of the whole map lies within twice the stated error.
+
+    Before, the error of F between two distances, which is unknown, counted as 0.
+    """
+    _, given, whole = white_view("ensenso-n10", scenes, "pillar1")
+    ends = PerformanceMap(given[3].data.isel(distance=[0, -1]))
+    found = expected_points(*given[:3], ends, *given[4:])
+    off = np.abs(found.fraction - whole.fraction)
+    assert off.max() > 1e-3
+    assert np.mean(off <= 2 * found.fraction_error) > 0.95
