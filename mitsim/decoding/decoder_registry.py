@@ -240,14 +240,12 @@ def _structured_light(
 ) -> PointCloud:
     unsmoothed = _structured_light_cloud(images, geometry, settings, code)
     cloud = smoothed_along_rays(unsmoothed, settings.smoothing_px)
-    # neighbours that share raw pixels, on a rectified grid or in the imager: their mean has more noise than that of
-    # independent ones; the errors of a Gray code are those of whole stripes
+    if cloud.sigma is not None and not any(has_fringes(code, axis) for axis in axes(code)):
+        return replace(cloud, sigma=unsmoothed.sigma)  # the errors of a Gray code are those of whole stripes
     in_imager = isinstance(images.imager, Imager) and images.imager.smoothing_px > 0
-    shared = isinstance(geometry, StereoGeometry) or in_imager
-    if settings.smoothing_px == 0 or cloud.sigma is None:
-        return cloud
-    fringes = any(has_fringes(code, axis) for axis in axes(code))
-    return replace(cloud, sigma=(None if shared else cloud.sigma) if fringes else unsmoothed.sigma)
+    # one alone averages independent pixels; two, neighbours that share pixels: their mean has more noise
+    averaged = (isinstance(geometry, StereoGeometry), in_imager, settings.smoothing_px > 0)
+    return replace(cloud, sigma=None) if sum(averaged) > 1 else cloud
 
 
 def _structured_light_cloud(
