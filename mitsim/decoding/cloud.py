@@ -304,7 +304,9 @@ def capture_cloud(
     if exposures is not None and not isinstance(settings, DeviceMapSettings):
         images, full_scale = _merged_exposures(capture, exposures, read_out)
         share, imager = min(exposures) / max(exposures), None
-        if isinstance(geometry, StereoGeometry):
+        # a stored reference is linear: it correlates with linear levels, whose bits are then not reduced to 8
+        of_8_bits = isinstance(settings, MatcherSettings) and settings.method != "correlation"
+        if isinstance(geometry, StereoGeometry) or of_8_bits:
             black = capture.decoding.black_level_dn * full_scale / (2.0**capture.bits - 1)
             images = {name: companded(stack, black, share) for name, stack in images.items()}
         else:  # levels refer to the shortest exposure, and the noise limits of the settings to the longest

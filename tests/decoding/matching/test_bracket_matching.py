@@ -7,11 +7,13 @@ from scipy.ndimage import gaussian_filter, shift
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.decoding.cloud import capture_cloud
+from mitsim.decoding.matching.reference_matching import reference_geometry
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.image_formation import expose
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.noise_sources import Noise
+from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.transforms import Transform
 
 HEIGHT, WIDTH, FOCAL, BASELINE, DISPARITY = 120, 200, 300.0, 60.0, 30.35
@@ -73,3 +75,30 @@ def test_a_bracket_has_points_where_its_longest_exposure_is_saturated(method):
     bright = 8 * IMAGER.full_well
     assert share_of_true_points(settings, bright, TIMES[-1:]) < 0.7
     assert share_of_true_points(settings, bright, TIMES) > 0.9
+
+
+DOTS = RandomDots(kind="random_dots", run_length_px=2.0, bright_share=0.4, blur_px=0.5, seed=3)
+ONE = Rig({"camera": RIG.cameras["left"]}, RIG.cameras["right"])
+REFERENCE = reference_geometry(ONE, DOTS, DEPTH)
+
+
+def off_plane_of_one_camera(settings: MatcherSettings, electrons: float, times: tuple[float, ...]):
+    """Errors of the points of a plane at the depth of the reference [mm]; NaN without a point."""
+    rng, light = np.random.default_rng(0), 0.1 + 0.9 * REFERENCE.reference / REFERENCE.reference.max()
+    stack = np.stack([expose(electrons * light * time, IMAGER, None, Noise(), rng) for time in times])
+    decoding = Decoding(exposure_s=times, black_level_dn=IMAGER.black_level, pattern=DOTS)
+    capture = Capture("drawn", "reference_stereo", "simulated", ONE, {"camera": stack}, 8, decoding)
+    return capture_cloud(capture, settings, REFERENCE).points[10:-10, 60:-20, 2] - DEPTH
+
+
+@pytest.mark.parametrize("method", ["sgbm", "census", "correlation"])
+@pytest.mark.parametrize("electrons", [800, 3000, 10000, 80000])
+def test_a_bracket_of_one_camera_has_the_points_of_its_longest_exposure(method, electrons):
+    """SGBM kept 7 % of the points of 3000 electrons, since levels of the shortest exposure were rounded to 8 bits."""
+    settings = SETTINGS.model_copy(update={"method": method, "block_size": 5, "reference_mm": DEPTH})
+    alone, merged = (off_plane_of_one_camera(settings, electrons, times) for times in (TIMES[-1:], TIMES))
+    shares = [np.mean(np.abs(each) < 0.01 * DEPTH) for each in (alone, merged)]
+    assert shares[1] > shares[0] - 0.01
+    assert shares[1] > 0.9
+    if method == "correlation" and electrons < IMAGER.full_well:
+        assert np.nanstd(merged) < 1.1 * np.nanstd(alone)
