@@ -300,18 +300,17 @@ def capture_cloud(
     if roi is not None:
         roi = checked_roi(roi, geometry.grid.width, geometry.grid.height, "capture_cloud")
     exposures, read_out = capture.decoding.bracket_s, capture.decoding.read_out
-    images, full_scale = capture.images, 2.0**capture.bits - 1
+    images, full_scale, linear_share = capture.images, 2.0**capture.bits - 1, 1.0
     if exposures is not None and not isinstance(settings, DeviceMapSettings):
         images, full_scale = _merged_exposures(capture, exposures, read_out)
         share, imager = min(exposures) / max(exposures), None
-        # a stored reference is linear: it correlates with linear levels, whose bits are then not reduced to 8
         of_8_bits = isinstance(settings, MatcherSettings) and settings.method != "correlation"
-        if isinstance(geometry, StereoGeometry) or of_8_bits:
+        if isinstance(geometry, StereoGeometry) or of_8_bits:  # correlation with a reference keeps linear levels
             black = capture.decoding.black_level_dn * full_scale / (2.0**capture.bits - 1)
             images = {name: companded(stack, black, share) for name, stack in images.items()}
         else:  # levels refer to the shortest exposure, and the noise limits of the settings to the longest
-            settings = settings.at_exposure(share)
-    shown = Images(capture, images, full_scale, imager, roi, read_out, coordinates)
+            settings, linear_share = settings.at_exposure(share), share
+    shown = Images(capture, images, full_scale, imager, roi, read_out, coordinates, linear_share)
     return technology.decode(shown, geometry, settings, pattern)
 
 

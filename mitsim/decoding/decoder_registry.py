@@ -85,6 +85,8 @@ class Images:
         Region that was read out of each camera, without cameras that were read out completely.
     coordinates
         Projector coordinates that structured light was decoded to before; None if it is not decoded yet.
+    share
+        As in :class:`mitsim.decoding.image_context.ImageContext`.
     """
 
     capture: Capture
@@ -94,6 +96,7 @@ class Images:
     roi: Roi | None
     read_out: dict[str, Roi]
     coordinates: Coordinates | None = None
+    share: float = 1.0
 
     @property
     def reference(self) -> tuple[str, NDArray[np.unsignedinteger[Any]]]:
@@ -130,7 +133,7 @@ class Images:
         regions = [self.read_out.get(name) for name in list(self.stacks)[:2]]
         read_out = (regions[0], regions[-1] if len(regions) > 1 else None)
         capture = self.capture
-        return ImageContext(capture.sensor, capture.source, self.full_scale, self.imager, roi, read_out)
+        return ImageContext(capture.sensor, capture.source, self.full_scale, self.imager, roi, read_out, self.share)
 
     def raw_region(self) -> tuple[Roi | None, bool]:
         """Return the region of the reference camera's raw image to decode, and whether any of it was read out."""

@@ -26,6 +26,8 @@ class ImageContext:
         Region of the cloud's grid to decode, None for all. Pixels outside are ``NO_SURFACE``.
     read_out
         Regions of the raw images of the first and second camera that were read out; None for a whole image.
+    share
+        Of merged exposures with linear levels: shortest exposure, to which the levels refer, over longest [1].
     """
 
     sensor: str
@@ -34,3 +36,4 @@ class ImageContext:
     imager: Imager | MeasuredNoise | None = None
     roi: Roi | None = None
     read_out: tuple[Roi | None, Roi | None] = (None, None)
+    share: float = 1.0

@@ -211,9 +211,10 @@ def decode_stereo(
             np.stack(left_strips), np.stack(right_strips), (begin, end), first, count, settings
         )
     elif settings.method == "correlation":
+        longest = np.float32(1 / context.share)  # in levels of the longest exposure
         matches = correlate_both_ways(
-            _centred(left_strips, left, read_out[0], full_scale),
-            _centred(right_strips, right, read_out[1], full_scale),
+            longest * _centred(left_strips, left, read_out[0], full_scale),
+            longest * _centred(right_strips, right, read_out[1], full_scale),
             (begin, end),
             first,
             count,

