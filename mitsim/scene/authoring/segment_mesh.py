@@ -33,6 +33,9 @@ _FLAT_DEG = 0.2
 #: surface differ by less than the joining angle of 20 deg, so there are 18 or more of them, each 5.6 % or less
 _FLAT_SHARE = 0.10
 
+#: points of a body that decide whether it lies inside another; chosen
+_POINTS = 9
+
 
 @dataclass(frozen=True)
 class SegmentedMesh:
@@ -86,32 +89,38 @@ def _outside_out(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, list[str]]:
         triangles = mesh.faces.copy()
         remarks.append("triangles of mixed winding made consistent")
     bodies = components(mesh.face_adjacency, np.arange(len(triangles)))
-    open_bodies, inward = 0, 0
-    for body in bodies:
-        shell = trimesh.Trimesh(mesh.vertices, triangles[body], process=False)
-        if not shell.is_watertight:
-            open_bodies += 1
-        elif shell.volume < 0 and not _inside_another(mesh, body, bodies):
-            triangles[body] = triangles[body][:, ::-1]
-            inward += 1
+    shells = [trimesh.Trimesh(mesh.vertices, triangles[body], process=False) for body in bodies]
+    closed = [number for number, shell in enumerate(shells) if shell.is_watertight]
+    around = {n: [other for other in closed if other != n and _inside(shells[n], shells[other])] for n in closed}
+    # a body within another is a cavity, or a part in one: it is turned with the body around it, if that is inward
+    inward = {n for n in closed if not around[n] and shells[n].volume < 0}
+    inward |= {n for n in closed if inward.intersection(around[n]) and (shells[n].volume > 0) == len(around[n]) % 2}
+    for number in inward:
+        triangles[bodies[number]] = triangles[bodies[number]][:, ::-1]
     if inward:
-        remarks.append(f"{inward} of {len(bodies)} bodies had inward normals: turned outward")
-    if open_bodies:
+        remarks.append(f"{len(inward)} of {len(bodies)} bodies had inward normals: turned outward")
+    if open_bodies := len(bodies) - len(closed):
         subject = "the mesh is" if len(bodies) == 1 else f"{open_bodies} of {len(bodies)} bodies are"
         remarks.append(f"{subject} not closed, so the outward direction is unknown: mitsim check reports visible backs")
     return trimesh.Trimesh(mesh.vertices, triangles, process=False), remarks
 
 
-def _inside_another(mesh: trimesh.Trimesh, body: Ints, bodies: list[Ints]) -> bool:
-    """Return whether a body's box lies within that of another: a cavity, whose normals correctly point into it."""
-    mine = mesh.vertices[mesh.faces[body]].reshape(-1, 3)
-    for other in bodies:
-        if other is body:
-            continue
-        box = mesh.vertices[mesh.faces[other]].reshape(-1, 3)
-        if (mine.min(0) > box.min(0)).all() and (mine.max(0) < box.max(0)).all():
-            return True
-    return False
+def _inside(shell: trimesh.Trimesh, other: trimesh.Trimesh) -> bool:
+    """Return whether a closed body lies within the material or a cavity of another, by the solid angle of its surface.
+
+    The angle is 4 pi from inside and 0 from outside (Van Oosterom and Strackee, IEEE Trans. Biomed. Eng. 30, 1983).
+    The median of some points decides, since some may lie where both touch.
+    """
+    if (shell.bounds[0] < other.bounds[0]).any() or (shell.bounds[1] > other.bounds[1]).any():
+        return False
+    turns = []
+    for point in shell.triangles_center[:: max(1, len(shell.faces) // _POINTS)]:
+        a, b, c = np.moveaxis(other.triangles - point, 1, 0)
+        ra, rb, rc = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))
+        volume = np.einsum("ij,ij->i", a, np.cross(b, c))
+        ab, bc, ca = (np.einsum("ij,ij->i", *pair) for pair in ((a, b), (b, c), (c, a)))
+        turns.append(abs(np.arctan2(volume, ra * rb * rc + ab * rc + bc * ra + ca * rb).sum()) / (2 * np.pi))
+    return bool(np.median(turns) > 0.5)
 
 
 def components(pairs: NDArray[np.integer], members: Ints) -> list[Ints]:

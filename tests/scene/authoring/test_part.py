@@ -282,6 +282,27 @@ def test_inward_bodies_are_turned_and_told_but_cavities_are_not():
     assert "not closed" in remarks[0]
 
 
+@pytest.mark.parametrize("inverted", [False, True])
+def test_a_pin_in_a_ring_is_no_cavity_and_a_cavity_turns_with_its_body(inverted):
+    """A ring round a ball; a shell with a ball in its cavity: each ball is solid, whichever way the file turns them."""
+    ring, ball = trimesh.creation.annulus(18.0, 20.0, 30.0, sections=64), trimesh.creation.icosphere(3, 5.0)
+    cavity = trimesh.creation.box((14.0, 14.0, 14.0))
+    cavity.invert()
+    shell = [trimesh.creation.box((20.0, 20.0, 20.0)), cavity]
+    for bodies in ([ring, ball], [*shell, ball]):
+        mesh = trimesh.util.concatenate(bodies)
+        if inverted:
+            mesh.invert()
+        faces, remarks = cut_of(mesh)
+        assert [face.convex for face in faces.values() if face.kind == "sphere"] == [True]
+        assert bool(remarks) == inverted
+        across = {True: [], False: []}
+        for face in faces.values():
+            if face.kind == "plane" and len(bodies) == 3:
+                across[bool(np.abs(face.surface.point).max() > 8)].append(face.surface.point @ face.surface.normal)
+        assert np.allclose(across[True], 10.0) and np.allclose(across[False], -7.0)
+
+
 @pytest.fixture(scope="module")
 def plate(tmp_path_factory):
     folder = tmp_path_factory.mktemp("plate")
