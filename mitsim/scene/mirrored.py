@@ -13,6 +13,9 @@ import numpy as np
 
 from mitsim.scene.backend import mi
 
+#: triangles of a mesh that tell its side; chosen: more take time in each loading
+_TRIANGLES = 10_000
+
 
 def face_normals_side(scene: Any) -> None:
     """Make the triangles of every mesh of an ``mi.Scene`` face the side of its normals, in place."""
@@ -27,7 +30,8 @@ def face_normals_side(scene: Any) -> None:
         elif name == "faces" and shape.has_vertex_normals():
             places, normals = f"{owner}.vertex_positions", f"{owner}.vertex_normals"
             triangles = np.array(parameters[key], np.uint32).reshape(-1, 3)
-            corners, outward = (np.array(parameters[n], float).reshape(-1, 3)[triangles] for n in (places, normals))
+            some = triangles[:: max(1, len(triangles) // _TRIANGLES)]
+            corners, outward = (np.array(parameters[n]).reshape(-1, 3)[some].astype(float) for n in (places, normals))
             a, b, c = np.moveaxis(corners, 1, 0)
             if np.einsum("ij,ikj->", np.cross(b - a, c - a), outward) < 0:
                 parameters[key] = mi.UInt32(np.ascontiguousarray(triangles[:, ::-1]).ravel())
