@@ -193,8 +193,8 @@ class _Reader:
             notes.append(" ".join(str(word) for word in described if word))
             return
         if entity.has("VALUE_RANGE"):  # its bounds stand in a list, which may name its type
-            for part in (value for part in entity.parts for value in part.values):
-                bounds = part.values[0] if isinstance(part, Typed) and part.values else part
+            for value in (value for part in entity.parts for value in part.values):
+                bounds = value.values[0] if isinstance(value, Typed) and value.values else value
                 for bound in bounds if isinstance(bounds, tuple) else ():
                     self.value(bound, measured, notes)
             return
