@@ -114,6 +114,10 @@ class Plane:
         point, normal = moved_rigidly(motion, self.point, self.normal)
         return Plane(point, normal)
 
+    def at_foot_of(self, point: Array) -> Plane:
+        """Describe the same plane by its point nearest to ``point`` (3,)."""
+        return Plane(point - ((point - self.point) @ self.normal) * self.normal, self.normal)
+
     def meet(self, points: Array, rays: Array | None) -> Meeting:
         """Intersect the rays (n, 3) of points (n, 3) [mm]."""
         distance = (points - self.point) @ self.normal

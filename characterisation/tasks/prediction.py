@@ -273,12 +273,12 @@ def _one_by_one(value: Callable[..., float], predictions: Sequence[ExpectedInput
 
 
 def _at_its_points(value: Callable[..., Any], middles: Sequence[Floats]) -> Callable[..., Any]:
-    """Return the measurement on axes described at the foot of their measured points, as fits are."""
+    """Return the measurement on planes and axes described at the foot of their measured points, as fits are."""
 
     def at_points(*estimates: Any) -> Any:
         return value(
             *[
-                estimate.at_foot_of(middle) if isinstance(estimate, Cylinder | Cone) else estimate
+                estimate.at_foot_of(middle) if isinstance(estimate, Plane | Cylinder | Cone) else estimate
                 for estimate, middle in zip(estimates, middles, strict=True)
             ]
         )

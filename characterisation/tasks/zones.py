@@ -81,30 +81,33 @@ def datum_motion(measured: Sequence[Datum], nominal: Sequence[Datum]) -> Array:
 
     The primary datum is a plane, and its normal is the first axis of the frame. There are two cases:
 
-    - Two more planes: the second axis is the normal of the secondary, made perpendicular; the origin is the point
-      common to all three.
-    - An axis perpendicular to the primary: the origin is its foot there. A second such axis, or a plane, determines the
-      rotation about it.
+    - Two more planes: the second axis is the normal of the secondary, made perpendicular. Both planes keep their
+      nominal angles to the frame, and pass through the middle of their points.
+    - An axis perpendicular to the primary: it passes through the middle of its points. A second such axis, or a plane,
+      determines the rotation about it.
     """
     frames = []
     for datums in (measured, nominal):
-        directions = [
+        first, *others = (
             direction(datum) * (1.0 if direction(datum) @ direction(ideal) >= 0 else -1.0)
             for datum, ideal in zip(datums, nominal, strict=True)
-        ]
-        primary, secondary, tertiary = datums
-        first = directions[0]
+        )
+        _, secondary, tertiary = datums
         if isinstance(secondary, Plane):
-            second, origin = directions[1], intersection([primary, secondary, tertiary]).place
+            second = others[0]
         else:
-            origin = secondary.point - ((secondary.point - primary.point) @ first) * first
-            second = directions[2] if isinstance(tertiary, Plane) else tertiary.point - origin
+            second = others[1] if isinstance(tertiary, Plane) else tertiary.point - secondary.point
         second = unit(second - (second @ first) * first)
-        frame = np.eye(4)
-        frame[:3, :3] = np.column_stack([first, second, cross(first, second)])
-        frame[:3, 3] = origin
-        frames.append(frame)
-    motion: Array = frames[0] @ np.linalg.inv(frames[1])
+        frames.append(np.column_stack([first, second, cross(first, second)]))
+    motion = np.eye(4)
+    motion[:3, :3] = frames[0] @ frames[1].T
+    # the primary places the origin along its normal; the others, in two more directions
+    places, ways = [0, 1, 2], np.array([direction(datum) for datum in nominal])
+    if not isinstance(nominal[1], Plane):
+        places, ways = [0, 1, 1], frames[1].T
+    ways = ways @ motion[:3, :3].T
+    moves = [measured[place].point - motion[:3, :3] @ nominal[place].point for place in places]
+    motion[:3, 3] = np.linalg.solve(ways, np.einsum("ij,ij->i", ways, np.array(moves)))
     return motion
 
 

@@ -120,6 +120,34 @@ def test_the_scatter_of_measured_values_is_what_was_expected(name, fits_of_draws
     assert found.chance == 1.0 and found.reason == ""
 
 
+def test_a_datum_plane_is_expected_at_its_points_wherever_its_nominal_point_lies(clouds) -> None:
+    """The middle of the wall's points is some 35 mm over the nominal point of the task."""
+    rng, found = np.random.default_rng(4), []
+    side = np.column_stack([np.full(700, -200.0), *(100 * rng.random((2, 700)))])
+    points = {"plane": clouds["plane"], "wall": clouds["wall"], "side": side, "pillar": clouds["pillar"]}
+    for height in (0.0, 35.0, 70.0):
+        document = TASK.model_dump(exclude_none=True)
+        document["features"]["wall"]["point_mm"] = (0, 60, height)
+        document["features"]["side"] = {"kind": "plane", "point_mm": (-200, 0, 0), "direction": (1, 0, 0)}
+        document["features"]["pillar"]["outline_mm"] = ((0, 0, 0), (0, 0, 60))
+        wanted = {"kind": "position", "features": ("pillar", "plane", "wall", "side"), "nominal": 0, "unit": "mm"}
+        document["measurements"] = {"stand": wanted}
+        task = Task.model_validate(document)
+        inputs = expected_inputs(task, {name: seen(name, points[name]) for name in task.features}, 100)
+        found.append(expected_measurement(task, "stand", inputs).uncertainty)
+    assert found == pytest.approx([found[0]] * 3, rel=1e-6)
+    values = []
+    for _ in range(100):
+        fits = {
+            name: fit_surface(measured, task.features[name].nominal(), EYE)
+            for name, measured in drawn(points, rng).items()
+        }
+        model = measurement_model(task, "stand")
+        values.append(model.value(*[fits[quantity.features[0]] for quantity in model.inputs]))
+    # a root mean square of 100 is known to 7 %; three of these
+    assert np.sqrt(np.mean(np.square(values))) == pytest.approx(found[0], rel=0.21)
+
+
 def test_the_scatter_of_fitted_poses_is_what_was_expected(clouds, inputs) -> None:
     rng, (quantity,) = np.random.default_rng(3), measurement_model(TASK, "place").inputs
     surfaces: dict[str, Surface] = {name: TASK.features[name].nominal() for name in TASK.features}

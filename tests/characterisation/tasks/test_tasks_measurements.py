@@ -149,6 +149,31 @@ def test_with_datums_an_error_of_the_pose_does_not_count():
     assert datum_motion(skew, planes)[:3, 2] == pytest.approx(Z)
 
 
+def test_datum_planes_are_the_least_squares_ones_at_right_angles_to_those_before_them():
+    """Walls that lean: ISO 5459 associates the secondary and tertiary datum with their angles fixed."""
+    u, v = (grid.reshape(-1, 1) for grid in np.meshgrid(np.linspace(-1, 1, 15), np.linspace(-1, 1, 11)))
+    top = 40 * u * X + 30 * v * Y
+    left = -40 * X - 10 * Z + 30 * u * Y + 10 * v * (Z + 0.02 * X)
+    front = 5 * Y - 30 * Y - 10 * Z + 40 * u * (X + 0.01 * Y) + 10 * v * (Z - 0.015 * Y)
+    planes = [Plane(ORIGIN, Z), Plane(-40 * X, -X), Plane(-30 * Y, -Y)]
+    # perpendicular to the top, the left wall is x = -40 in every height, and the front y = -25: 5 mm from nominal
+    ball = Sphere(np.array([7.0, 8, 9]), 2.0)
+    fits = [fit_plane(face) for face in (top, left, front)]
+    assert position(ball, *fits, nominal=[ball, *planes], outline=np.empty((0, 3))) == pytest.approx(10.0, abs=1e-9)
+    assert datum_motion(fits, planes) == pytest.approx(
+        np.block([[np.eye(3), np.array([[0.0], [5.0], [0.0]])], [np.zeros(3), np.ones(1)]]), abs=1e-9
+    )
+
+
+def test_a_datum_plane_keeps_its_nominal_angle():
+    """A third datum at 60 deg to the second, found 2 degrees off about the middle of its points, does not move."""
+    oblique = np.array([np.sqrt(0.75), 0.5, 0.0])
+    planes = [Plane(ORIGIN, Z), Plane(-40 * X, -X), Plane(30 * oblique, oblique)]
+    turned = Rotation.from_rotvec([0.0, 0.0, np.deg2rad(2)]).apply(oblique)
+    place = 30 * oblique + 15 * np.cross(Z, oblique)
+    assert datum_motion([*planes[:2], Plane(place, turned)], planes) == pytest.approx(np.eye(4), abs=1e-9)
+
+
 def test_a_pose_is_told_by_the_place_of_a_point_and_by_its_turn():
     true = moved()
     pose = Pose(true, true[:3, 3]).moved(np.array([0.0, 0, 0.01, 0.3, 0.4, 0]))
