@@ -10,9 +10,10 @@ intersections and middle planes are computed again, and figures are carried alon
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -32,6 +33,15 @@ NOWHERE = np.empty((0, 3))
 
 #: origin of a frame [mm]
 ORIGIN = np.zeros(3)
+
+#: second differences of a value over its first ones, above which it is not linear; chosen
+BENT = 0.1
+
+#: relative difference of u^2 by two roots below which all roots give the same; chosen
+SAME = 1e-3
+
+#: number of directions over which the square of a value that is not linear is averaged; chosen: u is known to 3 %
+DIRECTIONS = 64
 
 
 class Estimate(Protocol):
@@ -177,6 +187,10 @@ def evaluate(
     Where the value is well above its noise, it gives the error of the component along the vector, which is smaller by
     at most sqrt(2).
 
+    Every root L gives the same u of a linear f, and of the length of a vector that is 0. The largest or the range of
+    several deviations depends on L near 0. Where f is not linear, u^2 is therefore the mean over rotated roots. Of a
+    largest deviation or a range that is 0, it is the mean square for normal errors.
+
     ``covariance`` (P, P) is that of all parameters of all fits in their order, for correlated fits. By default, the
     fits are independent.
     """
@@ -186,14 +200,32 @@ def evaluate(
         root = block_diag(*[_square_root(block) for block in blocks])
     else:
         root = _square_root(np.asarray(covariance, float))
-    ends = np.cumsum([len(block) for block in blocks])
-    moment = 0.0
-    for column in root.T:
-        steps = np.split(column, ends[:-1])
-        for sign in (1.0, -1.0):
-            moved = [fit.moved(sign * step) if step.any() else fit for fit, step in zip(fits, steps, strict=True)]
-            moment += 0.5 * (value(*moved) - best) ** 2
-    return best, float(np.sqrt(moment))
+    ends = np.cumsum([len(block) for block in blocks])[:-1]
+
+    def changes(columns: Array) -> Array:
+        """Return the changes (k, 2) of the value by steps (P, k) forward and back."""
+        moved = [
+            [fit.moved(part) if part.any() else fit for fit, part in zip(fits, np.split(step, ends), strict=True)]
+            for column in columns.T
+            for step in (column, -column)
+        ]
+        return np.array([value(*each) - best for each in moved]).reshape(-1, 2)
+
+    change = changes(root)
+    moments = [float((change**2).sum()) / 2]
+    if (change.sum(axis=1) ** 2).sum() > BENT**2 * (change**2).sum():
+        for turn in _turns(root.shape[1]):
+            moments.append(float((changes(root @ turn) ** 2).sum()) / 2)
+            if math.isclose(*moments[:2], rel_tol=SAME):  # no root differs
+                break
+    return best, math.sqrt(np.mean(moments))
+
+
+@lru_cache
+def _turns(size: int) -> tuple[Array, ...]:
+    """Return random rotations (size, size), the same at every call."""
+    rng = np.random.default_rng(0)
+    return tuple(np.linalg.qr(rng.standard_normal((size, size)))[0] for _ in range(-(-DIRECTIONS // size)))
 
 
 def _square_root(covariance: Array) -> Array:

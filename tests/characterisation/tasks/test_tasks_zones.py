@@ -8,7 +8,7 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from characterisation.features.fitted import with_covariance
-from characterisation.features.surfaces import Cylinder, Plane
+from characterisation.features.surfaces import Cylinder, Plane, tangents
 from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
 from characterisation.statements.decision import decide
@@ -252,3 +252,20 @@ def test_limits_that_no_value_can_keep_are_refused(kind, unit, nominal, toleranc
     with pytest.raises(ValidationError, match=limits):
         Measurement.model_validate(asked | {"tolerance": tolerance})
     assert Measurement.model_validate(asked | {"nominal": 90.0, "tolerance": [-0.5, 0.5]}).tolerance == (-0.5, 0.5)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 1e-4, 0.6])
+def test_the_uncertainty_of_a_zone_of_0_is_the_root_mean_square_of_those_that_noise_makes(correlation):
+    """Heights of the corners of a square over drawn planes; a tilt of no preferred direction has no preferred axes."""
+    outline = np.array([[-30.0, -30, 0], [30, -30, 0], [30, 30, 0], [-30, 30, 0]])
+    covariance = np.diag([1e-4, 1e-8, 1e-8])
+    covariance[1, 2] = covariance[2, 1] = correlation * 1e-8
+    drawn = np.random.default_rng(1).multivariate_normal(np.zeros(3), covariance, 100_000)
+    base, post = Plane(np.zeros(3), Z), Cylinder(np.zeros(3), Z, 1.0)
+    fit = with_covariance(base, covariance)
+    heights = drawn @ np.column_stack([np.ones(4), outline @ tangents(Z).T]).T
+    for function, zones in (
+        (lambda plane: perpendicularity(plane, post, outline=outline), np.ptp(heights, axis=1)),
+        (lambda plane: symmetry(plane, base, outline=outline), 2 * np.abs(heights).max(axis=1)),
+    ):
+        assert evaluate(function, [fit])[1] == pytest.approx(np.sqrt((zones**2).mean()), rel=0.04)
