@@ -8,7 +8,7 @@ from scipy.stats import norm
 
 from characterisation.cloud_files import write_cloud
 from characterisation.files.errors import InputError
-from mitsim.cli.acceptance_request import read_artefacts
+from mitsim.cli.acceptance_request import Artefacts, joint_figures, read_artefacts
 from tests.seen_shapes import GRID, cloud_of, plane, sphere
 from tests.shell import mitsim_here
 
@@ -51,10 +51,18 @@ def test_a_wall_has_the_offset_the_noise_and_the_gap_that_it_was_made_with(walls
         assert one["wall flatness error"]["standard_uncertainty"] == pytest.approx(scatter, rel=0.4)
         assert one["wall fill rate"]["points"] == 152 * 200 and one["wall fill rate"]["points_given"] == 160 * 200
     assert together["wall mean depth error"]["value"] == pytest.approx(0.5, abs=0.002)
-    # of 4 captures, 3 degrees of freedom: the median of chi over sqrt(3) is 0.888
-    assert together["wall temporal noise"]["value"] == pytest.approx(0.888 * SIGMA, rel=0.03)
+    assert together["wall temporal noise"]["value"] == pytest.approx(SIGMA, rel=0.03)
     # noise of a mean of four; the 95th percentile of its absolute value is 1.96 standard deviations
     assert together["wall global planarity trueness"]["value"] == pytest.approx(1.96 * SIGMA / 2, rel=0.04)
+
+
+@pytest.mark.parametrize("captures", [2, 3, 12])
+def test_temporal_noise_does_not_depend_on_the_number_of_captures_or_on_gaps(captures, rng):
+    distance = plane([0, 0, 603], [0, 0, -1])
+    gaps = rng.random((captures, *distance.shape)) < 0.2
+    clouds = [cloud_of(np.where(gap, np.nan, distance), SIGMA, rng) for gap in gaps]
+    found = {result.name: result.value for result in joint_figures(clouds, Artefacts({"wall": (None, None)}, {}, []))}
+    assert found["wall temporal noise"] == pytest.approx(SIGMA, rel=0.03)
 
 
 def test_without_a_distance_or_repeats_there_are_no_figures_that_need_them(walls):
