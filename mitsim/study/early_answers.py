@@ -37,7 +37,10 @@ class StepTimes:
 
 
 class Answers:
-    """Answers before the end of a run: its folder and report, first after a minute and then as they improve."""
+    """Answers before the end of a run: its folder and report, first after a minute and then as they improve.
+
+    ``longest_s``: the longest time [s] that one has taken so far.
+    """
 
     def __init__(
         self,
@@ -52,6 +55,7 @@ class Answers:
         self.limit, self.clock, self.report = limit, clock, report
         self.next_s = FIRST_ANSWER_S
         self.drawn: set[int] = set()
+        self.longest_s = 0.0
 
     def improve(self, raced: Raced, stated: StatedView | None = None) -> None:
         """Write the answer so far, if it is time for one. Each takes at most a tenth of the time since the last."""
@@ -72,4 +76,6 @@ class Answers:
         self.report()
         first = self.next_s == FIRST_ANSWER_S
         say(f"{'first answer' if first else 'answer'} after {self.limit.elapsed:.0f} s: view {leader}, report.html")
-        self.next_s = self.limit.elapsed + max(FIRST_ANSWER_S, 10 * (time.monotonic() - began))
+        took = time.monotonic() - began
+        self.longest_s = max(self.longest_s, took)
+        self.next_s = self.limit.elapsed + max(FIRST_ANSWER_S, 10 * took)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -146,6 +146,7 @@ def run_within(
     raced = session.race(scores, None, race_limit, answers.improve)
     scores = write_raced(session, scores, raced)
     clock.lap("race")
+    plan = replace(plan, page_s=answers.longest_s)
     leaders = list(dict.fromkeys(raced.leaders().values()))
     stated, rest_limit = None, plan.rest_limit(limit)
     if leaders and (not limit.over() or session.trials.known(leaders[0])):  # a first trial may take minutes

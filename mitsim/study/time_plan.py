@@ -50,7 +50,7 @@ _REMEDIES_SHARE = 0.6
 
 @dataclass(frozen=True)
 class TimePlan:
-    """Planned seconds of the steps of a run."""
+    """Planned seconds of the steps of a run; ``page_s`` is what clouds and page of an earlier answer took."""
 
     screening: float
     race: float
@@ -58,6 +58,7 @@ class TimePlan:
     report: float
     remedies: float = 0.0
     sets: float = 0.0
+    page_s: float = 0.0
 
     @property
     def total(self) -> float:
@@ -106,9 +107,9 @@ class TimePlan:
         return max(self.page(limit), min(self.report, _LARGEST_REPORT_SHARE * limit.left))
 
     def page(self, limit: TimeLimit) -> float:
-        """Return the time [s] that clouds and page will take, on a machine as busy as it has been so far."""
+        """Return the time [s] of clouds and page: as they took before, or by how busy the machine has been so far."""
         busy = min(max(limit.elapsed / max(time.process_time(), 0.1), 0.5), _BUSIEST)
-        return min(busy * _PAGE_S, _PAGE_SHARE * limit.left)
+        return min(max(busy * _PAGE_S, self.page_s), _PAGE_SHARE * limit.left)
 
 
 def time_plan(seconds: float, views: int, remedies: bool = False, sets: bool = False) -> TimePlan:

@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from dataclasses import replace
 
 import pytest
 
@@ -67,3 +68,12 @@ def test_a_set_of_views_gets_its_planned_share(remedies):
     plan, limit = time_plan(600.0, 102, remedies, sets=True), TimeLimit(600.0, time.monotonic() - 300.0)
     ratio = plan.rest_limit(limit).left / plan.statement_limit(limit).left
     assert ratio == pytest.approx((plan.statement + plan.remedies) / plan.statement, rel=1e-3)
+
+
+def test_a_page_that_took_long_before_is_given_that_time_again():
+    """Clouds and page of a part of 100 faces take many times those of a simple part."""
+    plan, limit = time_plan(300.0, 102), TimeLimit(300.0, time.monotonic() - 100.0)
+    slow = replace(plan, page_s=60.0)
+    assert plan.last_limit(limit).left > 150
+    assert slow.last_limit(limit).left == pytest.approx(140.0, abs=1.0)
+    assert slow.statement_limit(limit).left <= 140.0
