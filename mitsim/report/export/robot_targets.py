@@ -130,6 +130,7 @@ def krl_data(targets: Sequence[RobotTarget], tool: str) -> str:
     """Return a KRL data list of FRAMEs, with the part frame as base."""
     lines = [
         "DEFDAT mitsim_views PUBLIC",
+        "; a controller reads this list from a file of its name, mitsim_views.dat",
         f"; poses of the {tool} in the part frame, which must be the BASE; mm, deg",
         "; A about z, B about the new y, C about the new x: R = Rz(A) Ry(B) Rx(C)",
     ]
