@@ -26,7 +26,10 @@ def statement_document(session: Session, stated: StatedView) -> dict[str, Any]:
         "coat" in unknowns.varied,
         study.sensor.technology == "time_of_flight",
     )
-    used = unknowns.table.temperature.model_copy(update={"expansion_per_kelvin": unknowns.expansion})
+    kelvin = {"expansion_per_kelvin": unknowns.expansion}
+    used: dict[str, Any] = {"temperature": unknowns.table.temperature.model_copy(update=kelvin)}
+    if study.sensor.technology != "time_of_flight":
+        used["calibration"] = unknowns.table.calibration.model_copy(update={"path_offset_mm": 0.0})
     exposed = {} if stated.planned is None else {"exposure": asdict(stated.planned)}
     return exposed | {
         "schema_version": 1,
@@ -40,7 +43,7 @@ def statement_document(session: Session, stated: StatedView) -> dict[str, Any]:
         "world_from_sensor": view.world_from_sensor.matrix().tolist(),
         "coverage_probability": 0.95,
         "calibration": unknowns.calibration.source,
-        "unknowns": unknowns.table.model_copy(update={"temperature": used}).model_dump(mode="json"),
+        "unknowns": unknowns.table.model_copy(update=used).model_dump(mode="json"),
         "measurements": {
             statement.measurement: _measurement(statement)
             | {"maker_sigma": maker_sigma(study.sensor, study.task.measurements[statement.measurement], view.standoff)}

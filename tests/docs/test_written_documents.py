@@ -56,6 +56,8 @@ def test_keys_of_a_statement(stated):
     row = next(line for line in FORMATS.splitlines() if line.startswith("| `budget` |"))
     assert {f"`{key}`" for key in measurement["budget"][0]} <= set(row.replace(",", " ").split())
     JSON_MODELS["statement"].model_validate(written)
+    # the path of light is an unknown of time of flight alone
+    assert written["unknowns"]["calibration"]["path_offset_mm"] == 0 < UnknownsTable().calibration.path_offset_mm
 
 
 def test_keys_of_a_plan_of_exposures(tmp_path):
