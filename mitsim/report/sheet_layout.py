@@ -43,6 +43,9 @@ _SIZES = (8.0, 7.5, 7.0, 6.5, 6.0, 5.5)
 
 _DPI = 200
 
+#: relative difference of a line's width from the sum of those of its pieces, which kerning stays below; chosen
+_KERNING = 0.02
+
 #: resolution of widths: advances that are rounded to pixels would differ from those of a PDF by 1 %
 _METRICS_DPI = 1200
 
@@ -78,12 +81,18 @@ def wrapped(text: str, size: float, across: float, weight: str = "normal") -> li
     --------
     text_width : of one line
     """
-    lines, line = list[str](), ""
+    lines, line, width = list[str](), "", 0.0
     for word in text.split(" "):
         for number, piece in enumerate(_pieces(word)):
-            trial = line + (" " if line and number == 0 else "") + piece
-            if text_width(trial, size, weight) <= across:
-                line = trial
+            added = (" " if line and number == 0 else "") + piece
+            longer = width + text_width(added, size, weight)
+            # only a line that nearly fits needs its own width
+            if abs(longer - across) < _KERNING * across:
+                fits = text_width(line + added, size, weight) <= across
+            else:
+                fits = longer < across
+            if fits:
+                line, width = line + added, longer
                 continue
             if line:
                 lines.append(line)
@@ -92,6 +101,7 @@ def wrapped(text: str, size: float, across: float, weight: str = "normal") -> li
                 cut = next(k for k in range(len(line), 0, -1) if text_width(line[:k], size, weight) <= across or k == 1)
                 lines.append(line[:cut])
                 line = line[cut:]
+            width = text_width(line, size, weight)
     return [*lines, line]
 
 
