@@ -12,19 +12,15 @@ another and of the errors of the calibration, so covariances add.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.rig_covariance import RigCovariance
-from mitsim.sensor.rig_parameters import PATH_NAMES, eyes, parameter_names
-
-if TYPE_CHECKING:
-    from mitsim.sensor.sensor import Sensor
+from mitsim.sensor.rig_parameters import eyes
 
 #: Sources of the defaults. "Recorded" refers to the Ensenso recordings of docs/how-to/real-captures.md.
 SOURCES: Mapping[str, str] = {
@@ -115,29 +111,6 @@ def drift_modes(rig: Rig, names: tuple[str, ...], drift: Drift) -> list[DriftMod
         longer = {f"{name}.position_{letter}_mm": float(part) for letter, part in zip("xyz", baseline, strict=True)}
         out.append(DriftMode(f"baseline to {name}", drift.baseline_per_kelvin * drift.temperature_k, longer))
     return out
-
-
-def with_drift(covariance: RigCovariance, sensor: Sensor, drift: Drift) -> RigCovariance:
-    """Return the covariance of a calibration plus that of drift; the source names both.
-
-    All eyes that measure drift, and those with a parameter in the covariance. Parameters that drift and are not in the
-    covariance come last.
-    """
-    drifting = {name.rpartition(".")[0] for name in covariance.names} | set(sensor.measuring_eyes)
-    possible = [name for name in parameter_names(sensor.rig) if name.rpartition(".")[0] in drifting]
-    if sensor.technology == "time_of_flight":
-        possible += PATH_NAMES
-    modes = [mode for mode in drift_modes(sensor.rig, tuple(possible), drift) if mode.sigma > 0]
-    moving = [name for mode in modes for name, value in mode.step.items() if value != 0]
-    names = tuple(dict.fromkeys((*covariance.names, *moving)))
-    count = len(covariance.names)
-    total = np.zeros((len(names), len(names)))
-    total[:count, :count] = covariance.covariance
-    for mode in modes:
-        step = np.array([mode.step.get(name, 0.0) for name in names])
-        total += mode.sigma**2 * np.outer(step, step)
-    described = ", ".join(f"{name} {value:g}" for name, value in drift.numbers().items())
-    return replace(covariance, names=names, covariance=total, source=f"{covariance.source}; drift: {described}")
 
 
 def _axes(eye: Camera, baseline: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:

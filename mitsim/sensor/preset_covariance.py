@@ -1,13 +1,17 @@
-"""Read the covariances of the presets: virtual calibrations made by ``mitsim calibrate``."""
+"""Read the covariances of the presets, virtual calibrations made by ``mitsim calibrate``, and add drift to any."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
+import numpy as np
+
 from characterisation.files.errors import InputError
-from mitsim.sensor.drift import Drift, with_drift
+from mitsim.sensor.drift import Drift, drift_modes
 from mitsim.sensor.rig_covariance import RigCovariance, read_rig_covariance
+from mitsim.sensor.rig_parameters import PATH_NAMES, parameter_names
 from mitsim.sensor.sensor import Sensor
 
 
@@ -30,3 +34,26 @@ def preset_covariance(sensor: Sensor, drift: Drift | None = None) -> RigCovarian
         )
     covariance = read_rig_covariance(path, sensor.rig)
     return with_drift(covariance, sensor, Drift() if drift is None else drift)
+
+
+def with_drift(covariance: RigCovariance, sensor: Sensor, drift: Drift) -> RigCovariance:
+    """Return the covariance of a calibration plus that of drift; the source names both.
+
+    All eyes that measure drift, and those with a parameter in the covariance. Parameters that drift and are not in the
+    covariance come last.
+    """
+    drifting = {name.rpartition(".")[0] for name in covariance.names} | set(sensor.measuring_eyes)
+    possible = [name for name in parameter_names(sensor.rig) if name.rpartition(".")[0] in drifting]
+    if sensor.technology == "time_of_flight":
+        possible += PATH_NAMES
+    modes = [mode for mode in drift_modes(sensor.rig, tuple(possible), drift) if mode.sigma > 0]
+    moving = [name for mode in modes for name, value in mode.step.items() if value != 0]
+    names = tuple(dict.fromkeys((*covariance.names, *moving)))
+    count = len(covariance.names)
+    total = np.zeros((len(names), len(names)))
+    total[:count, :count] = covariance.covariance
+    for mode in modes:
+        step = np.array([mode.step.get(name, 0.0) for name in names])
+        total += mode.sigma**2 * np.outer(step, step)
+    described = ", ".join(f"{name} {value:g}" for name, value in drift.numbers().items())
+    return replace(covariance, names=names, covariance=total, source=f"{covariance.source}; drift: {described}")

@@ -10,8 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from mitsim.sensor.drift import Drift, with_drift
+from mitsim.sensor.drift import Drift
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.preset_covariance import with_drift
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import PATH_NAMES, moved, path_error
 from mitsim.study.calibration.accuracy import _BARS, measured_points, measuring_volume

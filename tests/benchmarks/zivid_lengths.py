@@ -17,9 +17,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.sensor.drift import Drift, with_drift
+from mitsim.sensor.drift import Drift
 from mitsim.sensor.preset import load_sensor
-from mitsim.sensor.preset_covariance import preset_covariance
+from mitsim.sensor.preset_covariance import preset_covariance, with_drift
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.sensor import Sensor

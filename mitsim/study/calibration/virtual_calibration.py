@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.drift import Drift, with_drift
+from mitsim.sensor.drift import Drift
+from mitsim.sensor.preset_covariance import with_drift
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import PATH_NAMES
 from mitsim.sensor.sensor import Sensor

@@ -14,9 +14,9 @@ import numpy as np
 from characterisation.files.errors import InputError, nearest
 from mitsim.running.progress import say
 from mitsim.sensor.camera import Rig
-from mitsim.sensor.drift import Drift, with_drift
+from mitsim.sensor.drift import Drift
 from mitsim.sensor.preset import presets
-from mitsim.sensor.preset_covariance import preset_covariance
+from mitsim.sensor.preset_covariance import preset_covariance, with_drift
 from mitsim.sensor.rig_covariance import RigCovariance, read_rig_covariance
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.unknowns import CalibrationUnknowns, FormUnknowns, TemperatureUnknowns

@@ -8,8 +8,9 @@ import pytest
 from characterisation.files.errors import InputError
 from mitsim.decoding.structured_light.geometry import structured_light_geometry
 from mitsim.decoding.structured_light.newton_polynomial import evaluate
-from mitsim.sensor.drift import SOURCES, Drift, drift_modes, with_drift
+from mitsim.sensor.drift import SOURCES, Drift, drift_modes
 from mitsim.sensor.preset import load_sensor, presets
+from mitsim.sensor.preset_covariance import with_drift
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import moved, parameter_names, parameter_values
 from mitsim.sensor.unknowns import CalibrationUnknowns

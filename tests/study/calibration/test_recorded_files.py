@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.drift import Drift, with_drift
+from mitsim.sensor.drift import Drift
 from mitsim.sensor.fitted_to import FittedCapture, images_digest
 from mitsim.sensor.opencv_calibration import with_calibration
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.preset_covariance import with_drift
 from mitsim.sensor.rig_covariance import read_rig_covariance
 from mitsim.sensor.rig_parameters import parameter_differences
 from mitsim.sensor.transforms import Transform

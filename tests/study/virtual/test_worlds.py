@@ -8,9 +8,8 @@ from scipy.stats import kstest
 
 from characterisation.files.errors import InputError
 from mitsim.scene.surface.scatter import Deviation
-from mitsim.sensor.drift import with_drift
 from mitsim.sensor.preset import load_sensor
-from mitsim.sensor.preset_covariance import preset_covariance
+from mitsim.sensor.preset_covariance import preset_covariance, with_drift
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import parameter_names
 from mitsim.sensor.room_light import room_irradiance
