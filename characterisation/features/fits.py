@@ -93,7 +93,7 @@ def fit_plane(points: ArrayLike, viewpoint: ArrayLike | None = None) -> PlaneFit
     if viewpoint is not None:
         outward = (np.asarray(viewpoint, float) - centroid) @ plane.normal
     normal = plane.normal if outward > 0 else -plane.normal
-    plane = Plane(centroid - ((centroid - plane.point) @ normal) * normal, normal)
+    plane = Plane(plane.point, normal).at_foot_of(centroid)
     return PlaneFit(plane.point, plane.normal, *_uncertainty(plane, points[kept], viewpoint))
 
 

@@ -26,6 +26,7 @@ from scipy.spatial import cKDTree
 from trimesh.grouping import unique_rows
 
 from characterisation.files.arrays import Floats
+from mitsim.scene.ray_casting.solid_angles import solid_angles
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.views.table import MARGIN_MM, SensorBody
@@ -186,17 +187,8 @@ def is_inside(part: Obstacle, point: Floats) -> bool:
     squared = np.einsum("ij,ij->i", away, away)
     near = squared <= (_FAR * solids.reach) ** 2
     angles = np.einsum("ij,ij->i", solids.areas, away) / np.where(near, 1.0, squared) ** 1.5
-    total = angles[~near].sum() + _solid_angles(solids.triangles[near] - point).sum()
+    total = angles[~near].sum() + solid_angles(solids.triangles[near] - point).sum()
     return bool(total / (4 * np.pi) > _INSIDE)
-
-
-def _solid_angles(triangles: Floats) -> Floats:
-    """Return signed solid angles (n,) [sr] of triangles (n, 3, 3) from the origin; positive for outward normals."""
-    a, b, c = np.moveaxis(triangles, 1, 0)
-    la, lb, lc = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))
-    volume = np.einsum("ij,ij->i", a, np.cross(b, c))
-    ab, bc, ca = ((first * second).sum(axis=1) for first, second in ((a, b), (b, c), (c, a)))
-    return np.asarray(2 * np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb))
 
 
 def box_distance(triangles: Floats, half: Floats) -> Floats:

@@ -130,7 +130,7 @@ def centred(plane: Plane, vertices: Floats, triangles: Ints) -> Plane:
     """Return a plane with its point at the centroid of the area of its face, which every mesh of the face has alike."""
     areas, middles = _areas(vertices, triangles), vertices[triangles].mean(axis=1)
     middle = areas @ middles / areas.sum() if areas.any() else middles.mean(axis=0)
-    return Plane(middle - ((middle - plane.point) @ plane.normal) * plane.normal, plane.normal)
+    return plane.at_foot_of(middle)
 
 
 def surface_distance(surface: Surface, points: Floats) -> Floats:

@@ -19,6 +19,7 @@ from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from mitsim.scene.authoring.face import Face, Ints, same_surface
 from mitsim.scene.authoring.recognise import recognised
+from mitsim.scene.ray_casting.solid_angles import solid_angles
 
 #: largest number of faces; a mesh with more is a scan or noise, not a machined part
 LARGEST_COUNT = 1000
@@ -108,19 +109,13 @@ def _outside_out(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, list[str]]:
 def _inside(shell: trimesh.Trimesh, other: trimesh.Trimesh) -> bool:
     """Return whether a closed body lies within the material or a cavity of another, by the solid angle of its surface.
 
-    The angle is 4 pi from inside and 0 from outside (Van Oosterom and Strackee, IEEE Trans. Biomed. Eng. 30, 1983).
     The median of some points decides, since some may lie where both touch.
     """
     if (shell.bounds[0] < other.bounds[0]).any() or (shell.bounds[1] > other.bounds[1]).any():
         return False
-    turns = []
-    for point in shell.triangles_center[:: max(1, len(shell.faces) // _POINTS)]:
-        a, b, c = np.moveaxis(other.triangles - point, 1, 0)
-        ra, rb, rc = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))
-        volume = np.einsum("ij,ij->i", a, np.cross(b, c))
-        ab, bc, ca = (np.einsum("ij,ij->i", *pair) for pair in ((a, b), (b, c), (c, a)))
-        turns.append(abs(np.arctan2(volume, ra * rb * rc + ab * rc + bc * ra + ca * rb).sum()) / (2 * np.pi))
-    return bool(np.median(turns) > 0.5)
+    points = shell.triangles_center[:: max(1, len(shell.faces) // _POINTS)]
+    angles = [abs(solid_angles(other.triangles - point).sum()) for point in points]
+    return bool(np.median(angles) > 2 * np.pi)
 
 
 def components(pairs: NDArray[np.integer], members: Ints) -> list[Ints]:
