@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-
-import numpy as np
 
 from characterisation.files.errors import InputError
 from mitsim.sensor.drift import Drift, drift_modes
@@ -46,14 +43,10 @@ def with_drift(covariance: RigCovariance, sensor: Sensor, drift: Drift) -> RigCo
     possible = [name for name in parameter_names(sensor.rig) if name.rpartition(".")[0] in drifting]
     if sensor.technology == "time_of_flight":
         possible += PATH_NAMES
-    modes = [mode for mode in drift_modes(sensor.rig, tuple(possible), drift) if mode.sigma > 0]
-    moving = [name for mode in modes for name, value in mode.step.items() if value != 0]
-    names = tuple(dict.fromkeys((*covariance.names, *moving)))
-    count = len(covariance.names)
-    total = np.zeros((len(names), len(names)))
-    total[:count, :count] = covariance.covariance
-    for mode in modes:
-        step = np.array([mode.step.get(name, 0.0) for name in names])
-        total += mode.sigma**2 * np.outer(step, step)
+    modes = [
+        (mode.sigma**2, {name: value for name, value in mode.step.items() if value != 0})
+        for mode in drift_modes(sensor.rig, tuple(possible), drift)
+        if mode.sigma > 0
+    ]
     described = ", ".join(f"{name} {value:g}" for name, value in drift.numbers().items())
-    return replace(covariance, names=names, covariance=total, source=f"{covariance.source}; drift: {described}")
+    return covariance.plus(modes, f"drift: {described}")

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -76,6 +76,20 @@ class RigCovariance:
             sigma = [float(f"{value:{_ALIKE_SIGMA}}") for value in self.one_sigma.tolist()]
             content = np.array([*sigma, *(self.correlation.round(_ALIKE_CORRELATION) + 0.0).ravel()])
         return hashlib.sha256(content.tobytes()).hexdigest()
+
+    def plus(self, modes: Iterable[tuple[float, Mapping[str, float]]], source: str) -> RigCovariance:
+        """Return the covariance plus independent modes, each a variance and its changes of parameters by name.
+
+        Parameters that are not among ``names`` come last. ``source`` is added to that of the covariance.
+        """
+        modes = list(modes)
+        names = tuple(dict.fromkeys((*self.names, *(name for _, step in modes for name in step))))
+        total = np.zeros((len(names), len(names)))
+        total[: len(self.names), : len(self.names)] = self.covariance
+        for variance, step in modes:
+            changes = np.array([step.get(name, 0.0) for name in names])
+            total += variance * np.outer(changes, changes)
+        return replace(self, names=names, covariance=total, source=f"{self.source}; {source}")
 
     def draw(self, rng: np.random.Generator) -> NDArray[np.float64]:
         """Draw one deviation of all parameters from nominal, (n,), normally distributed.

@@ -94,15 +94,10 @@ def calibration_covariance(sensor: Sensor, table: CalibrationUnknowns, folder: P
 
 def with_temperature(covariance: RigCovariance, rig: Rig, table: TemperatureUnknowns) -> RigCovariance:
     """Return a covariance plus that of the sensor's temperature, which changes the eyes with errors as trials draw."""
-    step = dict.fromkeys(covariance.names, 0.0)
     errors_of = {name.partition(".")[0] for name in covariance.names}
     changes = zip(*warmed(rig, table, table.sensor_kelvin), strict=True)
-    step |= {name: float(value) for name, value in changes if name.partition(".")[0] in errors_of}
-    total = np.outer(list(step.values()), list(step.values()))
-    count = len(covariance.names)
-    total[:count, :count] += covariance.covariance
-    source = f"{covariance.source}; temperature of the sensor {table.sensor_kelvin:g} K"
-    return replace(covariance, names=tuple(step), covariance=total, source=source)
+    step = {name: float(value) for name, value in changes if name.partition(".")[0] in errors_of}
+    return covariance.plus([(1.0, step)], f"temperature of the sensor {table.sensor_kelvin:g} K")
 
 
 def _unscaled_covariance(sensor: Sensor, table: CalibrationUnknowns, folder: Path) -> RigCovariance:
