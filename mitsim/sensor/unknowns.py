@@ -84,6 +84,11 @@ class CalibrationUnknowns(Document):
             path_offset_mm=self.path_offset_mm,
         )
 
+    def of_kind(self, flight: bool) -> CalibrationUnknowns:
+        """Return the same without the drift that a sensor cannot have, with or without time of flight."""
+        own = FLIGHT_DRIFT if flight else TRIANGULATION_DRIFT
+        return self.model_copy(update=dict.fromkeys((TRIANGULATION_DRIFT | FLIGHT_DRIFT).keys() - own.keys(), 0.0))
+
     def drifting(self, flight: bool) -> list[str]:
         """Return the keys of the drift that a sensor has, with or without time of flight, and that is not zero."""
         keys = FLIGHT_DRIFT if flight else TRIANGULATION_DRIFT

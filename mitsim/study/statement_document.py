@@ -19,17 +19,19 @@ from mitsim.study.virtual.world import FRESH
 def statement_document(session: Session, stated: StatedView) -> dict[str, Any]:
     """Return the statement as JSON values; see docs/reference/formats/statement.md."""
     study, unknowns, view = session.study, session.unknowns, stated.view
+    flight = study.sensor.technology == "time_of_flight"
     declared = influences(
         unknowns.table,
         session.source,
         study.file.measure.light_path_depth,
         "coat" in unknowns.varied,
-        study.sensor.technology == "time_of_flight",
+        flight,
     )
     kelvin = {"expansion_per_kelvin": unknowns.expansion}
-    used: dict[str, Any] = {"temperature": unknowns.table.temperature.model_copy(update=kelvin)}
-    if study.sensor.technology != "time_of_flight":
-        used["calibration"] = unknowns.table.calibration.model_copy(update={"path_offset_mm": 0.0})
+    used = {
+        "temperature": unknowns.table.temperature.model_copy(update=kelvin),
+        "calibration": unknowns.table.calibration.of_kind(flight),
+    }
     exposed = {} if stated.planned is None else {"exposure": asdict(stated.planned)}
     return exposed | {
         "schema_version": 1,
