@@ -65,13 +65,29 @@ def arrays_of_npz(data: bytes, where: str | Path) -> dict[str, NDArray[Any]]:
     return out
 
 
+def arrays_in(data: bytes, where: Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an ``.npy`` or ``.npz`` file by name; that of the first has none.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    """
+    return {"": numbers_of_npy(data, where, tables=True)} if data.startswith(NPY_MAGIC) else arrays_of_npz(data, where)
+
+
 def map_in(data: bytes, where: Path, frame: int | None = None) -> NDArray[Any]:
-    """Return the points (rows, columns, 3), or else the depths (rows, columns), of an ``.npy`` or ``.npz`` file.
+    """Return the map in an ``.npy`` or ``.npz`` file (:func:`map_among`)."""
+    return map_among(arrays_in(data, where), where, frame)
+
+
+def map_among(arrays: dict[str, NDArray[Any]], where: Path, frame: int | None = None) -> NDArray[Any]:
+    """Return the points (rows, columns, 3), or else the depths (rows, columns), among arrays.
 
     Parameters
     ----------
-    data
-        Content of the file.
+    arrays
+        By name.
     where
         The file, for messages.
     frame
@@ -82,9 +98,6 @@ def map_in(data: bytes, where: Path, frame: int | None = None) -> NDArray[Any]:
     InputError
         If the file has neither, several arrays of depths of which none is named so, or no such frame.
     """
-    arrays = (
-        {"": numbers_of_npy(data, where, tables=True)} if data.startswith(NPY_MAGIC) else arrays_of_npz(data, where)
-    )
     arrays = _large(arrays)
     points = points_among(arrays, where)
     if points is not None and points.ndim == 3 and min(points.shape[:2]) > 1:

@@ -22,7 +22,7 @@ from mitsim.capture.decoding import Decoding
 from mitsim.capture.exr import EXR_MAGIC, exr_depths
 from mitsim.capture.grey_image import read_depths
 from mitsim.capture.npy import NPY_MAGIC
-from mitsim.capture.recordings.array_file import arrays_of_npz, disparities, is_disparity, map_in, unit_of_depths
+from mitsim.capture.recordings.array_file import arrays_in, disparities, is_disparity, map_among, unit_of_depths
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
 from mitsim.capture.recordings.cloud_numbers import FAR_BEYOND, FARTHEST_MM, METRES_UNDER, NEITHER_ABOVE
 from mitsim.capture.recordings.stated_scale import check_scale, stated_scales
@@ -158,14 +158,14 @@ def _levels(path: Path, frame: int | None) -> tuple[NDArray[Any], dict[str, floa
     Integers beyond 16 bits are floating point.
     """
     data = read_bounded(path, "a depth image")
-    of_numpy = data.startswith(NPY_MAGIC) or path.suffix.lower() == ".npz"
-    if of_numpy:
-        values: NDArray[Any] = map_in(data, path, frame)
+    arrays: dict[str, NDArray[Any]] = {}
+    if data.startswith(NPY_MAGIC) or path.suffix.lower() == ".npz":
+        arrays = arrays_in(data, path)
+        values = map_among(arrays, path, frame)
     else:
         values = exr_depths(path) if data.startswith(EXR_MAGIC) else read_depths(path)
     if values.ndim != 2 or not all(1 <= side <= LONGEST_SIDE_PX for side in values.shape):
         raise InputError(path, "shape", " x ".join(map(str, values.shape)), "depths of rows x columns")
-    arrays = arrays_of_npz(data, path) if of_numpy and not data.startswith(NPY_MAGIC) else {}
     if values.dtype.kind != "f" and values.dtype not in (np.uint8, np.uint16):
         values = values.astype(np.uint16 if values.min() >= 0 and values.max() < 1 << 16 else np.float64)
     return values, dict(stated_scales(arrays)), unit_of_depths(arrays)

@@ -37,7 +37,7 @@ def unread(path: Path) -> str:
     kind = path.suffix.lower()
     try:
         if kind in GLTF:
-            return _of_gltf(path.read_bytes())
+            return _of_gltf(_gltf_document(path))
         if kind == ".3mf":
             with zipfile.ZipFile(path) as package:
                 models = [package.read(name) for name in package.namelist() if name.lower().endswith(".model")]
@@ -56,10 +56,17 @@ def _of_3mf(models: list[bytes]) -> str:
     return "objects of one number in several files of the package" if mixed else ""
 
 
-def _of_gltf(data: bytes) -> str:
-    if data[:4] == b"glTF":  # the JSON is the first chunk
-        data = data[20 : 20 + int.from_bytes(data[12:16], "little")]
-    document: dict[str, Any] = json.loads(data)
+def _gltf_document(path: Path) -> dict[str, Any]:
+    """Return the JSON of a glTF file, without its triangles."""
+    with path.open("rb") as file:
+        head = file.read(20)
+        # of a binary file it is the first chunk, whose length the head states
+        rest = file.read(int.from_bytes(head[12:16], "little")) if head[:4] == b"glTF" else head + file.read()
+    document: dict[str, Any] = json.loads(rest)
+    return document
+
+
+def _of_gltf(document: dict[str, Any]) -> str:
     used = [name for name in _EXTENSIONS if name in document.get("extensionsUsed", ())]
     meshes, nodes = document.get("meshes", []), document.get("nodes", [])
     primitives = [primitive for mesh in meshes for primitive in mesh["primitives"]]
