@@ -37,6 +37,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from characterisation.acceptance.vdi_2634 import plane_distances
 from characterisation.coupon.patches import Coupon
@@ -210,6 +211,16 @@ def temporal_noise(clouds: Sequence[PointCloud]) -> Floats:
         mean = np.where(seen, distance, 0.0).sum(0) / count
         total = np.where(seen, distance - mean, 0.0) ** 2
         return np.where(count > 1, np.sqrt(total.sum(0) / (count - 1)), np.nan)
+
+
+def median_unbiased_noise(clouds: Sequence[PointCloud]) -> Floats:
+    """Return :func:`temporal_noise` (H, W) [mm], scaled so that its median is the deviation of normal noise.
+
+    The median of few values is lower: by a third for two captures, a ninth for four, under a hundredth for 40.
+    """
+    noise = temporal_noise(clouds)
+    freedom = np.sum([cloud.valid for cloud in clouds], axis=0) - 1
+    return np.asarray(noise / np.sqrt(chi2.median(np.maximum(freedom, 1)) / np.maximum(freedom, 1)))
 
 
 def local_planarity_precision(cloud: PointCloud, region: NDArray[np.bool_] | None = None) -> float:

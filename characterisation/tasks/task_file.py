@@ -32,6 +32,7 @@ LINE_ANGLES = ("plane_axis_angle", "axis_angle", "plane_angle")
 #: nominal values and limits this near to 0 or 90 deg lie there [mm or deg]; chosen: coordinates are rounded to 1e-4 mm,
 #: which turns a face of 10 mm by up to 1e-3 deg
 AT_FOLD = 1e-3
+
 FeatureKind = Literal["plane", "cylinder", "sphere", "cone", "circle", "edge_point", "intersection", "mid_plane"]
 Nominal = Surface | Circle | EdgePoint | Point
 
@@ -223,6 +224,11 @@ class Measurement(Document):
         return self.nominal + self.deviations[0], self.nominal + self.deviations[1]
 
 
+def _ends(tolerance: float | tuple[float, float]) -> tuple[float, float]:
+    """Return the lower and the upper deviation of a tolerance."""
+    return tolerance if isinstance(tolerance, tuple) else (-tolerance, tolerance)
+
+
 def effective_deviations(
     nominal: float, tolerance: float | tuple[float, float] | None
 ) -> tuple[float | None, float] | None:
@@ -232,7 +238,7 @@ def effective_deviations(
     """
     if tolerance is None:
         return None
-    lower, upper = tolerance if isinstance(tolerance, tuple) else (-tolerance, tolerance)
+    lower, upper = _ends(tolerance)
     return (lower if nominal + lower > AT_FOLD else None), upper
 
 
@@ -243,7 +249,7 @@ def tolerance_size(kind: str, nominal: float, tolerance: float | tuple[float, fl
     """
     if tolerance is None:
         return None
-    lower, upper = tolerance if isinstance(tolerance, tuple) else (-tolerance, tolerance)
+    lower, upper = _ends(tolerance)
     lowest, highest = nominal + lower, nominal + upper
     if lowest <= AT_FOLD < highest:
         return highest

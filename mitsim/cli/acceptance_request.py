@@ -12,19 +12,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from characterisation.acceptance.depth_quality import (
     global_planarity_trueness,
     local_planarity_precision,
     mean_depth_error,
+    median_unbiased_noise,
     plane_quality,
-    temporal_noise,
 )
 from characterisation.acceptance.range_uncertainty import flatness_uncertainty, form_error_uncertainty
 from characterisation.acceptance.vdi_2634 import flatness_error, probing_error, sphere_spacing_error
 from characterisation.coupon.patches import Coupon
-from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError, nearest
 from characterisation.point_cloud import PointCloud
 from characterisation.region_of_interest import Roi
@@ -143,7 +141,7 @@ def joint_figures(clouds: Sequence[PointCloud], artefacts: Artefacts) -> list[Re
         If there are fewer than two clouds, their grids differ in size, or a window does not lie in the grid.
     """
     out: list[Result] = []
-    noise = _unbiased_noise(clouds) if artefacts.planes else np.empty((0, 0))
+    noise = median_unbiased_noise(clouds) if artefacts.planes else np.empty((0, 0))
     for name, (window, distance) in artefacts.planes.items():
         inside = window_slices(window, clouds[0], name)
         region, known_noise = _mask(clouds[0], inside), noise[inside][np.isfinite(noise[inside])]
@@ -163,16 +161,6 @@ def joint_figures(clouds: Sequence[PointCloud], artefacts: Artefacts) -> list[Re
             error = mean_depth_error(clouds, _perpendicular_plane(clouds[0], distance), region)
             out.append(_figure_or_reason(f"{name} mean depth error", "%", error, "a cloud has too few points"))
     return out
-
-
-def _unbiased_noise(clouds: Sequence[PointCloud]) -> Floats:
-    """Return the temporal noise (H, W) [mm], scaled so that its median is the standard deviation for normal noise.
-
-    The median of few values is lower: by a third for two captures, a ninth for four, under a hundredth for 40.
-    """
-    noise = temporal_noise(clouds)
-    freedom = np.sum([cloud.valid for cloud in clouds], axis=0) - 1
-    return np.asarray(noise / np.sqrt(chi2.median(np.maximum(freedom, 1)) / np.maximum(freedom, 1)))
 
 
 def _plane_figures(
