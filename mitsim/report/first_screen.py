@@ -42,7 +42,7 @@ from mitsim.study.remedies.entries import remedies_in_words
 from mitsim.study.run_folder import Run
 from mitsim.study.scene_geometry import SceneGeometry
 from mitsim.study.statement_file import StatedMeasurement, StatementDocument
-from mitsim.views.view_scores import TOGETHER, apart_in_words
+from mitsim.views.no_view import TOGETHER, apart_in_words
 
 #: good: every tolerance fits; plain: there are no tolerances; warn: values are missing, or a verdict is open; bad: a
 #: tolerance does not fit, or a set of views exceeds a limit

@@ -61,7 +61,7 @@ from mitsim.study.virtual.plan import measured_by
 from mitsim.study.virtual.race import ALL, Raced, in_words
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.stated import StatedView
-from mitsim.views.view_scores import not_scored_in_words
+from mitsim.views.scoring_time import not_scored_in_words
 
 #: number of best views per measurement whose predicted clouds are written to the run folder
 SHOWN = 3

@@ -27,7 +27,7 @@ from mitsim.study.scoring import write_inputs, write_raced
 from mitsim.study.session import Session
 from mitsim.study.virtual.race import ALL, Raced
 from mitsim.study.virtual.stated import compared
-from mitsim.views.view_scores import not_scored_in_words
+from mitsim.views.scoring_time import not_scored_in_words
 
 #: number of runners-up in the record of a run
 RUNNERS_UP = 5

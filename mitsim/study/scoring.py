@@ -38,7 +38,7 @@ from mitsim.study.view_sets.confirmed_set import Search, joining_in_words
 from mitsim.study.virtual.race import Raced
 from mitsim.study.virtual.race_tables import raced_errors, with_race
 from mitsim.views import write_views
-from mitsim.views.view_scores import TOGETHER, apart_in_words
+from mitsim.views.no_view import TOGETHER, apart_in_words
 
 
 def score_study(

@@ -1,4 +1,4 @@
-"""Say why no view can make a measurement: which shape, how many points are expected of it, and what takes the others.
+"""Say why no view can make a measurement, or all: which shape, how many points are expected of it, what takes the rest.
 
 Signal chain: expected points of each shape from each view, in its finish and in matt white, with the part around it and
 without -> the shapes that have too few from every view -> the cause that takes most of them, in words.
@@ -12,11 +12,15 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from characterisation.statements.verdict_words import named
 from mitsim.running.numbers import listed
 from mitsim.views.view_scores import OCCLUDED
 
 #: share of the points in matt white below which the finish is a cause of their loss
 _DULL = 0.75
+
+#: what to do if no view can make all measurements
+TOGETHER = "The table [set] of a study finds the fewest views that measure together"
 
 
 def why_no_view(scores: xr.Dataset, measurement: str, shapes: Sequence[str]) -> str:
@@ -73,3 +77,19 @@ def _cause(scores: xr.Dataset, name: str, points: NDArray[np.float64], needed: f
     if white < needed or white < OCCLUDED * alone:
         return ": other faces hide it, or their light disturbs it"
     return ": its finish returns too little light to the sensor" if points[best] < _DULL * white else ""
+
+
+def apart_in_words(scores: xr.Dataset) -> str:
+    """Return which view can make the most measurements, if none can make all; empty otherwise, and for a single one."""
+    possible = scores["uncertainty_possible"].values
+    if len(possible) < 2 or possible.all(axis=0).any():
+        return ""
+    if not possible.any():
+        return f"no view can make any of the {len(possible)} measurements"
+    most = int(possible.sum(axis=0).argmax())
+    names = scores["measurement"].values[~possible.any(axis=1)].tolist()
+    never = f"; no view can make {named(names)}" if names else ""
+    return (
+        f"no single view can make all {len(possible)} measurements: "
+        f"view {int(scores['view'][most])} can make the most, {int(possible[:, most].sum())}{never}"
+    )

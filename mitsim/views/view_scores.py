@@ -24,7 +24,6 @@ from characterisation.features.robust_fit import FitError
 from characterisation.files.arrays import Floats
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.scores.view_score import rank_views, score_views, view_statistics
-from characterisation.statements.verdict_words import named
 from characterisation.tasks.covariance import LEAST_CHANCE, ExpectedPoints
 from characterisation.tasks.measurement_model import InputQuantity
 from characterisation.tasks.prediction import (
@@ -48,12 +47,13 @@ from mitsim.maps.prediction import (
     performance,
     together,
 )
-from mitsim.running.progress import say, track
+from mitsim.running.progress import track
 from mitsim.running.time_limit import TimeLimit, in_time
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
 from mitsim.sensor.transforms import Transform
 from mitsim.views import View
+from mitsim.views.scoring_time import FEWEST_VIEWS, TIMED_VIEWS, say_expected, scoring_order
 
 __all__ = ["LEAST_CHANCE", "MATT_WHITE", "score_candidates", "with_poses"]
 
@@ -64,12 +64,6 @@ RAYS = 40_000
 
 #: statistics of V_m in :class:`_ViewScore`, in the order of :func:`view_statistics`
 _STATISTICS = ("n", "sigma", "n_white", "sigma_white", "n_only")
-
-#: fewest views that are scored within a limit of time: as many as the corners of an icosahedron
-FEWEST_VIEWS = 12
-
-#: views after which the time of the screening is told; chosen
-_TIMED_VIEWS = 3
 
 #: R_f below which a lack of points is attributed to occlusion
 OCCLUDED = 0.75
@@ -173,8 +167,8 @@ def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above 
     scoring = track(one_ahead(in_limit, cast, score), "score views", len(views))
     for (_, view_score), index in zip(scoring, order, strict=False):
         by_index[index] = view_score
-        if len(by_index) == _TIMED_VIEWS:
-            _say_expected((time.monotonic() - began) / _TIMED_VIEWS, limit, len(views))
+        if len(by_index) == TIMED_VIEWS:
+            say_expected((time.monotonic() - began) / TIMED_VIEWS, limit, len(views))
     scored = [by_index.get(index) or _not_scored(by_index[order[0]]) for index in range(len(views))]
     columns = (np.array([getattr(view_score, key) for view_score in scored]) for key in _STATISTICS)
     statistics = view_statistics(names, *columns)
@@ -216,58 +210,6 @@ def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above 
     scores["tolerance"] = ("measurement", tolerances, {"units": "mm or deg"})
     scores["unit"] = ("measurement", [m.unit for m in measurements])
     return with_poses(scores, views), [view_score.inputs for view_score in scored]
-
-
-def _say_expected(each_s: float, limit: TimeLimit, views: int) -> None:
-    """Say how many views there will be time for, if not for all, from the time that a view takes."""
-    if limit.left < each_s * (views - _TIMED_VIEWS):
-        count = max(FEWEST_VIEWS, _TIMED_VIEWS + int(limit.left / each_s))
-        say(f"a view takes {each_s:.1f} s: about {count} of {views} views are screened, in {each_s * count:.0f} s")
-
-
-def not_scored_in_words(scores: xr.Dataset) -> str:
-    """Return how many views were scored within a limit of time; empty if all were."""
-    scored, views = int(scores.attrs.get("views_scored", scores.sizes["view"])), scores.sizes["view"]
-    return f"only {scored} of {views} views screened, for lack of time" if scored < views else ""
-
-
-#: what to do if no view can make all measurements
-TOGETHER = "The table [set] of a study finds the fewest views that measure together"
-
-
-def apart_in_words(scores: xr.Dataset) -> str:
-    """Return which view can make the most measurements, if none can make all; empty otherwise, and for a single one."""
-    possible = scores["uncertainty_possible"].values
-    if len(possible) < 2 or possible.all(axis=0).any():
-        return ""
-    if not possible.any():
-        return f"no view can make any of the {len(possible)} measurements"
-    most = int(possible.sum(axis=0).argmax())
-    names = scores["measurement"].values[~possible.any(axis=1)].tolist()
-    never = f"; no view can make {named(names)}" if names else ""
-    return (
-        f"no single view can make all {len(possible)} measurements: "
-        f"view {int(scores['view'][most])} can make the most, {int(possible[:, most].sum())}{never}"
-    )
-
-
-def scoring_order(views: Sequence[View], limit: TimeLimit | None) -> list[int]:
-    """Return the indices of views in the order in which they are scored: far apart if time may not suffice for all."""
-    return list(range(len(views))) if limit is None or limit.end is None else _far_apart(views)
-
-
-def _far_apart(views: Sequence[View]) -> list[int]:
-    """Return the indices of all views, each as far as possible from those before it in direction, roll and distance."""
-    poses = [view.world_from_sensor.matrix() for view in views]
-    reach = max(float(np.linalg.norm(pose[:3, 3])) for pose in poses)
-    rows = np.array([[*pose[:3, :3].ravel(), *(pose[:3, 3] / reach)] for pose in poses])
-    order, nearest = [0], np.linalg.norm(rows - rows[0], axis=1)
-    nearest[0] = -1.0
-    while len(order) < len(rows):
-        order.append(int(nearest.argmax()))
-        nearest = np.minimum(nearest, np.linalg.norm(rows - rows[order[-1]], axis=1))
-        nearest[order[-1]] = -1.0
-    return order
 
 
 def _not_scored(like: _ViewScore) -> _ViewScore:

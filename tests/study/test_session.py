@@ -23,7 +23,7 @@ from mitsim.study.virtual import stated as state
 from mitsim.study.virtual.screening import effects_of
 from mitsim.study.virtual.stated import BATCH, MOST, TrialsOfView, batches
 from mitsim.study.virtual.trials import Outcome
-from mitsim.views.view_scores import FEWEST_VIEWS, not_scored_in_words
+from mitsim.views.scoring_time import FEWEST_VIEWS, not_scored_in_words
 from tests.smaller_sensors import coarse_sensor
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"

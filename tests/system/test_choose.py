@@ -15,7 +15,7 @@ from mitsim.running.time_limit import TimeLimit
 from mitsim.study.choose import choose_sensor, read_candidates
 from mitsim.study.choose.table import document
 from mitsim.study.session import Session
-from mitsim.views.view_scores import FEWEST_VIEWS
+from mitsim.views.scoring_time import FEWEST_VIEWS
 from tests import shell
 from tests.small_study import MEASUREMENTS, few_measurements
 from tests.smaller_sensors import coarse_sensor

@@ -3,7 +3,7 @@
 import numpy as np
 import xarray as xr
 
-from mitsim.views.view_scores import apart_in_words
+from mitsim.views.no_view import apart_in_words
 
 
 def _scores(possible):

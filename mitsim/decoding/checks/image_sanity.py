@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
 from mitsim.decoding.checks.code_lines import CodeLines, line_slices, lines_of
-from mitsim.decoding.checks.fringe_origin import origin_in_words, stripe_edges
+from mitsim.decoding.checks.fringe_edges import stripe_edges
+from mitsim.decoding.checks.fringe_origin import origin_in_words
 from mitsim.decoding.checks.fringe_steps import copies_in_words, steps_in_words
 from mitsim.decoding.checks.fringe_wave import wave_in_words
 from mitsim.decoding.checks.gray_origin import beyond_in_words

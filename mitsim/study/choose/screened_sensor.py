@@ -22,7 +22,8 @@ from mitsim.study.choose.sensor_result import SensorResult
 from mitsim.study.screened_errors import screened_errors, stated_shares
 from mitsim.study.session import Session
 from mitsim.study.virtual.plan import map_digest, trial_digest
-from mitsim.views.view_scores import not_scored_in_words, screening_risk
+from mitsim.views.scoring_time import not_scored_in_words
+from mitsim.views.view_scores import screening_risk
 
 #: a sensor with views left out is screened again if its share of the time is longer than before by this factor
 _LONGER = 1.5

@@ -39,7 +39,7 @@ from mitsim.study.choose.sensor_result import SensorResult
 from mitsim.study.screened_errors import screened_errors
 from mitsim.study.virtual.plan import map_digest
 from mitsim.views.no_view import why_no_view
-from mitsim.views.view_scores import not_scored_in_words
+from mitsim.views.scoring_time import not_scored_in_words
 
 
 def document(

@@ -27,7 +27,8 @@ from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.study.calibration.accuracy import measured_points
 from mitsim.study.virtual.study_unknowns import study_unknowns
 from mitsim.study.virtual.world import Unknowns, warmed
-from mitsim.views.view_scores import score_candidates, scoring_order
+from mitsim.views.scoring_time import scoring_order
+from mitsim.views.view_scores import score_candidates
 
 #: number of places along each axis of the box around a part for which displacements are computed; chosen
 _RASTER = 4
