@@ -15,6 +15,7 @@ from mitsim.capture.recordings.calibration_file import read_calibration
 from mitsim.sensor.calibration_qualifiers import ReadOut, check_intrinsics, of_images
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.preset import load_sensor
+from tests.sensor.opencv_files import opencv_file
 
 K = np.array([[600.0, 0, 322.3], [0, 601.2, 241.7], [0, 0, 1]])
 K2 = np.array([[598.0, 0, 318.9], [0, 599.0, 238.2], [0, 0, 1]])
@@ -322,24 +323,16 @@ def test_of_several_cameras_of_matlab_none_is_taken_unasked(tmp_path):
 # --- units and warnings
 
 
-def opencv(path, **values):
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    for name, value in values.items():
-        storage.write(name, value)
-    storage.release()
-    return path
-
-
 def test_units_of_length(tmp_path):
     pair = {"K1": K, "D1": D, "K2": K2, "D2": D, "R": R}
-    read = read_calibration(opencv(tmp_path / "a.yml", **pair, T=T), SIZE)
+    read = read_calibration(opencv_file(tmp_path / "a.yml", **pair, T=T), SIZE)
     assert read.notes == ()
-    read = read_calibration(opencv(tmp_path / "b.yml", **pair, T=T / 1000), SIZE)
+    read = read_calibration(opencv_file(tmp_path / "b.yml", **pair, T=T / 1000), SIZE)
     assert "right stands 0.06 mm from the first camera" in read.notes[0] and "to_mm = 1000" in read.notes[0]
-    read = read_calibration(opencv(tmp_path / "c.yml", **pair, T=T / 25.4, unit="inch"), SIZE)
+    read = read_calibration(opencv_file(tmp_path / "c.yml", **pair, T=T / 25.4, unit="inch"), SIZE)
     sees(read.rig.cameras["right"], K2, D, R, T)
     with pytest.raises(InputError, match=r"unit: found 'furlong'; allowed: .*to_mm"):
-        read_calibration(opencv(tmp_path / "d.yml", **pair, T=T, unit="furlong"), SIZE)
+        read_calibration(opencv_file(tmp_path / "d.yml", **pair, T=T, unit="furlong"), SIZE)
     text = '[calibration]\nfile = "c.yml"\ncameras = ["left", "right"]\nprojector = false\nto_mm = 1\n'
     (tmp_path / "my.toml").write_text(text)
     assert "to_mm = 1 is used, though the file states 25.4 mm" in read_calibration(tmp_path / "my.toml", SIZE).notes[0]
@@ -347,13 +340,13 @@ def test_units_of_length(tmp_path):
 
 @pytest.mark.parametrize("name", ["dist_coeff", "dist_coeffs", "distortion_coeffs"])
 def test_names_of_distortion(tmp_path, name):
-    read = read_calibration(opencv(tmp_path / "a.yml", camera_matrix=K, **{name: D}), SIZE)
+    read = read_calibration(opencv_file(tmp_path / "a.yml", camera_matrix=K, **{name: D}), SIZE)
     sees(read.rig.reference, K, D)
     assert read.notes == ()
 
 
 def test_names_of_a_projector_of_three_letters(tmp_path):
-    opencv(tmp_path / "a.yml", cam_K=K, cam_kc=D, pro_K=K2, pro_kc=-D, pro_size=np.array([912, 570]), R=R, T=T)
+    opencv_file(tmp_path / "a.yml", cam_K=K, cam_kc=D, pro_K=K2, pro_kc=-D, pro_size=np.array([912, 570]), R=R, T=T)
     (tmp_path / "my.toml").write_text(
         'name = "rig"\ntechnology = "structured_light"\n[calibration]\nfile = "a.yml"\n[pattern]\nkind = "gray_code"\n'
         "[decoder]\n"
@@ -377,7 +370,7 @@ def test_dotted_names_and_maps_are_read_or_named(tmp_path):
 
 def test_a_bad_value_of_the_second_camera_is_told(tmp_path):
     """Before, the pair was read as one camera."""
-    path = opencv(tmp_path / "a.yml", K1=K, K2=K2, R=2 * R, T=T)
+    path = opencv_file(tmp_path / "a.yml", K1=K, K2=K2, R=2 * R, T=T)
     with pytest.raises(InputError, match="rotation of right"):
         read_calibration(path, SIZE)
 

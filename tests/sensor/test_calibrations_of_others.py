@@ -12,6 +12,7 @@ from scipy.io import savemat
 from characterisation.files.errors import InputError
 from mitsim.sensor.calibration_tree import read_tree
 from mitsim.sensor.preset import load_sensor
+from tests.sensor.opencv_files import opencv_file
 
 K1 = np.array([[900.5, 0, 317.2], [0, 901.25, 241.4], [0, 0, 1]])
 K2 = np.array([[1250.0, 0, 455.5], [0, 1251.0, 300.0], [0, 0, 1]])
@@ -47,13 +48,6 @@ kind = "gray_code"
 """
 
 
-def storage(path, **values):
-    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    for name, value in values.items():
-        file.write(name, value)
-    file.release()
-
-
 def loaded(folder, text, file, size=(640, 480), more=""):
     (folder / "my.toml").write_text(text.replace("FILE", file) + more, encoding="utf-8")
     return load_sensor(folder / "my.toml", "decoding", size)
@@ -70,9 +64,9 @@ def is_the_rig(rig, second, distortion=D2):
 
 def test_the_pair_of_files_of_opencvs_sample(tmp_path):
     """intrinsics.yml and extrinsics.yml of stereo_calib: no size, which the images have."""
-    storage(tmp_path / "intrinsics.yml", M1=K1, D1=D1, M2=K2, D2=D2)
+    opencv_file(tmp_path / "intrinsics.yml", M1=K1, D1=D1, M2=K2, D2=D2)
     beside = {"R1": R, "R2": R, "P1": np.eye(3, 4), "P2": np.eye(3, 4), "Q": np.eye(4)}
-    storage(tmp_path / "extrinsics.yml", R=R, T=T.reshape(3, 1), **beside)
+    opencv_file(tmp_path / "extrinsics.yml", R=R, T=T.reshape(3, 1), **beside)
     found = loaded(tmp_path, PAIR, '["intrinsics.yml", "extrinsics.yml"]')
     is_the_rig(found.rig, found.rig.cameras["right"])
     assert (found.rig.reference.width, found.rig.reference.height) == (640, 480)
@@ -158,14 +152,14 @@ def test_a_structure_of_the_vision_toolbox(tmp_path):
 
 def test_names_that_go_together_are_found_together(tmp_path):
     """``matrix = "Kc"`` alone made the distortion zero in silence."""
-    storage(tmp_path / "c.yml", Kc=K1, kc=D1, Kp=K2, kp=D2, R=R, T=T, cam_size=np.array([640, 480]))
+    opencv_file(tmp_path / "c.yml", Kc=K1, kc=D1, Kp=K2, kp=D2, R=R, T=T, cam_size=np.array([640, 480]))
     found = loaded(tmp_path, ALONE, '"c.yml"', size=None, more='\n[calibration.keys.camera]\nmatrix = "Kc"\n')
     is_the_rig(found.rig, found.rig.projector)
     assert found.notes == ()
 
 
 def test_what_is_left_unread_is_said(tmp_path):
-    storage(tmp_path / "c.yml", Kc=K1, my_lens=D1, Kp=K2, kp=D2, R=R, T=T, E=R, rms=0.2, R1=R, fc_error=D2)
+    opencv_file(tmp_path / "c.yml", Kc=K1, my_lens=D1, Kp=K2, kp=D2, R=R, T=T, E=R, rms=0.2, R1=R, fc_error=D2)
     found = loaded(tmp_path, ALONE, '"c.yml"')
     assert found.notes == (
         "calibration c.yml: values not read: my_lens; camera without distortion. If it belongs to the rig, name it in "
@@ -185,13 +179,13 @@ def test_numpy_and_ros(tmp_path):
         f"camera_matrix:\n  rows: 3\n  cols: 3\n  data: {K1.ravel().tolist()}\ndistortion_model: plumb_bob\n"
         f"distortion_coefficients:\n  rows: 1\n  cols: 5\n  data: {D1.tolist()}\n"
     )
-    storage(tmp_path / "beamer.yml", Kp=K2, kp=D2, R=OM, T=T)
+    opencv_file(tmp_path / "beamer.yml", Kp=K2, kp=D2, R=OM, T=T)
     found = loaded(tmp_path, ALONE, '["left.yaml", "beamer.yml"]', size=None)
     is_the_rig(found.rig, found.rig.projector)
 
 
 def test_all_that_a_calibration_lacks_comes_in_one_message(tmp_path):
-    storage(tmp_path / "c.yml", A=K1, dist=D1, B=K2)
+    opencv_file(tmp_path / "c.yml", A=K1, dist=D1, B=K2)
     with pytest.raises(
         InputError,
         match=r"matrix of camera, the matrix of projector, the rotation of projector, the "
@@ -202,7 +196,7 @@ def test_all_that_a_calibration_lacks_comes_in_one_message(tmp_path):
 
 def test_a_second_camera_is_not_taken_for_the_projector(tmp_path):
     """R and T of two cameras, and a projector calibrated beside them under its own names."""
-    storage(tmp_path / "c.yml", M1=K1, D1=D1, M2=K2, D2=D2, R=R, T=T, Kp=K2, kp=D2, proj_R=R.T, proj_T=-T)
+    opencv_file(tmp_path / "c.yml", M1=K1, D1=D1, M2=K2, D2=D2, R=R, T=T, Kp=K2, kp=D2, proj_R=R.T, proj_T=-T)
     text = PAIR.replace("projector = false\n", "")
     rig = loaded(tmp_path, text, '"c.yml"').rig
     is_the_rig(rig, rig.cameras["right"])
@@ -219,7 +213,7 @@ def test_files_that_are_nothing_are_refused(tmp_path, name):
 
 def test_a_packed_calibration_that_is_cut_off_is_refused(tmp_path):
     """Its first half is YAML too, without the distortion."""
-    storage(tmp_path / "c.yml", A=K1, dist=D1)
+    opencv_file(tmp_path / "c.yml", A=K1, dist=D1)
     packed = gzip.compress((tmp_path / "c.yml").read_bytes())
     (tmp_path / "c.yml.gz").write_bytes(packed)
     assert read_tree([tmp_path / "c.yml.gz"]).names() == ["A", "dist"]

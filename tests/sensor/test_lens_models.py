@@ -10,19 +10,12 @@ import pytest
 
 from characterisation.files.errors import InputError
 from mitsim.capture.recordings.calibration_file import read_calibration
+from tests.sensor.opencv_files import opencv_file
 
 K = np.array([[600.0, 0, 322.0], [0, 602.0, 238.0], [0, 0, 1]])
 BENT = np.array([0.01, -0.005, 0.002, -0.001])  # too small to raise a doubt by themselves
 POINTS = np.random.default_rng(1).uniform([-120, -90, 400], [120, 90, 800], (50, 3))
 SIZE = (640, 480)
-
-
-def storage(path, **values):
-    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    for name, value in values.items():
-        file.write(name, value)
-    file.release()
-    return path
 
 
 def single(path, **more):
@@ -41,7 +34,7 @@ def is_fisheye(path):
 def test_opencvs_sample_marks_a_fisheye_lens(tmp_path, suffix, fisheye):
     """Its saveCameraParams writes fisheye_model; the coefficients were those of a perspective lens, 4.6 px off."""
     values = {"camera_matrix": K, "distortion_coefficients": BENT.reshape(4, 1)}
-    path = storage(tmp_path / f"a{suffix}", fisheye_model=fisheye, **values)
+    path = opencv_file(tmp_path / f"a{suffix}", fisheye_model=fisheye, **values)
     if fisheye:
         is_fisheye(path)
         return
@@ -98,7 +91,7 @@ def test_the_unified_model_of_two_cameras_is_refused(tmp_path):
     second = {"camera_matrix_2": K, "distortion_coefficients_2": bent, "xi_2": 1.2}
     pose = {"rotation": np.array([0.0, 0.1, 0.0]), "translation": np.array([-120.0, 0, 0])}
     with pytest.raises(InputError, match=r"xi_1: found 1\.2"):
-        read_calibration(storage(tmp_path / "a.yml", **first, **second, **pose), SIZE)
+        read_calibration(opencv_file(tmp_path / "a.yml", **first, **second, **pose), SIZE)
 
 
 @pytest.mark.parametrize("device", ["OmniVision OV9281", "DS-2CD2143", "RealSense D435", "Basler acA1920 FOV60"])

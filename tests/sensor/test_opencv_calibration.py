@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.files.errors import InputError
 from mitsim.sensor.preset import load_sensor
+from tests.sensor.opencv_files import opencv_file
 
 FRINGES = (Path(__file__).parents[1] / "data/fringes.toml").read_text(encoding="utf-8")
 K = np.array([[900.5, 0, 317.2], [0, 901.25, 241.4], [0, 0, 1]])
@@ -32,13 +33,6 @@ USUAL = {
 }
 
 
-def write(path, values):
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    for name, value in values.items():
-        storage.write(name, value)
-    storage.release()
-
-
 def sensor_text(table='file = "calib.yml"'):
     """The file of tests/data without its optics, and with a calibration."""
     head, _, rest = FRINGES.partition("[cameras.camera]")
@@ -47,7 +41,7 @@ def sensor_text(table='file = "calib.yml"'):
 
 
 def loaded(folder, values=USUAL, name="calib.yml", table=None):
-    write(folder / name, values)
+    opencv_file(folder / name, **values)
     (folder / "my.toml").write_text(sensor_text(table or f'file = "{name}"'), encoding="utf-8")
     return load_sensor(folder / "my.toml")
 
@@ -103,7 +97,7 @@ translation = "beamer.pose.t"
 
 def test_two_cameras_and_a_projector_of_ones_own(tmp_path):
     """A stereo calibration under OpenCV's sample's names; the projector is not in it."""
-    write(tmp_path / "stereo.yml", {"M1": K, "D1": D, "M2": K, "D2": D, "R": R, "T": T})
+    opencv_file(tmp_path / "stereo.yml", M1=K, D1=D, M2=K, D2=D, R=R, T=T)
     head, _, rest = FRINGES.partition("[cameras.camera]")
     _, projector = rest.split("[projector]")
     table = '[calibration]\nfile = "stereo.yml"\ncameras = ["left", "right"]\nprojector = false\n'

@@ -113,6 +113,12 @@ def test_nobody_else_gets_the_page_or_writes_files(served, folder):
     assert (folder / "made" / "made.xml").read_text().startswith("<!-- Made from bracket.step")
 
 
+def page_of(made, browser):
+    """Write the page of a scene folder by mitsim check, and open it."""
+    mitsim_here("check", made / "made.xml", "--task", made / "task.toml", "--html", made.parent / "page.html")
+    return Author(browser, (made.parent / "page.html").as_uri())
+
+
 @needs_step
 @pytest.mark.parametrize("scheme", [pytest.param("light", marks=in_browser)])
 def test_a_bracket_from_step_to_a_study_without_an_editor(served, folder, browser, scheme):
@@ -231,8 +237,7 @@ def test_rules_and_features_that_the_page_does_not_show_are_kept(step_file, step
         "tolerance = [-0.1, 0]\ndecision = { guard_share = 0.1 }\n"
     )
     (made / "task.toml").write_text((made / "task.toml").read_text() + own)
-    mitsim_here("check", made / "made.xml", "--task", made / "task.toml", "--html", tmp_path / "page.html")
-    page = Author(browser, (tmp_path / "page.html").as_uri())
+    page = page_of(made, browser)
     page.choose("left")
     page.type("#author-name", "side")
     written = tomllib.loads(page.downloaded()[1])
@@ -248,8 +253,7 @@ def test_rules_and_features_that_the_page_does_not_show_are_kept(step_file, step
 def test_rims_tolerance_classes_and_a_coat_are_given_by_a_click(step_file, step_here, browser, tmp_path):
     made = tmp_path / "made"
     mitsim_here("part", step_file, "-o", made)
-    mitsim_here("check", made / "made.xml", "--task", made / "task.toml", "--html", tmp_path / "page.html")
-    page = Author(browser, (tmp_path / "page.html").as_uri())
+    page = page_of(made, browser)
 
     page.choose("bore_12mm_left", "top_at_z12mm")
     browser.tell("document.getElementById('author-rim').click()")
@@ -307,8 +311,7 @@ def test_the_plane_midway_between_the_sides_of_a_wall_is_measured(step_file, ste
     """The wall lies between y = 18 and 30 mm, and the base between -30 and 30 mm."""
     made = tmp_path / "made"
     mitsim_here("part", step_file, "-o", made)
-    mitsim_here("check", made / "made.xml", "--task", made / "task.toml", "--html", tmp_path / "page.html")
-    page = Author(browser, (tmp_path / "page.html").as_uri())
+    page = page_of(made, browser)
     kinds = "[...document.getElementById('author-kind').options].map((one) => one.value)"
     page.choose("front_at_y18mm", "top")
     assert browser.tell("document.getElementById('author-midway')") is None
@@ -354,8 +357,7 @@ def test_general_tolerances_go_by_sides_and_legs_not_by_the_box(step_here, brows
     plate = BRepBuilderAPI_Transform(chamfered.Shape(), motion).Shape()
     made = tmp_path / "made"
     mitsim_here("part", write_step([("plate", plate, None)], tmp_path / "plate.step"), "-o", made)
-    mitsim_here("check", made / "made.xml", "--task", made / "task.toml", "--html", tmp_path / "page.html")
-    page = Author(browser, (tmp_path / "page.html").as_uri())
+    page = page_of(made, browser)
     normals = {
         name: one["direction"] for name, one in tomllib.loads((made / "task.toml").read_text())["features"].items()
     }
