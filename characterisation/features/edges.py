@@ -62,17 +62,17 @@ class Crossings(NamedTuple):
     - ``spread`` [mm]: expected standard deviation of one point along its row or column.
     - ``fraction``: F of the face beside the edge.
     - ``shared`` [mm]: common displacement of all points by one standard error of F.
-    - ``lines`` (n,): number of the column (or row) beside which each lies, by which an edge along one is recognised.
+    - ``steps`` (n, 3) [mm] on the plane, to the next pixel of its row or column.
     """
 
     points: Array
     spread: float
     fraction: float
     shared: float
-    lines: NDArray[np.int64]
+    steps: Array
 
 
-_NONE = Crossings(np.empty((0, 3)), 0.0, 0.0, 0.0, np.empty(0, np.int64))
+_NONE = Crossings(np.empty((0, 3)), 0.0, 0.0, 0.0, np.empty((0, 3)))
 
 
 def fit_circle(cloud: PointCloud, plane: PlaneFit, nominal: Circle, near: float | None = None) -> CircleFit:
@@ -121,9 +121,8 @@ def fit_edge_point(
 ) -> EdgePointFit:
     """Fit the point where a line in a plane crosses the edge of the face.
 
-    The sampling error of an edge along a row of pixels is the same in all crossings. The variance is therefore at least
-    d^2 / (12 k^2), regardless of their number. Here d is the spacing of the pixels along the line, and k the number of
-    rows or columns that the edge crosses.
+    The sampling errors of its crossings are not independent, since the angle of the edge to the pixels relates them
+    (:func:`_straight_covariance`): along a row or at 45 deg all are the same, at most other angles they nearly cancel.
 
     Parameters
     ----------
@@ -143,11 +142,12 @@ def fit_edge_point(
     crossings = _crossings(cloud, plane, nominal, near, reach)
     edge, kept = _fit(nominal, crossings)
     edge = edge.seen_from(cloud.grid.origin)
-    residual, jacobian, _ = edge.linearised(np.zeros(2), crossings.points[kept])
-    covariance, residual_std, count = covariance_of(residual, jacobian, edge.kind)
-    pitch = _pitch(cloud, edge)
-    floor = pitch**2 / 12 / len(np.unique(crossings.lines[kept])) ** 2
-    covariance[0, 0] = max(covariance[0, 0], floor) + crossings.shared**2
+    points, steps = crossings.points[kept], crossings.steps[kept]
+    residual, jacobian, _ = edge.linearised(np.zeros(2), points)
+    _, residual_std, count = covariance_of(residual, jacobian, edge.kind)
+    pitch = edge.linearised(np.zeros(2), points + steps)[0] - residual
+    covariance = _straight_covariance(residual, jacobian, pitch)
+    covariance[0, 0] += crossings.shared**2
     fit = EdgePointFit(edge.point, edge.direction, edge.normal, edge.slope, edge.ray, covariance, residual_std, count)
     check_figure(fit, nominal, reach)
     return fit
@@ -174,14 +174,12 @@ def _fit(nominal: Figure, crossings: Crossings) -> tuple[Figure, NDArray[np.bool
 class _Ends(NamedTuple):
     """Places where the face ends along rows or columns.
 
-    ``last`` (k, 3) [mm] is the last place on the face, ``following`` (k, 3) that of the next pixel. ``line`` (k,) is
-    the number of the column (or row) of the last. ``deeper`` is the
+    ``last`` (k, 3) [mm] is the last place on the face, ``following`` (k, 3) that of the next pixel. ``deeper`` is the
     number of pixels deeper in the face, ``shown`` that of those which show it.
     """
 
     last: Array
     following: Array
-    line: NDArray[np.int64]
     shown: int
     deeper: int
 
@@ -211,12 +209,12 @@ def _crossings(
     if len(last) == 0 or shown == 0:
         return _NONE
     fraction = shown / deeper
-    positions = last + (0.5 + (1 - fraction) / fraction) * (following - last)
-    pitch = float(np.median(np.linalg.norm(following - last, axis=1)))
+    steps = following - last
+    positions = last + (0.5 + (1 - fraction) / fraction) * steps
+    pitch = float(np.median(np.linalg.norm(steps, axis=1)))
     spread = float(pitch * np.sqrt(1 / 12 + (1 - fraction) / fraction**2))
     shared = float(pitch * np.sqrt(ACROSS_THE_EDGE * fraction * (1 - fraction) / deeper) / fraction**2)
-    lines = np.concatenate([2 * along_rows.line, 2 * along_columns.line + 1])
-    return Crossings(positions, spread, fraction, shared, lines)
+    return Crossings(positions, spread, fraction, shared, steps)
 
 
 def _ends(
@@ -251,7 +249,6 @@ def _ends(
     return _Ends(
         points[row[last], column[last]],
         points[row[last], next_column],
-        column[last].astype(np.int64),
         int((shows & deeper).sum()),
         int(deeper.sum()),
     )
@@ -290,7 +287,21 @@ def _window(cloud: PointCloud, figure: Circle | EdgePoint, reach: float) -> tupl
     return rows, columns
 
 
-def _pitch(cloud: PointCloud, edge: EdgePoint) -> float:
-    """Return the length [mm] along the line of a pixel of its row or column, whichever is closer to the line."""
-    here, there = cloud.grid.project(np.stack([edge.point, edge.point + edge.direction]))
-    return float(1.0 / np.abs(there - here).max())
+def _straight_covariance(residual: Array, jacobian: Array, pitch: Array) -> Array:
+    """Return the covariance (2, 2) of a straight edge through crossings with residuals (n,) [mm], derivatives (n, 2).
+
+    Where the edge lies between two pixels a ``pitch`` (n,) [mm] apart is uniform, but the same for all crossings: they
+    differ by their residuals r = pitch p. The errors of two crossings, over all places of the edge, have the covariance
+
+        d_i d_j (1/12 - t (1 - t) / 2),      t = p_i - p_j modulo 1
+
+    The remaining variance of the residuals is that of random losses and noise, which are independent.
+    """
+    normal = jacobian.T @ jacobian
+    inverse = np.linalg.inv(normal)
+    phase = residual / pitch
+    apart = (phase[:, None] - phase) % 1.0
+    weights = (jacobian * pitch[:, None]) @ inverse
+    sampling = weights.T @ (1 / 12 - apart * (1 - apart) / 2) @ weights
+    remaining = max(float(residual @ residual - pitch @ pitch / 12 + np.sum(normal * sampling)), 0.0)
+    return np.asarray(sampling + remaining / (len(residual) - 2) * inverse)
