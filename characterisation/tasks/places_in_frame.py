@@ -29,13 +29,19 @@ PLACE_QUANTITIES: dict[str, tuple[tuple[str, str], ...]] = {
 }
 
 
-def place_functions(fit: Plane | Sphere | Cylinder, frame: Array) -> list[tuple[str, str, Callable[[Any], float]]]:
+def place_functions(
+    fit: Plane | Sphere | Cylinder, middle: Array, frame: Array
+) -> list[tuple[str, str, Callable[[Any], float]]]:
     """Return name, unit and function of each quantity of a shape; a function takes the shape or one moved a little.
+
+    The point of an axis slides along it when it tilts, since the ``middle`` of the points lies beside the axis.
 
     Parameters
     ----------
     fit
         Surface in the sensor frame [mm].
+    middle
+        (3,) of its points [mm], sensor frame.
     frame
         (4, 4) rigid transform from the sensor frame to that of the quantities [mm].
     """
@@ -55,7 +61,10 @@ def place_functions(fit: Plane | Sphere | Cylinder, frame: Array) -> list[tuple[
         along = rotation @ fit.axis
         sign = 1.0 if along[np.argmax(np.abs(along))] > 0 else -1.0
         functions = [_component(lambda cylinder: sign * rotation @ cylinder.axis, k) for k in range(3)]
-        functions += [_component(lambda cylinder: rotation @ cylinder.point + shift, k) for k in range(3)]
+        beside = middle - ((middle - fit.point) @ fit.axis) * fit.axis
+        functions += [
+            _component(lambda cylinder: rotation @ cylinder.at_foot_of(beside).point + shift, k) for k in range(3)
+        ]
         kind = "cylinder"
     return [(name, unit, function) for (name, unit), function in zip(PLACE_QUANTITIES[kind], functions, strict=True)]
 

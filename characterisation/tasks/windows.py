@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from characterisation.features.fits import fit_cylinder, fit_plane, fit_sphere
 from characterisation.features.fitted import CylinderFit, PlaneFit, SphereFit
 from characterisation.features.form import fit_form, zone
-from characterisation.features.robust_fit import FitError
+from characterisation.features.robust_fit import CLIP, FitError, rays_from
 from characterisation.features.starts import cylinder_start
-from characterisation.features.surfaces import lengths
+from characterisation.features.surfaces import distances, lengths
 from characterisation.files.errors import InputError, nearest
 from characterisation.point_cloud import PointCloud
 from characterisation.region_of_interest import Roi
@@ -157,7 +157,7 @@ def measure_windows(cloud: PointCloud, plan: WindowPlan, frame: NDArray[np.float
             results += [failed(f"{name} {quantity}", unit, str(fit), 0, len(points)) for quantity, unit in quantities]
         else:
             results += _shape_results(name, fit, points, cloud.grid.origin)
-            results += _place_results(name, fit, len(points), np.eye(4) if frame is None else frame)
+            results += _place_results(name, fit, points, cloud.grid.origin, np.eye(4) if frame is None else frame)
     for kind, first, second in plan.pairs:
         results.append(_pair_result(kind, (first, second), fits, counts, plan))
     return results
@@ -247,11 +247,15 @@ def _shape_results(
     return [form_result, noise, distance]
 
 
-def _place_results(name: str, fit: ShapeFit, point_count: int, frame: NDArray[np.float64]) -> list[Result]:
+def _place_results(
+    name: str, fit: ShapeFit, points: NDArray[np.float64], viewpoint: NDArray[np.float64], frame: NDArray[np.float64]
+) -> list[Result]:
     """Return place and direction of one fitted feature in a frame."""
+    near = np.abs(distances(fit, points, rays_from(viewpoint, points))[0]) <= CLIP * fit.residual_std
+    middle = points[near].mean(axis=0)
     return [
-        Result(f"{name} {quantity}", unit, *evaluate(function, [fit]), "fit", fit.count, point_count)
-        for quantity, unit, function in place_functions(fit, frame)
+        Result(f"{name} {quantity}", unit, *evaluate(function, [fit]), "fit", fit.count, len(points))
+        for quantity, unit, function in place_functions(fit, middle, frame)
     ]
 
 

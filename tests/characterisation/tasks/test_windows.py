@@ -93,6 +93,15 @@ def test_the_uncertainty_is_the_scatter_of_independent_noise(trials, name):
         assert abs(values.mean() - truth[name]) < 4 * stated / np.sqrt(60) + (1e-3 * 0.2 if name == "a noise" else 0)
 
 
+def test_the_point_of_a_short_axis_slides_along_it_as_its_uncertainty_says(rng):
+    """The middle of the points lies a radius beside the axis, so an axis that tilts moves its nearest point."""
+    pin, window, runs = cylinder([0, 0, 470], [0, 1, 0], 15), Roi(85, 70, 30, 20), 100
+    plan = WindowPlan({"pin": ("cylinder", window)})
+    along = [by_name(measure_windows(cloud_of(pin, 0.05, rng), plan))["pin axis point y"] for _ in range(runs)]
+    stated = np.sqrt(np.mean([one.uncertainty**2 for one in along]))
+    assert stated == pytest.approx(np.std([one.value for one in along], ddof=1), rel=4 / np.sqrt(2 * runs))
+
+
 def test_repeatability_is_mean_and_standard_deviation_over_clouds(trials):
     over = {one.name: one for one in repeatability(trials)}
     values = [by_name(one)["ball diameter"].value for one in trials]
