@@ -6,9 +6,13 @@ dot's points -> 3D centres -> neighbours about a pitch apart -> row and column o
 transform from plate to dots: scale and residuals.
 
 The scale s minimises sum |p_i - t - s R g_i|^2 (Umeyama, IEEE PAMI 13(4), 1991). Here p_i are the measured centres, g_i
-those of the print, and g is the mean of the g_i. As for the slope of a straight line, the standard uncertainty of s is
-sigma / sqrt(sum |g_i - g|^2). The standard deviation sigma follows from the residuals in the plane of the plate, with
-2 n - 4 degrees of freedom. Noise across the plane does not change the scale.
+those of the print, and g is the mean of the g_i. The standard uncertainty of s follows from the residuals r_i in the
+plane of the plate, with 2 n - 4 degrees of freedom,
+
+    u^2(s) = 2 n / (2 n - 4) sum (r_i . (g_i - g))^2 / (sum |g_i - g|^2)^2.
+
+Noise across the plane does not change the scale. Noise along the view rays errs in the plane in one direction only, and
+more the more the ray leans; residuals of one size in all directions would give u/sqrt(2) or less.
 
 The mean distance of neighbours is also reported, without an uncertainty. An error of an inner dot lengthens one
 distance and shortens the next. So the distances are not independent: their standard deviation over the root of their
@@ -107,7 +111,7 @@ def measure_plate(name: str, plate: Plate, cloud: PointCloud, image: NDArray[np.
     - pitch: scale times the nominal pitch, with its standard uncertainty.
     - neighbour distance, neighbour spread: mean and standard deviation of the distances of neighbours.
     - in-plane: standard deviation of the residuals per axis in the plane of the plate, with 2 n - 4 degrees of freedom.
-      Its relative standard uncertainty is 1 / sqrt(2 (2 n - 4)) (JCGM 100, E.4.3).
+      Its standard uncertainty takes the residuals along the view ray and across it as normal, each of its own size.
     - flatness: range of the dots across the plate.
 
     If the dots cannot be measured, each result has no value and gives the reason.
@@ -139,9 +143,16 @@ def measure_plate(name: str, plate: Plate, cloud: PointCloud, image: NDArray[np.
         dots = plate_dots(name, plate, cloud, image)
     except FitError as error:
         return [failed(quantity, "mm", str(error)) for quantity in names]
-    scale, uncertainty, residual = plate_scale(dots, plate.pitch)
+    scale, uncertainty, residual, rotation = plate_scale(dots, plate.pitch)
     count, freedom = len(dots.centres), 2 * len(dots.centres) - 4
-    within = math.sqrt(float((residual[:, :2] ** 2).sum()) / freedom)
+    square = float((residual[:, :2] ** 2).sum())
+    within = math.sqrt(square / freedom)
+    leaning = ((dots.centres - cloud.grid.origin) @ rotation)[:, :2]
+    leaning /= np.maximum(np.linalg.norm(leaning, axis=1, keepdims=True), SMALLEST_SCALE)
+    along = (residual[:, :2] * leaning).sum(axis=1)
+    across = residual[:, 0] * leaning[:, 1] - residual[:, 1] * leaning[:, 0]
+    # the square of a normal error has the variance 2 v^2, its fourth power the mean 3 v^2
+    variance = 2 / 3 * float((along**4 + across**4).sum()) * 2 * count / freedom
     mean, spread = float(dots.distances.mean()), float(dots.distances.std(ddof=1))
     result = partial(Result, unit="mm", points=count, points_given=dots.dot_count)
     fitted = partial(result, origin="fit")
@@ -149,7 +160,7 @@ def measure_plate(name: str, plate: Plate, cloud: PointCloud, image: NDArray[np.
         fitted(names[0], value=scale * plate.pitch, uncertainty=uncertainty * plate.pitch, nominal=plate.pitch),
         result(names[1], value=mean, nominal=plate.pitch),
         result(names[2], value=spread),
-        fitted(names[3], value=within, uncertainty=within / math.sqrt(2 * freedom)),
+        fitted(names[3], value=within, uncertainty=within * math.sqrt(variance) / (2 * max(square, SMALLEST_SCALE**2))),
         result(names[4], value=float(np.ptp(residual[:, 2]))),
     ]
 
@@ -212,19 +223,21 @@ def plate_dots(name: str, plate: Plate, cloud: PointCloud, image: NDArray[np.uin
     return PlateDots(centres, indices, distances, len(dots))
 
 
-def plate_scale(dots: PlateDots, pitch: float) -> tuple[float, float, Array]:
-    """Return the scale of the dots relative to the print, its standard uncertainty, and residuals (n, 3) [mm].
+def plate_scale(dots: PlateDots, pitch: float) -> tuple[float, float, Array, Array]:
+    """Return the scale of the dots relative to the print, its standard uncertainty, residuals and rotation.
 
-    ``pitch`` [mm] is that of the print. The first two components of a residual lie in the plane of the plate, the third
-    across it. Formulas and source: :mod:`mitsim.decoding.plate`.
+    ``pitch`` [mm] is that of the print. The residuals (n, 3) [mm] are in the frame of the plate, from which the
+    rotation (3, 3) leads to the sensor frame: the first two components lie in the plane of the plate, the third across
+    it. Formulas and source: :mod:`mitsim.decoding.plate`.
     """
     plate = np.column_stack([dots.indices * pitch, np.zeros(len(dots.indices))]).astype(float)
     plate -= plate.mean(axis=0)
     centred = dots.centres - dots.centres.mean(axis=0)
     rotation, scale = turn_and_scale(centred, plate)
     residual = centred @ rotation - scale * plate
-    sigma = math.sqrt(float((residual[:, :2] ** 2).sum()) / (2 * len(plate) - 4))
-    return scale, sigma / math.sqrt(float((plate**2).sum())), residual
+    stretch = (residual[:, :2] * plate[:, :2]).sum(axis=1)
+    spread = math.sqrt(float((stretch**2).sum()) * 2 * len(plate) / (2 * len(plate) - 4))
+    return scale, spread / float((plate**2).sum()), residual, rotation
 
 
 def turn_and_scale(points: Array, printed: Array) -> tuple[Array, float]:

@@ -107,7 +107,7 @@ def plate_cells(
     cloud = capture_cloud(capture, settings, imager=imager)
     where = Roi(*(window or (0, 0, cloud.grid.width, cloud.grid.height)))
     dots = plate_dots(name, Plate(where, PITCH), cloud, image_on_grid(capture, cloud.grid))
-    scale, scatter, _ = plate_scale(dots, PITCH)
+    scale, scatter, *_ = plate_scale(dots, PITCH)
     parts, (axes, shear) = contributions(capture, preset, dots.centres), axes_of(dots)
     total = PITCH * float(np.sqrt(scatter**2 + sum(part**2 for part in parts.values())))
     pitch = scale * PITCH

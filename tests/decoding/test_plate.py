@@ -65,6 +65,20 @@ def test_rows_and_columns_are_those_of_the_plate():
     assert len(dots.distances) == 2 * 7 * 6
 
 
+@pytest.mark.parametrize("angles", [(0, 0, 0), (-15, 30, 45)])
+def test_noise_along_the_rays_scatters_pitch_and_residuals_by_their_uncertainties(angles, rng, monkeypatch):
+    """Its errors in the plane have one direction for each dot, and grow toward the rim of a plate seen from above."""
+    image, normal = drawn(Rotation.from_euler("xyz", angles, degrees=True).as_matrix())
+    found, runs = dot_centres(image), 150
+    monkeypatch.setattr("mitsim.decoding.plate.dot_centres", lambda image, dark: found)
+    distance, plate = plane([0, 0, 500], normal, GRID), Plate(None, PITCH)
+    measured = [measure_plate("plate", plate, cloud_of(distance, 1.0, rng, GRID), image) for _ in range(runs)]
+    for number, name in ((0, "plate pitch"), (3, "plate in-plane")):
+        value, uncertainty = np.array([(one[number].value, one[number].uncertainty) for one in measured]).T
+        assert measured[0][number].name == name
+        assert np.sqrt(np.mean(uncertainty**2)) == pytest.approx(value.std(ddof=1), rel=3 / np.sqrt(2 * runs))
+
+
 def test_the_uncertainty_of_the_scale_is_its_scatter(rng):
     """Dots with errors of 0.05 mm on every axis, 200 times: s / u within 1 +- 3 / sqrt(2 * 199)."""
     indices = np.stack(np.meshgrid(np.arange(7), np.arange(5)), -1).reshape(-1, 2)

@@ -186,7 +186,7 @@ def dots_of_plate(capture: Capture, plate: Plate, cloud: PointCloud, printed: fl
         dots = plate_dots("plate", plate, cloud, image_on_grid(capture, cloud.grid))
     except FitError as error:
         raise InputError("--dots", "", str(error), "a plate of dots in the window") from None
-    scale, scatter, _ = plate_scale(dots, plate.pitch)
+    scale, scatter, *_ = plate_scale(dots, plate.pitch)
     extent = float(np.linalg.norm(np.ptp(dots.centres, axis=0)))
     return KnownPoints(dots.centres, scale, scatter, printed, np.empty(0), extent)
 
@@ -308,6 +308,6 @@ def _similarity(points: Floats, true: Floats) -> tuple[float, float]:
     square = float((of_true**2).sum())
     scale = float(((of_true @ turn) * from_middle).sum()) / square
     left = from_middle - scale * of_true @ turn
-    normal = np.linalg.svd(from_middle, full_matrices=False)[2][-1]
-    in_plane = left - np.outer(left @ normal, normal)
-    return scale, float(np.sqrt((in_plane**2).sum() / max(2 * len(points) - 4, 1) / square))
+    stretch = (left * (of_true @ turn)).sum(axis=1)  # as of a plate of dots: mitsim.decoding.plate
+    degrees = 2 * len(points)
+    return scale, float(np.sqrt((stretch**2).sum() * degrees / max(degrees - 4, 1)) / square)
