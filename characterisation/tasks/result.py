@@ -23,7 +23,8 @@ NOT_INCLUDED = (
     "noise that neighbouring points share",
     "calibration and scale of the sensor",
     "systematic error of the surface (reflections, penetration, blur at edges)",
-    "form of the surface, except in flatness and cylindricity",
+    "form of the surface, except in flatness and cylindricity (there: of the margin at edges)",
+    "what noise alone adds to values near 0, up to 1.5 u",
 )
 
 #: source of a standard uncertainty: the covariance of a fit, a statement, or none

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from characterisation.features.fits import fit_cylinder, fit_plane
-from characterisation.features.form import Form, fit_form, form_modes, zone
+from characterisation.features.form import NODES, Form, fit_form, form_modes, node_modes, zone
 from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import Cylinder, Plane, tangents
 from characterisation.tasks.measurement_model import evaluate
@@ -125,3 +125,18 @@ def test_too_few_points_for_a_form_are_refused():
     points = face(16, np.random.default_rng(8))
     with pytest.raises(FitError, match="16 points, the form of a plane needs at least 19"):
         fit_form(points, FACE)
+
+
+def test_forms_at_the_nodes_scatter_as_random_forms_of_the_whole_face():
+    """Random polynomials of a face, by least squares over 301 x 301 places, are 4.4 times as high at a corner as at an
+    edge's middle in the mean square; the same of the forms at the nodes."""
+    at = np.linspace(-1, 1, 301)
+    u, v = (grid.ravel() for grid in np.meshgrid(at, at, indexing="ij"))
+    columns = np.column_stack([u**i * v**j for i in range(5) for j in range(5 - i)])
+    rigid = np.linalg.qr(columns[:, [0, 1, 5]])[0]  # 1, v, u
+    rest = np.delete(columns, [0, 1, 5], axis=1)
+    square = (np.linalg.qr(rest - rigid @ (rigid.T @ rest))[0] ** 2).sum(axis=1).reshape(301, 301)
+    nodes = (node_modes("plane") ** 2).sum(axis=1).reshape(NODES, NODES)
+    for place, node in ((0, 0), (150, 3)):
+        expected = square[place, place] / square[0, 150]
+        assert nodes[node, node] / nodes[0, 3] == pytest.approx(expected, rel=0.05)
