@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from characterisation.statements.verdict_words import named
 from mitsim.running.numbers import listed
-from mitsim.views.view_scores import OCCLUDED
+from mitsim.views.limiting_factor import OCCLUDED
 
 #: share of the points in matt white below which the finish is a cause of their loss
 _DULL = 0.75

@@ -27,7 +27,6 @@ from characterisation.scores.view_score import rank_views, score_views, view_sta
 from characterisation.tasks.covariance import LEAST_CHANCE, ExpectedPoints
 from characterisation.tasks.measurement_model import InputQuantity
 from characterisation.tasks.prediction import (
-    ExpectedInput,
     ExpectedMeasurement,
     expected_inputs,
     expected_measurement,
@@ -53,6 +52,7 @@ from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
 from mitsim.sensor.transforms import Transform
 from mitsim.views import View
+from mitsim.views.limiting_factor import limiting_factors
 from mitsim.views.scoring_time import FEWEST_VIEWS, TIMED_VIEWS, say_expected, scoring_order
 
 __all__ = ["LEAST_CHANCE", "MATT_WHITE", "score_candidates", "with_poses"]
@@ -64,9 +64,6 @@ RAYS = 40_000
 
 #: statistics of V_m in :class:`_ViewScore`, in the order of :func:`view_statistics`
 _STATISTICS = ("n", "sigma", "n_white", "sigma_white", "n_only")
-
-#: R_f below which a lack of points is attributed to occlusion
-OCCLUDED = 0.75
 
 
 @dataclass(frozen=True)
@@ -201,7 +198,8 @@ def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above 
     overall = rank_views(-risk.mean(axis=0), np.asarray(possible.all(axis=0)))
     long_name = "rank by the mean logarithm of the predicted risk over all measurements, 1 is best"
     add("overall_rank", ("view",), overall, long_name)
-    factor, feature = _limits(task, scored, scores, possible)
+    measured, inputs = [score.measurements for score in scored], [score.inputs for score in scored]
+    factor, feature = limiting_factors(task, measured, inputs, scores["R_f"], possible)
     add("limit", by, factor, "limiting factor of the view, against the best view")
     add("limiting_feature", by, feature, "the feature that contributes most")
     measurements = task.measurements.values()
@@ -209,7 +207,7 @@ def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above 
     tolerances = [math.nan if m.tolerance_size is None else m.tolerance_size for m in measurements]
     scores["tolerance"] = ("measurement", tolerances, {"units": "mm or deg"})
     scores["unit"] = ("measurement", [m.unit for m in measurements])
-    return with_poses(scores, views), [view_score.inputs for view_score in scored]
+    return with_poses(scores, views), inputs
 
 
 def _not_scored(like: _ViewScore) -> _ViewScore:
@@ -283,62 +281,6 @@ def _white_points(predictor: Predictor, alone: CharacterisedScene, world_from_se
     predicted = predictor.look_up(alone, world_from_sensor)
     counted = (predicted.labels[predicted.seen.roi.slices] == 0) & np.isfinite(predicted.seen.sigma)
     return float(predicted.seen.fraction[counted].sum(dtype=float))
-
-
-def _limits(
-    task: Task, scored: Sequence[_ViewScore], scores: xr.Dataset, possible: NDArray[np.bool_]
-) -> tuple[NDArray[np.str_], NDArray[np.str_]]:
-    """Return the limiting factor of each measurement in each view, and its feature, (measurement, view) each.
-
-    The contribution to u is noise / sqrt(n) times a factor of geometry; the farthest of these from its best over all
-    views is the limiting factor.
-    """
-    shape = (len(task.measurements), len(scored))
-    limit, feature = np.full(shape, "", object), np.full(shape, "", object)
-    kinds = {name: definition.kind for name, definition in task.features.items()}
-    share = scores["R_f"]
-    for m in range(shape[0]):
-        for v, score in enumerate(scored):
-            predicted = score.measurements[m]
-            if not predicted.uncertainty > 0:
-                short = [name for name in predicted.reason.split(":")[0].split(", ") if name in kinds]
-                feature[m, v] = short[0] if short else ""
-        inputs = next((score.measurements[m].inputs for score in scored), ())
-        parts = np.array([score.measurements[m].contributions for score in scored])
-        noise, count = np.full((2, len(scored), len(inputs)), np.nan)
-        for v, score in enumerate(scored):
-            for i, quantity in enumerate(inputs):
-                if isinstance(expected := score.inputs[quantity], ExpectedInput):
-                    noise[v, i], count[v, i] = expected.fit.noise, expected.fit.count
-        able = possible[m]
-        if not able.any():
-            limit[m] = "few points"
-            continue
-        among = np.broadcast_to(able[:, None], noise.shape)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            geometry = parts * np.sqrt(count) / noise
-            excess = np.stack(
-                [
-                    noise / np.min(noise, axis=0, where=among & np.isfinite(noise), initial=np.inf),
-                    np.sqrt(np.max(count, axis=0, where=among & np.isfinite(count), initial=0.0) / count),
-                    geometry / np.min(geometry, axis=0, where=among & (geometry > 0), initial=np.inf),
-                ]
-            )
-        for v in range(len(scored)):
-            if not np.isfinite(parts[v]).all() or not parts[v].any():
-                limit[m, v] = "few points"
-                continue
-            worst = int(np.argmax(parts[v]))
-            name = inputs[worst].features[0]
-            feature[m, v] = name
-            cause = int(np.nanargmax(np.where(np.isfinite(excess[:, v, worst]), excess[:, v, worst], -1)))
-            limit[m, v] = ("noise", "few points", "small extent" if kinds[name] == "plane" else "short arc")[cause]
-            shaped = name in share["feature"].values
-            if cause == 1 and shaped and float(share.sel(feature=name).values[v]) < OCCLUDED:
-                limit[m, v] = "occlusion"
-            if not able[v]:
-                limit[m, v] = "occlusion" if limit[m, v] == "occlusion" else "few points"
-    return limit.astype(str), feature.astype(str)
 
 
 def with_poses(scores: xr.Dataset, views: Sequence[View]) -> xr.Dataset:
