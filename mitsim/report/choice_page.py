@@ -83,7 +83,7 @@ def _row(choice: ChoiceDocument, entry: SensorEntry) -> dict[str, Any]:
         "stated": entry.status == "stated",
         "why": entry.why,
         "rough": entry.roughness_in_words,
-        "fits": entry.fits_in_words(toleranced).removeprefix("fits ") if toleranced else "",
+        "fits": entry.fits_in_cell(toleranced),
         "possible": entry.possible_in_words,
         "ratio": NONE if entry.ratio is None else two_digits(entry.ratio),
         "capture": NONE if entry.capture is None else f"{rounded(1e3 * entry.capture.seconds)}\N{NO-BREAK SPACE}ms",

@@ -163,6 +163,10 @@ class SensorEntry(PartialDocument):
         unsure = sum(cell.verdict == "not decided" for cell in self.measurements.values())
         return fits_in_words(self.fits, unsure, toleranced)
 
+    def fits_in_cell(self, toleranced: int) -> str:
+        """Return :meth:`fits_in_words` below a heading that says *fits*; empty without tolerances."""
+        return self.fits_in_words(toleranced).removeprefix("fits ") if toleranced else ""
+
     @property
     def fits_all(self) -> bool:
         """Return whether all measurements are possible, and every tolerance is decided to fit."""

@@ -199,10 +199,8 @@ _SIGNS = {"fits": "fits", "does not fit": "no", "undecidable": "undecidable", "n
 
 
 def _fits(sensor_entry: SensorEntry, toleranced: int) -> str:
-    if not toleranced:
-        return "-"
-    if sensor_entry.status == "stated":
-        return sensor_entry.fits_in_words(toleranced).removeprefix("fits ")
+    if sensor_entry.status == "stated" or not toleranced:
+        return sensor_entry.fits_in_cell(toleranced) or "-"
     return f"({sensor_entry.expected_fits} of {toleranced})"
 
 
