@@ -24,7 +24,13 @@ from characterisation.tasks.definitions import (
     plane_distance,
     point_plane_distance,
 )
-from mitsim.scene.authoring.drawn_characteristics import Dimension, DrawnTarget, GeometricTolerance, ProductInformation
+from mitsim.scene.authoring.drawn_characteristics import (
+    NO_LIMITS,
+    Dimension,
+    DrawnTarget,
+    GeometricTolerance,
+    ProductInformation,
+)
 from mitsim.scene.authoring.drawn_zones import Side, zones
 from mitsim.scene.authoring.face import Face
 from mitsim.scene.authoring.naming import identifier
@@ -155,12 +161,11 @@ class _TaskBuilder:
         if not first or (dimension.second is not None and not second):
             return left_out(f"it is {_what(dimension.first if not first else dimension.second or DrawnTarget())}")
         remarks = list(dimension.notes)
+        lost = [note for note in remarks if NO_LIMITS in note]
         tolerance = _deviations(dimension)
         if dimension.limits is not None and tolerance is None:
-            remarks.append(
-                f"its limits {dimension.limits[0]:g} and {dimension.limits[1]:g} are not in increasing order"
-            )
-            self.task.in_part.append(f"{described}{on}: without its tolerance, because {remarks[-1]}")
+            lost.append(f"its limits {dimension.limits[0]:g} and {dimension.limits[1]:g} are not in increasing order")
+            remarks.append(lost[-1])
         made: list[tuple[str, str, tuple[Face, ...], float]] = []
         if dimension.second is None:
             made = self._sizes(dimension, first)
@@ -173,6 +178,7 @@ class _TaskBuilder:
                 made = [(f"{first[0].name}_to_{second[0].name}_{short}", kind, (first[0], second[0]), value)]
         if not made:
             return left_out("a task has no such measurement between such faces")
+        self.task.in_part += [f"{described}{on}: without its tolerance, because {note}" for note in lost]
         for name, kind, members, model in made:
             nominal, allowed, said = dimension.nominal, tolerance, list(remarks)
             if dimension.angular and kind != "cone_angle" and nominal > 90:  # a task has lines' angles, 0 to 90 deg

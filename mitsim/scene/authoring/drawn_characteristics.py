@@ -10,6 +10,9 @@ UNEQUAL = "its zone lies unequally about the surface"
 #: note of a tolerance whose zone lies outside the feature
 PROJECTED = "its zone is projected out of the feature"
 
+#: end of the note of a fit that leaves its dimension without limits
+NO_LIMITS = "has no limits here: ISO 286-1 has none for this size, or mitsim does not know its class"
+
 
 @dataclass(frozen=True)
 class DrawnTarget:

@@ -13,6 +13,7 @@ from collections import defaultdict
 from typing import Any
 
 from mitsim.scene.authoring.drawn_characteristics import (
+    NO_LIMITS,
     PROJECTED,
     UNEQUAL,
     Dimension,
@@ -20,6 +21,7 @@ from mitsim.scene.authoring.drawn_characteristics import (
     GeometricTolerance,
     ProductInformation,
 )
+from mitsim.scene.authoring.fits import fit_deviations
 from mitsim.scene.authoring.part21 import Entity, Enumeration, Reference, StepText, Typed
 from mitsim.scene.authoring.units import unit_size
 
@@ -63,6 +65,13 @@ def read_product_information(text: StepText) -> ProductInformation:
     dimensions = [reader.dimension(entity) for entity in text.all(*_SIZES, *_LOCATIONS)]
     tolerances = [reader.tolerance(entity) for entity in text.all(*TOLERANCES)]
     return ProductInformation(dimensions, tolerances, reader.datums(), reader.unread())
+
+
+def _tolerance_class(fit: tuple[Any, ...]) -> str:
+    """Return the class of a fit: its letters in capitals for a hole, and its grade, which may stand with them."""
+    letter, of, grade = (word if isinstance(word, str) else "" for word in (*fit, None, None, None)[:3])
+    letter = {"hole": letter.upper(), "shaft": letter.lower()}.get(of.strip().lower(), letter)
+    return letter + grade
 
 
 class _Reader:
@@ -178,9 +187,11 @@ class _Reader:
                 if low is not None and high is not None:
                     limits = (nominal + low, nominal + high)
             elif (fit := band.of("LIMITS_AND_FITS")) is not None:
-                notes.append(
-                    f"the fit {''.join(str(word) for word in fit[:3:2] if word)}, whose limits are not in the file"
-                )
+                name = _tolerance_class(fit)
+                ends = None if angular or "radius" in kind else fit_deviations(name, nominal)
+                if ends is not None and limits is None:
+                    limits = (nominal + ends[0], nominal + ends[1])
+                notes.append(f"the fit {name}" if limits else f"the fit {name} {NO_LIMITS}")
         return Dimension(entity.number, kind, first, second, nominal, limits, angular, tuple(notes))
 
     def value(self, reference: Any, measured: dict[str, float], notes: list[str]) -> None:
