@@ -31,7 +31,7 @@ from mitsim.scene.authoring.drawn_characteristics import (
     GeometricTolerance,
     ProductInformation,
 )
-from mitsim.scene.authoring.drawn_zones import Side, zones
+from mitsim.scene.authoring.drawn_zones import Side, middles, zones
 from mitsim.scene.authoring.face import Face
 from mitsim.scene.authoring.naming import identifier
 
@@ -199,7 +199,7 @@ class _TaskBuilder:
         return None
 
     def _sizes(self, dimension: Dimension, faces: list[Face]) -> list[tuple[str, str, tuple[Face, ...], float]]:
-        """Return the sizes of faces: of each round face, or the distance or angle of two planes."""
+        """Return the sizes of faces: of each round face, of two planes, or the widths of slots."""
         planes = [face for face in faces if isinstance(face.surface, Plane)]
         if dimension.angular:
             cones = [f for f in faces if isinstance(f.surface, Cone)]
@@ -213,9 +213,13 @@ class _TaskBuilder:
             if kind:
                 scale = 1 if kind == "radius" else 2
                 return [(f"{f.name}_{kind}", kind, (f,), scale * _radius(f)) for f in faces]
-        if dimension.angular and len(planes) == len(faces) == 2:
-            kind, value = _between(faces[0], faces[1], True)
-            return [(f"{faces[0].name}_to_{faces[1].name}_angle", kind, (faces[0], faces[1]), value)]
+        else:
+            widths = [(side.of, *_between(side.of[0], side.of[1], False)) for side in middles(faces)]
+            return [
+                (f"{of[0].name}_to_{of[1].name}_distance", kind, of, value)
+                for of, kind, value in widths
+                if abs(value - (dimension.nominal or 0.0)) <= _AGREE
+            ]
         return []
 
     def tolerance(self, geometric_tolerance: GeometricTolerance) -> None:

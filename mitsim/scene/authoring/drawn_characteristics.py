@@ -10,16 +10,23 @@ UNEQUAL = "its zone lies unequally about the surface"
 #: note of a tolerance whose zone lies outside the feature
 PROJECTED = "its zone is projected out of the feature"
 
+#: note of a tolerance whose faces have one zone together
+COMMON = "common zone"
+
 #: end of the note of a fit that leaves its dimension without limits
 NO_LIMITS = "has no limits here: ISO 286-1 has none for this size, or mitsim does not know its class"
 
 
 @dataclass(frozen=True)
 class DrawnTarget:
-    """The object of a dimension, tolerance or datum: faces by number, and anything else by its type."""
+    """The object of a dimension, tolerance or datum: faces by number, and anything else by its type.
+
+    ``of_size``: whether a tolerance is given to the size of the faces, so that it applies to their axis or mid-plane.
+    """
 
     faces: tuple[int, ...] = ()
     other_types: tuple[str, ...] = ()
+    of_size: bool = False
 
 
 @dataclass(frozen=True)

@@ -8,17 +8,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 
 import numpy as np
 
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
 from characterisation.tasks.places import mid_plane
 from characterisation.tasks.zones import Datum, frame_fault
-from mitsim.scene.authoring.drawn_characteristics import PROJECTED, UNEQUAL, GeometricTolerance
+from mitsim.scene.authoring.drawn_characteristics import COMMON, PROJECTED, UNEQUAL, GeometricTolerance
 from mitsim.scene.authoring.face import Face
 
 #: two sides belong to a slot or a web if their normals are opposite within this cosine
 _OPPOSITE = -0.9999
+
+#: how far the round end of a slot may lie off its mid-plane and differ from its width, as a part of the width; also the
+#: cosine of its axis with the normal; chosen
+_TOUCHING = 1e-3
+
+#: tolerances of the mid-planes of two sides; and those too, if the file gives them to a size instead of to faces
+_OF_SIZES = ("position", "symmetry")
+_OF_FACES_OR_SIZES = ("parallelism", "perpendicularity", "angularity")
 
 _PLANES = "between two planes"
 
@@ -73,18 +82,66 @@ def middle(faces: Sequence[Face]) -> Side | None:
     first, second = (face.surface for face in faces)
     if not isinstance(first, Plane) or not isinstance(second, Plane):
         return None
-    outward = [face.surface.normal * (1 if face.convex else -1) for face in faces if isinstance(face.surface, Plane)]
-    if outward[0] @ outward[1] > _OPPOSITE:
+    if _outward(faces[0]) @ _outward(faces[1]) > _OPPOSITE:
         return None
     return Side(f"middle_of_{faces[0].name}", mid_plane(first, second), tuple(faces))
+
+
+def _outward(face: Face) -> np.ndarray:
+    """Return the normal of a plane out of the part."""
+    assert isinstance(face.surface, Plane)
+    return face.surface.normal * (1 if face.convex else -1)
+
+
+def middles(faces: Sequence[Face]) -> list[Side]:
+    """Return the mid-planes of one or several slots, which may have round ends, or webs; none for other faces.
+
+    The sides of several slots are those that face each other, the nearest first; those of several webs face away.
+    """
+    planes = [face for face in faces if isinstance(face.surface, Plane)]
+    both = [side for pair in combinations(planes, 2) if (side := middle(pair)) is not None]
+    both.sort(key=lambda side: float(np.linalg.norm(_across(side))))
+    for towards in (1, -1) if len(planes) > 2 else (0,):
+        found: list[Side] = []
+        for side in both:
+            if _across(side) @ _outward(side.of[0]) * towards >= 0 and not any(side.faces & one.faces for one in found):
+                found.append(side)
+        rest = [face for face in faces if not any(face.name in side.faces for side in found)]
+        if all(any(_is_end(face, side) for side in found) for face in rest):
+            return found
+    return []
+
+
+def _across(side: Side) -> np.ndarray:
+    """Return the way from the first to the second of two sides [mm]."""
+    first, second = (face.surface for face in side.of)
+    assert isinstance(first, Plane)
+    assert isinstance(second, Plane)
+    return second.point - first.point
+
+
+def _is_end(face: Face, slot: Side) -> bool:
+    """Return whether a face is a round end of a slot: a cylinder about its mid-plane, as wide as the slot."""
+    surface, plane = face.surface, slot.surface
+    if not isinstance(surface, Cylinder) or not isinstance(plane, Plane):
+        return False
+    width = abs(float(_across(slot) @ plane.normal))
+    off = max(abs(float((surface.point - plane.point) @ plane.normal)), abs(2 * surface.radius - width))
+    return off <= _TOUCHING * width and abs(float(surface.axis @ plane.normal)) <= _TOUCHING
 
 
 def zones(tolerance: GeometricTolerance, faces: Sequence[Face], datum_faces: Mapping[str, Sequence[Face]]) -> Zones:
     """Return the zones of a tolerance on ``faces``; ``datum_faces`` by the letter of their datum."""
     out = Zones()
     datums = [_side(datum_faces.get(letter, ())) for letter in tolerance.datums]
-    both = middle(faces) if tolerance.kind in ("position", "symmetry") else None
-    held = [both] if both is not None else [_side([face]) or face for face in faces]
+    of_sizes = tolerance.kind in _OF_SIZES or (tolerance.target.of_size and tolerance.kind in _OF_FACES_OR_SIZES)
+    sides = middles(faces) if of_sizes else []
+    held: Sequence[Side | Face] = sides or [_side([face]) or face for face in faces]
+    framed = tolerance.kind == "surface profile" and not isinstance(_frame(tolerance, datums), str)
+    located = tolerance.kind == "position" or framed  # a zone at its place is the same for one face and for several
+    if COMMON in tolerance.notes and len(held) > 1 and not located:
+        out.left_out.append(("", "its zone is common to its faces, and a task has zones of single faces"))
+        return out
     if tolerance.kind == "surface profile" and tolerance.datums and len(faces) > 1 and "all around" in tolerance.notes:
         out.left_out.append(("", "all around: it applies to its faces together, and a task has zones of single faces"))
         return out

@@ -156,7 +156,8 @@ class _Reader:
 
         if isinstance(reference, Reference):
             aspect(reference.number, 0)
-        return DrawnTarget(tuple(faces), tuple(other_types))
+        of = self.text.follow(reference)
+        return DrawnTarget(tuple(faces), tuple(other_types), of is not None and of.has(*_SIZES))
 
     def dimension(self, entity: Entity) -> Dimension:
         """Read one size or location."""

@@ -26,6 +26,24 @@ def bracket():
     return rounded.Shape()
 
 
+def slotted():
+    """Solid of a plate of 100 x 60 x 10 mm: slots 6 mm wide at x = 30 and 39 mm, one 8 mm wide with round ends."""
+    from OCP.BRepAlgoAPI import BRepAlgoAPI_Cut, BRepAlgoAPI_Fuse
+    from OCP.BRepPrimAPI import BRepPrimAPI_MakeBox, BRepPrimAPI_MakeCylinder
+    from OCP.gp import gp_Ax2, gp_Dir, gp_Pnt
+
+    solid = BRepPrimAPI_MakeBox(gp_Pnt(0, 0, 0), gp_Pnt(100, 60, 10)).Shape()
+    tool = BRepPrimAPI_MakeBox(gp_Pnt(20, 11, -1), gp_Pnt(40, 19, 11)).Shape()
+    for x in (20, 40):
+        end = BRepPrimAPI_MakeCylinder(gp_Ax2(gp_Pnt(x, 15, -1), gp_Dir(0, 0, 1)), 4, 12).Shape()
+        tool = BRepAlgoAPI_Fuse(tool, end).Shape()
+    solid = BRepAlgoAPI_Cut(solid, tool).Shape()
+    for x in (30, 39):
+        tool = BRepPrimAPI_MakeBox(gp_Pnt(x - 3, 40, -1), gp_Pnt(x + 3, 61, 11)).Shape()
+        solid = BRepAlgoAPI_Cut(solid, tool).Shape()
+    return solid
+
+
 def edge_at(solid, place, way):
     """The edge of a solid that runs through a place along an axis."""
     from OCP.BRepAdaptor import BRepAdaptor_Curve

@@ -8,7 +8,7 @@ import pytest
 from characterisation.tasks.task_reading import check_nominal_values, read_task
 from mitsim.scene.authoring.part_folder import read_part, write_part
 from mitsim.scene.authoring.read_step import step_installed
-from tests.scene.authoring.bracket import bracket, write_step
+from tests.scene.authoring.bracket import bracket, slotted, write_step
 from tests.scene.authoring.drawing import Drawing
 
 pytestmark = [
@@ -70,6 +70,53 @@ def test_an_angle_of_a_face_and_an_axis_is_that_of_the_face_not_of_its_normal(dr
         "front_at_y18mm": ("plane_axis_angle", 90, pytest.approx((-0.2, 0.2))),
         "bore_12mm_left": ("axis_angle", 0, None),
     }
+
+
+@pytest.fixture
+def plate(tmp_path):
+    """The file of the plate with slots, its drawing without entities, and the numbers of its faces by name."""
+    path = write_step([("plate", slotted(), None)], tmp_path / "plate.step", "AP242DIS")
+    face = {one.name: one.entities[0] for one in read_part(path).faces}
+    return path, Drawing(path.read_text()), face
+
+
+def test_a_tolerance_of_several_slots_holds_for_the_mid_plane_of_each(plate):
+    """ISO 1101: before, each side had it. The web between the slots at 30 and 39 mm is narrower, 3 mm."""
+    path, drawing, face = plate
+    mm = drawing.measure
+    datums = [
+        drawing.datum(letter, face[name]) for letter, name in zip("ABC", ("bottom", "front", "left"), strict=True)
+    ]
+    frame, base = drawing.system(*datums), drawing.system(datums[0])
+    sides = [face[f"{side}_at_x{x}mm"] for side, x in (("right", 27), ("right", 36), ("left", 33), ("left", 42))]
+    size = drawing.size("width", *sides, items=(mm(6.0, "nominal value"),))
+    drawing.plus_minus(size, mm(-0.1), mm(0.2))
+    ends = [face[name] for name in face if name.startswith("slot_end")]
+    long = drawing.aspect(face["back_at_y11mm"], face["front_at_y19mm"], *ends)
+    drawing.tolerance("POSITION", mm(0.11), size, frame)
+    drawing.tolerance("PERPENDICULARITY", mm(0.12), size, base)
+    drawing.tolerance("PERPENDICULARITY", mm(0.13), drawing.aspect(*sides[:2]), base)
+    drawing.tolerance("POSITION", mm(0.14), long, frame)
+    backs = drawing.aspect(*(face[name] for name in face if name.startswith("back_left")))
+    drawing.add(
+        f"( FLATNESS_TOLERANCE() GEOMETRIC_TOLERANCE('',$,#{mm(0.15)},#{backs}) "
+        "GEOMETRIC_TOLERANCE_WITH_MODIFIERS((.COMMON_ZONE.)) )"
+    )
+    drawing.tolerance("FLATNESS", mm(0.16), backs)
+    task = task_of(path, drawing)
+    found = {}
+    for one in task.measurements.values():
+        at = task.nominal(one.features[0]).point
+        found.setdefault((one.kind, one.tolerance), []).append(round(at[1] if one.tolerance == 0.14 else at[0], 3))
+    assert {key: sorted(places) for key, places in found.items() if key[0] != "flatness"} == {
+        ("plane_distance", (-0.1, 0.2)): [27, 36],
+        ("position", 0.11): [30, 39],
+        ("perpendicularity", 0.12): [30, 39],
+        ("perpendicularity", 0.13): [27, 36],
+        ("position", 0.14): [15],
+    }
+    assert {kind: len(places) for kind, places in found.items() if kind[0] == "flatness"} == {("flatness", 0.16): 2}
+    assert any("0.15" in one and "common to its faces" in one for one in read_part(path).drawing.left_out)
 
 
 #: kind, face, datums, form of the zone in the file, and whether a task has a zone of this form (ISO 1101)
