@@ -10,6 +10,9 @@ UNEQUAL = "its zone lies unequally about the surface"
 #: note of a tolerance whose zone lies outside the feature
 PROJECTED = "its zone is projected out of the feature"
 
+#: note of a tolerance whose zone has an orientation plane, intersection plane or direction feature
+DIRECTED = "its zone has a direction of its own"
+
 #: note of a tolerance whose faces have one zone together
 COMMON = "common zone"
 

@@ -15,7 +15,7 @@ import numpy as np
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
 from characterisation.tasks.places import mid_plane
 from characterisation.tasks.zones import Datum, frame_fault
-from mitsim.scene.authoring.drawn_characteristics import COMMON, PROJECTED, UNEQUAL, GeometricTolerance
+from mitsim.scene.authoring.drawn_characteristics import COMMON, DIRECTED, PROJECTED, UNEQUAL, GeometricTolerance
 from mitsim.scene.authoring.face import Face
 
 #: two sides belong to a slot or a web if their normals are opposite within this cosine
@@ -196,6 +196,8 @@ def _zone(tolerance: GeometricTolerance, side: Side, datums: Sequence[Side | Non
         return f"{UNEQUAL}, and those of a task lie equally about it"
     if PROJECTED in tolerance.notes:
         return f"{PROJECTED}, and those of a task lie at it"
+    if DIRECTED in tolerance.notes:
+        return f"{DIRECTED}, and those of a task have that of the feature or its datum"
     match tolerance.kind:
         case "flatness" if flat:
             return Zone("flatness", side)

@@ -13,6 +13,7 @@ from collections import defaultdict
 from typing import Any
 
 from mitsim.scene.authoring.drawn_characteristics import (
+    DIRECTED,
     NO_LIMITS,
     PROJECTED,
     UNEQUAL,
@@ -56,6 +57,13 @@ _RESTRICTIONS = {
     "GEOMETRIC_TOLERANCE_WITH_DEFINED_AREA_UNIT": "it holds for each area of the feature",
     "GEOMETRIC_TOLERANCE_WITH_MAXIMUM_TOLERANCE": "its zone has a maximum",
 }
+_ZONES = (
+    "TOLERANCE_ZONE",
+    "DIRECTED_TOLERANCE_ZONE",
+    "ORIENTED_TOLERANCE_ZONE",
+    "DIRECTION_FEATURE_TOLERANCE_ZONE",
+    "TOLERANCE_ZONE_WITH_DATUM",
+)
 _DEEPEST = 20
 
 
@@ -111,17 +119,19 @@ class _Reader:
         ]
         projected = {values[0].number for values in definitions if values and isinstance(values[0], Reference)}
         self.projected: set[int] = set()  # tolerances
-        for zone in text.all("TOLERANCE_ZONE"):
-            of, form = (None, None, *(zone.of("TOLERANCE_ZONE") or ()))[-2:]
+        self.directed: set[int] = set()  # tolerances
+        for zone in text.all(*_ZONES):
+            values = zone.of(*_ZONES) or ()
+            of, form = (None, None, *(values[4:6] if len(values) >= 6 else values))[-2:]
             shape = text.follow(form)
             zone_form = shape.of("TOLERANCE_ZONE_FORM") if shape else None
-            for member in of if isinstance(of, tuple) else ():
-                if not isinstance(member, Reference):
-                    continue
-                if zone_form and isinstance(zone_form[0], str):
-                    self.zones[member.number] = zone_form[0]
-                if zone.number in projected:
-                    self.projected.add(member.number)
+            members = {
+                member.number for member in (of if isinstance(of, tuple) else ()) if isinstance(member, Reference)
+            }
+            if zone_form and isinstance(zone_form[0], str):
+                self.zones |= dict.fromkeys(members, zone_form[0])
+            self.projected |= members if zone.number in projected else set()
+            self.directed |= members if zone.has(*_ZONES[1:]) else set()
 
     def target(self, reference: Any) -> DrawnTarget:
         """Return the object of a shape aspect, through its members and the aspects it was derived from."""
@@ -250,8 +260,7 @@ class _Reader:
             notes.append("all around")
         if entity.number in self.zones:
             notes.append(f"zone: {self.zones[entity.number]}")
-        if entity.number in self.projected:
-            notes.append(PROJECTED)
+        notes += [PROJECTED] * (entity.number in self.projected) + [DIRECTED] * (entity.number in self.directed)
         letters = self.letters(named, 0)
         return GeometricTolerance(
             entity.number, name, kind, self.measure(values[2]), self.target(values[3]), letters, tuple(notes)

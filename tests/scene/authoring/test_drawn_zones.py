@@ -174,6 +174,28 @@ def test_a_projected_zone_is_left_out_and_a_form_that_is_not_stated_is_told(draw
 
 
 @pytest.mark.parametrize(
+    "record",
+    [
+        "DIRECTED_TOLERANCE_ZONE('',$,#{shape},.F.,(#{of}),#{form},#{plane},.PERPENDICULAR.)",
+        "ORIENTED_TOLERANCE_ZONE('',$,#{shape},.F.,(#{of}),#{form},#{plane},.PARALLEL.,$)",
+        "( DIRECTED_TOLERANCE_ZONE(.PARALLEL.) SHAPE_ASPECT('',$,#{shape},.F.) TOLERANCE_ZONE((#{of}),#{form}) "
+        "TOLERANCE_ZONE_WITH_DATUM(#{plane}) )",
+    ],
+)
+def test_a_zone_with_a_direction_of_its_own_is_left_out_with_the_reason(drawn, record):
+    """A symmetry across B in the direction of C: before, the direction was ignored, without a remark."""
+    path, drawing, face = drawn
+    across, along = (drawing.system(drawing.datum(one, face[name])) for one, name in (("B", "back"), ("C", "left")))
+    made = drawing.tolerance("SYMMETRY", drawing.measure(0.1), drawing.aspect(face["boss_20mm"]), across)
+    form = drawing.add("TOLERANCE_ZONE_FORM('within two parallel planes')")
+    drawing.add(record.format(shape=drawing.shape, of=made, form=form, plane=along))
+    path.write_text(drawing.whole())
+    found = read_part(path).drawing
+    assert not found.measurements
+    assert any("symmetry 0.1" in one and "a direction of its own" in one for one in found.left_out)
+
+
+@pytest.mark.parametrize(
     "written", ["Functional surface of the {} for the sealing ring", "シール面シール面シール面シール面{}"]
 )
 def test_measurements_of_faces_with_long_names_have_names_that_a_task_allows(drawn, written):
