@@ -177,6 +177,21 @@ function leg(name, other) {
   return FLAT.has(one.kind) && length(across) > 0.02 ? extent(pointsOf(name), unit(across)) : longerSide(name);
 }
 
+// Return whether a cylinder is less than a bore or a boss, which span more than 200 deg, and whether it is convex.
+function arc(name) {
+  const one = geometry(name), number = faces.findIndex((face) => face.name === name), way = along(one), { normals } = view.solid;
+  if (one.kind !== 'cylinder') return { part: false, convex: false };
+  const first = unit(cross(way, Math.abs(way[2]) < 0.9 ? [0, 0, 1] : [1, 0, 0])), second = cross(way, first);
+  let outward = 0;
+  const angles = [...new Set([...owner].flatMap((each, i) => (each === number ? [...triangles.subarray(3 * i, 3 * i + 3)] : [])))].map((i) => {
+    const off = less([0, 1, 2].map((axis) => vertices[axis * count + i]), one.point_mm), x = dot(off, first), y = dot(off, second);
+    outward += dot([0, 1, 2].map((axis) => normals[axis * count + i]), add(first.map((value) => x * value), second, y));
+    return Math.atan2(y, x) * DEGREES;
+  }).sort((a, b) => a - b);
+  const gap = Math.max(...angles.map((angle, i) => (angles[i + 1] ?? angles[0] + 360) - angle));
+  return { part: gap >= 160, convex: outward > 0 };
+}
+
 // Return the general tolerance of a measurement by the classes of a drawing's note, as ISO 2768; undefined without one.
 function generalTolerance({ kind, nominal: value, features: names }, dimensions, zones) {
   // sizes of the mesh are rounded, so that a side of 100 mm is one of up to 100 mm
@@ -189,6 +204,8 @@ function generalTolerance({ kind, nominal: value, features: names }, dimensions,
     return wide && Math.round(wide / 60 * 1e4) / 1e4;
   }
   if (value < 0.5) return undefined; // to be given on the drawing
+  const { part, convex } = kind === 'radius' ? arc(names[0]) : {};
+  if (part) return at(convex ? general.broken_edges : general.linear, dimensions, value);
   const half = kind === 'radius' ? 2 : 1, wide = at(general.linear, dimensions, half * value); // half that of the diameter
   return wide === undefined ? undefined : wide / half;
 }

@@ -26,7 +26,7 @@ from mitsim.report.view_clouds import box_around, packed, packed_normals, smooth
 from mitsim.report.view_data import COLOURS, as_json
 from mitsim.scene.authoring.check import Authored
 from mitsim.scene.authoring.finding import SceneFinding
-from mitsim.scene.authoring.general_tolerances import ANGLES, LINEAR, ZONES
+from mitsim.scene.authoring.general_tolerances import ANGLES, BROKEN_EDGES, LINEAR, ZONES
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.triangles import triangles_by_shape
 from mitsim.scene.surface.metals import CONSTANTS
@@ -87,7 +87,7 @@ def page_data(about: Authored, served: str) -> dict[str, Any]:
         "processes": {key: list(process.usual) for key, process in PROCESSES.items()},
         "metals": list(CONSTANTS),
         "known": characterised(about.sensor.name),
-        "general": {"linear": LINEAR, "angles": ANGLES, "zones": ZONES},
+        "general": {"linear": LINEAR, "broken_edges": BROKEN_EDGES, "angles": ANGLES, "zones": ZONES},
         "colours": COLOURS,
         "served": served,
         "findings": findings_data(about.findings),

@@ -1,8 +1,8 @@
 """General tolerances, which a drawing's note "ISO 2768-mK" gives to all dimensions without a tolerance of their own.
 
-Linear dimensions and angles are those of ISO 2768-1:1989, tables 1 and 3; flatness, perpendicularity and symmetry those
-of ISO 2768-2:1989, tables 1 to 3. A size above the last range, or a kind of measurement that the standard does not
-name, has no general tolerance.
+Linear dimensions, broken edges and angles are those of ISO 2768-1:1989, tables 1 to 3; flatness, perpendicularity and
+symmetry those of ISO 2768-2:1989, tables 1 to 3. A size above the last range, or a kind of measurement that the
+standard does not name, has no general tolerance.
 """
 
 from __future__ import annotations
@@ -14,6 +14,15 @@ LINEAR: dict[str, list[float | None]] = {
     "m": [0.1, 0.1, 0.2, 0.3, 0.5, 0.8, 1.2, 2],
     "c": [0.2, 0.3, 0.5, 0.8, 1.2, 2, 3, 4],
     "v": [None, 0.5, 1, 1.5, 2.5, 4, 6, 8],
+}
+
+#: the same for broken edges: external radii, and heights of chamfers; the last range has no end
+BROKEN_EDGES: dict[str, list[float | None]] = {
+    "to_mm": [3, 6, 1e9],
+    "f": [0.2, 0.5, 1],
+    "m": [0.2, 0.5, 1],
+    "c": [0.4, 1, 2],
+    "v": [0.4, 1, 2],
 }
 
 #: ends of the ranges of the shorter leg [mm], and by class plus and minus [minutes of arc]

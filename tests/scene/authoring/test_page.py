@@ -383,6 +383,42 @@ def test_general_tolerances_go_by_sides_and_legs_not_by_the_box(step_here, brows
 @needs_step
 @pytest.mark.browser
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
+def test_general_tolerances_of_radii_go_by_the_edge(step_here, browser, tmp_path):
+    """ISO 2768-m: 0.5 mm for an edge of R4 (table 2), 0.2 mm for a fillet of R20, half that of a boss of 20 mm.
+
+    Before, the edge and the fillet had half the tolerance of a diameter: 0.1 and 0.15 mm.
+    """
+    from OCP.BRepAlgoAPI import BRepAlgoAPI_Fuse
+    from OCP.BRepFilletAPI import BRepFilletAPI_MakeFillet
+    from OCP.BRepPrimAPI import BRepPrimAPI_MakeBox, BRepPrimAPI_MakeCylinder
+    from OCP.gp import gp_Ax2, gp_Dir, gp_Pnt
+
+    solid = BRepPrimAPI_MakeBox(100, 80, 12).Shape()
+    solid = BRepAlgoAPI_Fuse(solid, BRepPrimAPI_MakeBox(gp_Pnt(0, 60, 12), gp_Pnt(100, 80, 60)).Shape()).Shape()
+    boss = gp_Ax2(gp_Pnt(50, 20, 12), gp_Dir(0, 0, 1))
+    solid = BRepAlgoAPI_Fuse(solid, BRepPrimAPI_MakeCylinder(boss, 10, 15).Shape()).Shape()
+    for radius, place in ((20.0, (50, 60, 12)), (4.0, (50, 0, 12))):
+        rounded = BRepFilletAPI_MakeFillet(solid)
+        rounded.Add(radius, edge_at(solid, place, (1, 0, 0)))
+        solid = rounded.Shape()
+    made = tmp_path / "made"
+    mitsim_here("part", write_step([("corner", solid, None)], tmp_path / "corner.step"), "-o", made)
+    page = page_of(made, browser)
+    for name in ("round_r4mm", "fillet_r20mm", "boss_20mm"):
+        page.choose(name)
+        page.measure("radius", "")
+    browser.tell("document.getElementById('author-give').click()")
+    written = tomllib.loads(page.downloaded()[1])["measurements"]
+    assert {one["features"][0]: one["tolerance"] for one in written.values()} == {
+        "round_r4mm": 0.5,
+        "fillet_r20mm": 0.2,
+        "boss_20mm": 0.1,
+    }
+
+
+@needs_step
+@pytest.mark.browser
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
 def test_tables_are_whole_on_a_narrow_screen(step_file, step_here, browser, tmp_path):
     mitsim_here("part", step_file, "-o", tmp_path / "made")
     mitsim_here(
