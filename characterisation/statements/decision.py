@@ -35,7 +35,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,13 +52,9 @@ from characterisation.statements.coverage import (
     share,
     standard_errors,
 )
+from characterisation.statements.global_risks import Errors, global_risks, limited_below
 from characterisation.statements.one_sided import OneSidedErrors, stated_errors, without_bias
 from characterisation.statements.tolerance import Tolerance
-from characterisation.tasks.decision_table import Decision
-from characterisation.tasks.task_file import AT_FOLD
-
-#: errors (n,) of trials, or those of a value that folds
-Errors = Floats | OneSidedErrors
 
 #: least number of trials whose order statistics give the coverage interval
 FEW = round(2 / (1 - COVERAGE)) - 1
@@ -88,8 +84,8 @@ class Decided:
     verdict
         - ``fits``: the demand is met.
         - ``does not fit``: the demand is not met.
-        - ``undecidable``: no reading can be accepted, because the expanded uncertainty is as large as the tolerance,
-          also at the low end of its 95 % interval, or no value was measured.
+        - ``undecidable``: no reading can be accepted, also at the low end of the 95 % interval of the expanded
+          uncertainty, or with JCGM 106 of the risk that the largest guard band leaves; or no value was measured.
         - ``not decided``: too few trials to decide, such as a single one with a value, or less than five without one.
     fits_corrected
         Whether it fits if the bias is subtracted.
@@ -157,9 +153,10 @@ def decide(
     if high <= 1:
         verdict = "fits"
     elif low > 1:
-        verdict = "undecidable" if limits is None and low >= _hopeless(rule) else "does not fit"
+        hopeless = limits is None and _hopeless(errors, tolerance, low, related)
+        verdict = "undecidable" if hopeless else "does not fit"
     edges = [edge for edge in (tolerance.lower, tolerance.upper) if math.isfinite(edge)]
-    if _limited_below(taken, tolerance):
+    if limited_below(taken, tolerance):
         edges = [tolerance.lower]
     through = [share(_within(edge + _errors_at(taken, edge), limits)) for edge in edges]
     worst = max(through, key=lambda probability: probability.value)
@@ -180,9 +177,19 @@ def decide(
     )
 
 
-def _hopeless(rule: Decision) -> float:
-    """Return the demand from which on no reading is accepted; of JCGM 106 it depends on the process, so 1."""
-    return {"iso_14253_1": 1 / rule.largest_share, "simple_acceptance": rule.least_ratio}.get(rule.rule, 1.0)
+def _hopeless(errors: Errors, tolerance: Tolerance, low: float, related: NDArray[np.int64] | None) -> bool:
+    """Return whether surely no reading is accepted, by the ``low`` end of the demand; of JCGM 106 by the risk left."""
+    rule = tolerance.rule
+    if rule.rule != "jcgm_106":
+        return low >= (1 / rule.largest_share if rule.rule == "iso_14253_1" else rule.least_ratio)
+    assert rule.consumer_risk is not None
+    narrowest, most = (tolerance.lower + tolerance.size, tolerance.upper - tolerance.size), rule.consumer_risk
+
+    def left(part: Errors) -> float:
+        bias = float(stated_errors(part).mean()) if rule.subtract_bias else 0.0
+        return global_risks(without_bias(part, bias), tolerance, narrowest)[0] / most
+
+    return _risk_interval(errors, left, related)[0] >= 1
 
 
 def _errors_at(errors: Errors, value: float) -> Floats:
@@ -190,15 +197,10 @@ def _errors_at(errors: Errors, value: float) -> Floats:
     return errors.at(abs(errors.fold - value)) if isinstance(errors, OneSidedErrors) else errors
 
 
-def _limited_below(errors: Errors, tolerance: Tolerance) -> bool:
-    """Return whether only the lower limit is one that values can exceed: those of a right angle are at most 90 deg."""
-    return isinstance(errors, OneSidedErrors) and errors.fold == 90 and tolerance.upper >= 90 - AT_FOLD
-
-
 def acceptance(errors: Errors, tolerance: Tolerance) -> tuple[float, float] | None:
     """Return the readings, from and to, that the rule of the tolerance accepts; None if there are none."""
     lower, upper, rule = tolerance.lower, tolerance.upper, tolerance.rule
-    folds = _limited_below(errors, tolerance)
+    folds = limited_below(errors, tolerance)
     if folds and not rule.subtract_bias:
         upper = 90.0  # no reading lies above; one minus its bias may
     if rule.rule == "simple_acceptance":
@@ -261,50 +263,6 @@ def _scaled_without_bias(errors: Errors, factor: float) -> Errors:
     return np.asarray(factor * (errors - errors.mean()))
 
 
-def global_risks(errors: Errors, tolerance: Tolerance, limits: tuple[float, float] | None) -> tuple[float, float]:
-    """Return the global consumer's and producer's risk (JCGM 106, 9.5) of accepting readings between ``limits``.
-
-    They are means over parts of the tolerance's process, with equally likely errors (n,).
-    """
-    process, lower, upper = tolerance.process.cdf, tolerance.lower, tolerance.upper
-    if isinstance(errors, OneSidedErrors):
-        if math.isinf(lower):
-            return _one_sided_risks(errors, process, upper, limits and limits[1])
-        if _limited_below(errors, tolerance):
-
-            def deviations(size: Floats) -> Floats:
-                return np.asarray(process(90 + size) - process(90 - size))
-
-            return _one_sided_risks(errors, deviations, 90 - lower, limits and 90 - limits[0])
-        errors = errors.stated
-    conforming = float(process(upper) - process(lower))
-    if limits is None:
-        return 0.0, conforming
-    a, b = limits[0] - errors, limits[1] - errors  # values whose reading lies at a limit
-    below = process(np.minimum(lower, b)) - process(a)
-    above = process(b) - process(np.maximum(upper, a))
-    right = process(np.minimum(upper, b)) - process(np.maximum(lower, a))
-    consumer = np.maximum(below, 0.0) + np.maximum(above, 0.0)
-    return float(consumer.mean()), conforming - float(np.maximum(right, 0.0).mean())
-
-
-def _one_sided_risks(
-    errors: OneSidedErrors, process: Callable[[Any], Any], largest: float, limit: float | None
-) -> tuple[float, float]:
-    """Return the global risks of accepting readings of deviations up to a limit, of a value that folds.
-
-    ``process`` is the distribution function of the deviations of the parts, of which those up to ``largest`` conform.
-    No reading is accepted if ``limit`` is None.
-    """
-    conforming = float(process(largest))
-    if limit is None:
-        return 0.0, conforming
-    low, high = errors.accepted_parts(limit)
-    accepted = process(np.minimum(largest, high)) - process(np.minimum(largest, low))
-    wrong = process(np.maximum(largest, high)) - process(np.maximum(largest, low))
-    return float(wrong.mean()), float(conforming - accepted.mean())
-
-
 def _least_guard(errors: Errors, tolerance: Tolerance) -> float:
     """Return the least guard band, up to the whole tolerance, with at most the stated consumer's risk."""
     most = tolerance.rule.consumer_risk
@@ -338,11 +296,21 @@ def _demand_interval(
         ratio, (low, high) = asked / expanded_uncertainty(stated), expanded_interval(stated, related)
         return ratio * low, ratio * high
 
+    return _risk_interval(errors, lambda part: demand(part, tolerance), related)
+
+
+def _risk_interval(
+    errors: Errors, risk: Callable[[Errors], float], related: NDArray[np.int64] | None
+) -> tuple[float, float]:
+    """Return the 95 % interval of a risk of trials, symmetric in its logarithm."""
+    value = risk(errors)
+    if not value > 0:
+        return 0.0, 0.0
+
     def without_block(chosen: Floats) -> Floats:
         kept = chosen.astype(int)
-        part = errors.part(kept) if isinstance(errors, OneSidedErrors) else errors[kept]
-        return np.array([demand(part, tolerance)])
+        return np.array([risk(errors.part(kept) if isinstance(errors, OneSidedErrors) else errors[kept])])
 
     moved = float(standard_errors(np.arange(len(errors), dtype=float), without_block, related)[0])
-    factor = factor_of_limits(moved / asked)
-    return asked / factor, asked * factor
+    factor = factor_of_limits(moved / value)
+    return value / factor, value * factor

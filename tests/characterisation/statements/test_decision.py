@@ -9,7 +9,8 @@ from scipy.stats import binom, gamma, norm, t
 
 from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
-from characterisation.statements.decision import acceptance, decide, global_risks, needed
+from characterisation.statements.decision import acceptance, decide, needed
+from characterisation.statements.global_risks import global_risks
 from characterisation.statements.statement import statement
 from characterisation.statements.tolerance import Tolerance, plus_minus, tolerance_of
 from characterisation.statements.verdict_words import Judged, in_words, result_reasons
