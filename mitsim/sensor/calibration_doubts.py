@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-#: shortest baseline [mm] that raises no doubt about the unit
-_SHORTEST_MM = 5.0
+from characterisation.files.errors import InputError
+
+#: longest baseline [mm] that is plausible in a unit that the file does not state. Chosen: the 1.8 cm of a RealSense
+#: D405, read in metres, are longer
+_LONGEST_MM = 1500.0
+
+#: shortest baseline [mm] that is plausible in mm if nothing tells the unit. Chosen: rigs whose eyes stand over 40 cm
+#: apart seldom state them in cm; those of a RealSense D435 stand 50 mm apart
+_SHORTEST_MM = 40.0
 
 #: tangential coefficients of a lens are smaller
 _LARGEST_TANGENTIAL = 0.02
@@ -23,14 +31,30 @@ _MOST_ASPECT = 1.25
 _MOST_TURNED_DEG = 60.0
 
 
-def baseline_note(name: str, baseline_mm: float) -> str:
-    """Return a warning about a distance between two eyes [mm] that suggests another unit; empty without doubt."""
-    if baseline_mm >= _SHORTEST_MM or baseline_mm == 0:
-        return ""
-    return (
-        f"{name} stands {baseline_mm:.3g} mm from the first camera: if the translation is in metres, say so in a "
-        "sensor file: [calibration] with to_mm = 1000"
-    )
+def check_unit(where: str | Path, name: str, baseline: float, unit_mm: float | None) -> None:
+    """Check that a distance between two eyes is plausible in a unit that the file itself does not state.
+
+    Parameters
+    ----------
+    where, name
+        The file and the second eye, for messages.
+    baseline
+        As the file has it.
+    unit_mm
+        The unit that the format implies [mm]; None if nothing tells it: then mm is assumed.
+
+    Raises
+    ------
+    InputError
+        If the distance is too long, or, in mm, too short.
+    """
+    low = _SHORTEST_MM if unit_mm is None else 0.0
+    if baseline == 0 or low <= baseline * (unit_mm or 1.0) <= _LONGEST_MM:
+        return
+    limits = f"{low:g} to {_LONGEST_MM:g} mm" if low else f"up to {_LONGEST_MM / (unit_mm or 1.0):g}, as in its format"
+    found = f"a baseline of {baseline:.4g} in a unit that the file does not state"
+    hint = 'state it: unit: "cm" (mm, m, inch) beside the translation, or to_mm = 10 in [calibration] of a sensor file'
+    raise InputError(where, f"translation of {name}", found, f"{limits}, or a stated unit", hint)
 
 
 def board_unit_note(name: str, baseline_mm: float) -> str:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mitsim.sensor.calibration_numbers import Composed, dotted, vector
+from mitsim.sensor.calibration_qualifiers import OF_FORMAT
 
 #: name of Kalibr for the motion from the camera before
 _STEP = "T_cn_cnm1"
@@ -50,7 +51,7 @@ def pose_in(maps: Sequence[tuple[str, dict[str, Any]]]) -> dict[str, Composed]:
             numbers = vector(table.get(key), 16)
             if numbers is not None:
                 motion = inverse(numbers.reshape(4, 4)) if of_camera else numbers.reshape(4, 4)
-                posed = Composed(motion, (dotted(name, key),), {"unit": unit} if unit else table)
+                posed = Composed(motion, (dotted(name, key),), ({OF_FORMAT: unit} if unit else {}) | table)
                 return {"rotation": posed, "translation": posed}
         for turns, shifts in (_TO_CAMERA, _OF_CAMERA) if name else ():
             ordered = [spelling for spelling in table if spelling.lower().endswith(("xyzw", "wxyz"))]
@@ -61,7 +62,7 @@ def pose_in(maps: Sequence[tuple[str, dict[str, Any]]]) -> dict[str, Composed]:
                 continue
             rotation = R.reshape(3, 3) if len(R) == 9 else R
             if of_librealsense and len(R) == 9 and np.ndim(table[turn]) == 1:
-                rotation, table = rotation.T, {"unit": "m"} | table
+                rotation, table = rotation.T, {OF_FORMAT: "m"} | table
             if shifts is _OF_CAMERA[1] and len(R) != 4:
                 rotation = Rotation.from_rotvec(R).as_matrix() if len(R) == 3 else rotation
                 rotation, T = rotation.T, -rotation.T @ T

@@ -28,7 +28,7 @@ from mitsim.sensor.calibration_eyes import eyes_of, lens_in, usual_values
 from mitsim.sensor.calibration_names import USUAL_NAMES
 from mitsim.sensor.calibration_numbers import Composed, dotted, vector
 from mitsim.sensor.calibration_poses import inverse
-from mitsim.sensor.calibration_qualifiers import rectified_pair
+from mitsim.sensor.calibration_qualifiers import OF_FORMAT, rectified_pair
 from mitsim.sensor.calibration_quaternions import with_rotations
 from mitsim.sensor.lens_models import is_fisheye
 
@@ -128,8 +128,9 @@ def _of_old_orb_slam(tree: dict[str, Any]) -> dict[str, Any]:
     pair = rectified_pair(sides[0], sides[1]) if {"LEFT.K", "RIGHT.K"} <= set(tree) else None
     if pair is not None:
         sources = ("LEFT.R", "LEFT.P", "RIGHT.R", "RIGHT.P")
-        posed = {name: Composed(value, sources, {"unit": "m"}) for name, value in zip(("+R", "+T"), pair, strict=True)}
-        return {name: value for name, value in tree.items() if not name.startswith("Camera.")} | posed
+        rotation, translation = (Composed(value, sources, {OF_FORMAT: "m"}) for value in pair)
+        kept = {name: value for name, value in tree.items() if not name.startswith("Camera.")}
+        return kept | {"+R": rotation, "+T": translation}
     if "Tlr" in tree:
         return {re.sub(r"^Camera\.(?=f[xy]$|c[xy]$|[kp]\d$)", "Camera1.", name): value for name, value in tree.items()}
     return tree
@@ -137,7 +138,7 @@ def _of_old_orb_slam(tree: dict[str, Any]) -> dict[str, Any]:
 
 def _orb_slam(tree: dict[str, Any]) -> dict[str, Any]:
     """Return the values that settings of ORB-SLAM3 state once for two cameras [m]; a rectified pair has one matrix."""
-    metres = {"unit": "m"}
+    metres = {OF_FORMAT: "m"}
     for name in ("Stereo.T_c1_c2", "Tlr"):
         step = vector(tree.get(name))
         if step is not None and len(step) in (12, 16):

@@ -49,6 +49,9 @@ LENGTHS_MM = {word: UNITS_MM[word] for word in ("um", "mm", "cm", "m", "inch", "
 #: names under which files state their unit of length
 UNIT_NAMES = ("unit", "units", "length_unit", "world_units", "WorldUnits", "translation_unit", "baseline_unit")
 
+#: name of the unit that a format implies, which the file itself does not state
+OF_FORMAT = "unit of the format"
+
 #: units of other quantities that may have the same name
 _NOT_LENGTHS = ("px", "pixel", "pixels", "deg", "degree", "degrees", "rad", "radian", "radians", "none")
 
@@ -216,14 +219,14 @@ def of_images(
 
 
 def unit_mm(table: dict[str, Any], where: str | Path) -> float | None:
-    """Return the unit of length [mm] that a table states; None if it states none.
+    """Return the unit of length [mm] that a table states, else that of its format; None without both.
 
     Raises
     ------
     InputError
         If the unit is unknown.
     """
-    for name in UNIT_NAMES:
+    for name in (*UNIT_NAMES, OF_FORMAT):
         text = table.get(name)
         if isinstance(text, str) and text:
             unit = UNITS_MM.get(text.lower())

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mitsim.sensor.calibration_numbers import vector
-from mitsim.sensor.calibration_qualifiers import UNIT_NAMES
+from mitsim.sensor.calibration_qualifiers import OF_FORMAT
 
 #: largest difference of the length of a quaternion from 1: that of three digits
 _LENGTH_TOLERANCE = 1e-2
@@ -33,8 +33,8 @@ def with_rotations(table: dict[str, Any]) -> dict[str, Any]:
     of_ros = [
         len(value) for name, value in table.items() if isinstance(value, dict) and not isinstance(out[name], dict)
     ]
-    if sorted(of_ros) == [3, 4] and not set(UNIT_NAMES) & set(out):
-        out["unit"] = "m"
+    if sorted(of_ros) == [3, 4]:
+        out[OF_FORMAT] = "m"
     return out
 
 

@@ -22,13 +22,13 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.files.documents import Document, validate
 from characterisation.files.errors import InputError, nearest
-from mitsim.sensor.calibration_doubts import baseline_note, board_unit_note, facing_note, lens_note, matrix_notes
+from mitsim.sensor.calibration_doubts import board_unit_note, check_unit, facing_note, lens_note, matrix_notes
 from mitsim.sensor.calibration_eyes import size_of
 from mitsim.sensor.calibration_formats import beside
 from mitsim.sensor.calibration_names import USUAL_NAMES, Names
 from mitsim.sensor.calibration_numbers import by_rows, checked_matrix, numbers_of, rotation_matrix
 from mitsim.sensor.calibration_poses import is_motion
-from mitsim.sensor.calibration_qualifiers import of_images, read_out_of, rectified_pair, unit_mm
+from mitsim.sensor.calibration_qualifiers import OF_FORMAT, of_images, read_out_of, rectified_pair, unit_mm
 from mitsim.sensor.calibration_quaternions import ORDERED
 from mitsim.sensor.calibration_tree import CalibrationTree, Found, read_tree
 from mitsim.sensor.lens_models import lens_model
@@ -52,7 +52,7 @@ class CalibrationTable(Document):
     """Source of the geometry of cameras and projector, in place of their own keys.
 
     - ``file``: one or several, beside the sensor file.
-    - ``to_mm``: their unit of length in mm; by default the unit that the file or its format states, else 1.
+    - ``to_mm``: their unit of length in mm; by default the unit that the file or its format states, else 1 if likely.
     - ``cameras``: names, the reference camera first.
     - ``projector``: whether the files also calibrate it.
     - ``model`` of the cameras' lenses; by default the one that the file states, else perspective.
@@ -335,20 +335,21 @@ def _pose(values: _Values, name: str, index: int, sensor_keys: dict[str, Any]) -
             allowed = f"a rotation matrix or vector, or {ORDERED}"
             raise InputError(rotation.file, rotation.name, f"four numbers, {R.ravel().tolist()}", allowed)
         R, T = R[:3, :3] if R.shape in motions else R, T[:3, 3] if T.shape in motions else T
-        stated = unit_mm(translation.table, translation.file)
+        table = translation.table
     elif pair is not None:
-        (R, T), stated = pair, 1000.0
+        (R, T), table = pair, {OF_FORMAT: "m"}
     else:
         return {}
     R = rotation_matrix(R, name, file, values.by_columns and rotation is not None)
-    to_mm = values.calibration_table.to_mm
+    to_mm, stated = values.calibration_table.to_mm, unit_mm(table, file)
+    if to_mm is None and "position_mm" not in sensor_keys and unit_mm(table | {OF_FORMAT: ""}, file) is None:
+        check_unit(file, name, float(np.linalg.norm(T)), stated)
     T = T * (to_mm or stated or 1.0)
     if to_mm is not None and stated is not None and to_mm != stated:
         values.notes.append(f"calibration: to_mm = {to_mm:g} is used, though the file states {stated:g} mm")
-    baseline = float(np.linalg.norm(T))
     of_mc_calib = translation is not None and to_mm is stated is None and "camera_pose_matrix" in translation.name
-    doubt = board_unit_note if of_mc_calib else baseline_note
-    values.notes += [f"calibration: {note}" for note in (doubt(name, baseline), facing_note(name, R)) if note]
+    doubts = [board_unit_note(name, float(np.linalg.norm(T))) if of_mc_calib else "", facing_note(name, R)]
+    values.notes += [f"calibration: {note}" for note in doubts if note]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # at 90 deg about y the angles are not unique; any solution is valid
         turn = Rotation.from_matrix(R.T)

@@ -144,6 +144,17 @@ PAIRS = {
 }
 
 
+def test_lengths_of_a_format_in_metres_are_refused_if_they_are_those_of_a_file_in_centimetres(tmp_path):
+    """The eyes of a RealSense D405 stand 1.8 cm apart: they were read as 1.8 m. A stated unit is followed."""
+    cameras = {"left": OF_LIBREALSENSE, "right": OF_LIBREALSENSE | {"rotation": np.eye(3).ravel().tolist()}}
+    cameras["right"] |= {"translation": [-1.8, 0.0, 0.0]}
+    with pytest.raises(InputError, match=r"baseline of 1\.8 .*up to 1\.5, as in its format.*to_mm"):
+        read_calibration(saved(tmp_path / "a.json", cameras))
+    cameras["right"] |= {"unit": "cm"}
+    right = read_calibration(saved(tmp_path / "b.json", cameras)).rig.cameras["right"]
+    np.testing.assert_allclose(right.centre, (18, 0, 0), atol=1e-12)
+
+
 def test_all_single_numbers_of_opencvs_lens_are_read(tmp_path):
     """Before, the thin prism and the tilt were left out without a word."""
     names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY")
@@ -160,7 +171,6 @@ DOUBTS = {
     "the principal point 2, -3 is far from the middle": NUMBERS | {"cx": 2.0, "cy": -3.0},
     "focal lengths of 600 and 322 px differ": {"intrinsics": [600.0, 322.0, 602.0, 238.0], "resolution": [640, 480]},
     "right looks 69 deg away": {"K1": K.tolist(), "K2": K2.tolist(), "R": [0.1, 1.2, -0.3], "T": [-60, 0, 0]},
-    "right stands 1.2 mm": {"K1": K.tolist(), "K2": K2.tolist(), "R": np.eye(3).tolist(), "T": [-1.2, 0, 0]},
     "right looks 172 deg away": {"K1": K.tolist(), "K2": K2.tolist(), "R": [0.0, 3.0, 0.0], "T": [-60, 0, 0]},
 }
 

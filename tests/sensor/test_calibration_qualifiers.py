@@ -327,8 +327,11 @@ def test_units_of_length(tmp_path):
     pair = {"K1": K, "D1": D, "K2": K2, "D2": D, "R": R}
     read = read_calibration(opencv_file(tmp_path / "a.yml", **pair, T=T), SIZE)
     assert read.notes == ()
-    read = read_calibration(opencv_file(tmp_path / "b.yml", **pair, T=T / 1000), SIZE)
-    assert "right stands 0.06 mm from the first camera" in read.notes[0] and "to_mm = 1000" in read.notes[0]
+    for factor in (1e-3, 1e-1, 1e3):  # m, cm and um
+        with pytest.raises(InputError, match=r"baseline of .* the file does not state.*unit: \"cm\".*to_mm"):
+            read_calibration(opencv_file(tmp_path / "b.yml", **pair, T=T * factor), SIZE)
+    read = read_calibration(opencv_file(tmp_path / "b.yml", **pair, T=T / 10, unit="cm"), SIZE)
+    sees(read.rig.cameras["right"], K2, D, R, T)
     read = read_calibration(opencv_file(tmp_path / "c.yml", **pair, T=T / 25.4, unit="inch"), SIZE)
     sees(read.rig.cameras["right"], K2, D, R, T)
     with pytest.raises(InputError, match=r"unit: found 'furlong'; allowed: .*to_mm"):

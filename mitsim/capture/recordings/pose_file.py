@@ -21,7 +21,7 @@ from mitsim.capture.calibration import EXACT, PoseDocument
 from mitsim.capture.recordings.cloud_numbers import METRES_UNDER
 from mitsim.capture.recordings.json_fields import nearest_rotation, parsed_json
 from mitsim.sensor.calibration_numbers import vector
-from mitsim.sensor.calibration_qualifiers import UNIT_NAMES, unit_mm
+from mitsim.sensor.calibration_qualifiers import OF_FORMAT, UNIT_NAMES, unit_mm
 from mitsim.sensor.calibration_quaternions import ORDERED, with_rotations
 from mitsim.sensor.transforms import Transform, is_rotation
 from mitsim.sensor.yaml_values import read_yaml
@@ -107,7 +107,7 @@ def _rows_of(file: Path, table: dict[str, Any]) -> list[list[float]]:
     while (name := next((key for key in _MESSAGES if isinstance(table.get(key), dict)), None)) is not None:
         table = table[name]
     table = with_rotations(table)
-    names = [name for name in table if name not in UNIT_NAMES]
+    names = [name for name in table if name not in (*UNIT_NAMES, OF_FORMAT)]
     positions = [name for name in names if name in _POSITIONS]
     turns = [name for name in names if name.lower().endswith(_TURNS)]
     T, R = (vector(table[keys[0]]) if len(keys) == 1 else None for keys in (positions, turns))

@@ -81,7 +81,7 @@ def _eye(eye: Camera, matrix: str, distortion: str, size: str) -> list[str]:
 
 def _pose(eye: Camera) -> list[str]:
     motion = eye.sensor_from_camera.inverse()
-    return [*_matrix("R", motion.rotation), *_matrix("T", motion.translation.reshape(3, 1))]
+    return [*_matrix("R", motion.rotation), *_matrix("T", motion.translation.reshape(3, 1)), 'unit: "mm"']
 
 
 def _matrix(name: str, values: ArrayLike) -> list[str]:
