@@ -13,14 +13,16 @@ Poses: :mod:`mitsim.sensor.calibration_poses`.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.errors import InputError
 from mitsim.sensor.calibration_names import USUAL_NAMES
 from mitsim.sensor.calibration_numbers import Composed, dotted, vector
 from mitsim.sensor.calibration_poses import pose_in, second_from_first
@@ -48,6 +50,9 @@ _LENSES = frozenset(name.lower() for name in (*USUAL_NAMES["distortion"][0], "co
 #: single numbers of the distortion in OpenCV's order, and those of a fisheye lens
 _BENT = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "taux", "tauy")
 _FISHEYE = ("k1", "k2", "k3", "k4")
+
+#: names of lists of these names, which state the order of a list of coefficients
+_NAMES_OF_BENT = re.compile(r"(?i:(?:dist|coef).*(?:names|order|labels))")
 
 #: names of lists of radial and of tangential coefficients; MATLAB's are written together
 _RADIAL_TANGENTIAL = (
@@ -252,12 +257,8 @@ def lens_in(maps: Sequence[_Named], fisheye: bool) -> Composed | None:
             if vector(table.get(low.get(coefficient, "")), 1) is not None
         ]
         if names:
-            order = _FISHEYE if fisheye else _BENT
-            count = next(length for length in (4, 5, 8, 12, 14) if length > order.index(names[-1]))
-            numbers = [
-                _number(table[low[coefficient]]) if coefficient in names else 0.0 for coefficient in order[:count]
-            ]
-            return Composed(np.array(numbers), tuple(dotted(name, low[coefficient]) for coefficient in names), table)
+            numbers = _ordered({coefficient: _number(table[low[coefficient]]) for coefficient in names}, fisheye)
+            return Composed(numbers, tuple(dotted(name, low[coefficient]) for coefficient in names), table)
         radial, tangential = (next((key for key in keys if key in table), "") for keys in _RADIAL_TANGENTIAL)
         k, p = vector(table.get(radial)), vector(table.get(tangential, [0.0, 0.0]), 2)
         if k is not None and p is not None and 1 <= len(k) <= 3:
@@ -265,6 +266,54 @@ def lens_in(maps: Sequence[_Named], fisheye: bool) -> Composed | None:
             sources = tuple(dotted(name, source) for source in (radial, tangential) if source)
             return Composed(np.array([k1, k2, *p, k3]), sources, table)
     return None
+
+
+def in_opencvs_order(value: Any, table: Mapping[str, Any], fisheye: bool, where: Path) -> Any:
+    """Return coefficients in OpenCV's order if their map states another; anything else as it is.
+
+    Parameters
+    ----------
+    value
+        The coefficients, as the file has them.
+    table
+        Their map, which may have a list of names, such as ``distortion_names``.
+    fisheye
+        Whether they are those of a fisheye lens.
+    where
+        The file, for messages.
+
+    Raises
+    ------
+    InputError
+        If a name is unknown, or there are not as many names as coefficients.
+
+    See Also
+    --------
+    lens_in : coefficients that are single numbers
+    """
+    numbers = vector(value)
+    if numbers is None or not numbers.size:
+        return value
+    for key in filter(_NAMES_OF_BENT.search, table):
+        stated = table[key]
+        words = stated.replace(",", " ").split() if isinstance(stated, str) else np.ravel(np.asarray(stated, object))
+        if not all(isinstance(word, str) for word in words):
+            continue
+        names = [word.strip().lower().replace("_", "") for word in words]
+        known = _FISHEYE if fisheye else _BENT
+        if sorted(set(names) & set(known)) != sorted(names) or len(names) != numbers.size:
+            allowed = f"the name of each of the {numbers.size} coefficients, of {', '.join(known)}"
+            raise InputError(where, key, ", ".join(words), allowed)
+        return _ordered(dict(zip(names, numbers.tolist(), strict=True)), fisheye)
+    return value
+
+
+def _ordered(named: Mapping[str, float], fisheye: bool) -> NDArray[np.float64]:
+    """Return coefficients by name in OpenCV's order, 0 for those that are missing."""
+    order = _FISHEYE if fisheye else _BENT
+    last = max(order.index(name) for name in named)
+    count = next(length for length in (4, 5, 8, 12, 14) if length > last)
+    return np.array([named.get(name, 0.0) for name in order[:count]])
 
 
 def _size(maps: list[_Named]) -> Composed | None:

@@ -164,6 +164,28 @@ def test_all_single_numbers_of_opencvs_lens_are_read(tmp_path):
         sees(read_calibration(saved(tmp_path / "a.json", table), SIZE).rig.reference, K, bent[:count])
 
 
+def test_coefficients_are_read_by_the_names_beside_them(tmp_path):
+    """Before, k3 was p1: a point at the edge of the image moved by more than a pixel."""
+    named = {"k1": -0.11, "k2": 0.08, "p1": 1.2e-3, "p2": -8e-4, "k3": -0.02}
+    table = {"K": K.tolist(), "distortion": [named[name] for name in ("k1", "k2", "k3", "p1", "p2")]}
+    x, y = 0.5, 0.4  # on the plane z = 1: OpenCV's formula, written out
+    r2 = x * x + y * y
+    radial = 1 + named["k1"] * r2 + named["k2"] * r2**2 + named["k3"] * r2**3
+    bent_x = x * radial + 2 * named["p1"] * x * y + named["p2"] * (r2 + 2 * x * x)
+    bent_y = y * radial + named["p1"] * (r2 + 2 * y * y) + 2 * named["p2"] * x * y
+    for order in (["k1", "k2", "k3", "p1", "p2"], "K1, K2, K3, P1, P2"):
+        camera = read_calibration(saved(tmp_path / "a.json", table | {"distortion_names": order}), SIZE).rig.reference
+        pixels = cv2.projectPoints(np.array([[x, y, 1]]), np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)[0]
+        np.testing.assert_allclose(pixels.ravel(), (FX * bent_x + CX, FY * bent_y + CY), atol=1e-9)
+    round_lens = table | {"distortion": [4.0, 3.0, 2.0, 1.0], "distortion_names": ["k4", "k3", "k2", "k1"]}
+    for folded in (round_lens | {"model": "fisheye"}, {"camera": round_lens | {"model": "fisheye"}}):
+        read = read_calibration(saved(tmp_path / "a.json", folded), SIZE)
+        assert read.rig.reference.distortion.tolist() == [1, 2, 3, 4]
+    for wrong in (["k1", "k2", "k3", "p1", "q2"], ["k1", "k2", "k3", "p1", "p1"], ["k1", "k2"]):
+        with pytest.raises(InputError, match=r"distortion_names: .* each of the 5 coefficients, of k1, k2, p1"):
+            read_calibration(saved(tmp_path / "a.json", table | {"distortion_names": wrong}), SIZE)
+
+
 DOUBTS = {
     "has four coefficients, of which p1 and p2": {"K": K.tolist(), "D": [-0.05, 0.03, 0.06, -0.04]},
     "has p1 and p2 of 0.08 and 0.001": {"K": K.tolist(), "D": [-0.2, 0.1, 0.08, 0.001, -0.0005]},
