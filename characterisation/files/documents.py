@@ -250,7 +250,11 @@ def _explain(
             meant = nearest(key, names)
             other_keys = [missing_key for missing_key in missing if f"{missing_key.rpartition('.')[2]!r}" not in meant]
             also = f"Also missing: {', '.join(other_keys)}" if other_keys else ""
-            return InputError(where, field, "an unknown key", ", ".join(names) or "no keys", _joined(meant, also))
+            above = "" if meant and key not in fields_of(model) else _header_above(where, field)
+            meant = "" if above else meant
+            return InputError(
+                where, field, "an unknown key", ", ".join(names) or "no keys", _joined(meant, above, also)
+            )
         case "missing" | "union_tag_not_found":
             return missing_error(where, missing or [field])
         case "union_tag_invalid":
@@ -295,6 +299,14 @@ _TYPES = {
 
 def _joined(*sentences: str) -> str:
     return " ".join(sentence for sentence in sentences if sentence)
+
+
+def _header_above(where: str | Path, field: str) -> str:
+    """Return why a key of a TOML file stands in a table, as a hint; empty of keys in no table."""
+    table = ".".join(part for part in field.split(".")[:-1] if not part.isdecimal())
+    if not table or not str(where).lower().endswith(".toml"):
+        return ""
+    return f"keys after the header [{table}] belong to that table; keys of the whole file come before all headers"
 
 
 def _keys_at(model: type[Document], location: tuple[Any, ...]) -> list[str]:

@@ -323,6 +323,19 @@ def test_of_several_cameras_of_matlab_none_is_taken_unasked(tmp_path):
 # --- units and warnings
 
 
+@pytest.mark.parametrize("header", ["calibration", "calibration.keys.camera", "unknowns", "unknowns.calibration"])
+@pytest.mark.parametrize("key", ['name = "mine"', "depth_scale = 0.1"])
+def test_a_key_of_the_file_after_the_header_of_a_table_is_refused_with_the_cause(tmp_path, header, key):
+    """Before, all of [unknowns] was left out unread, and other tables did not say why the key is in them."""
+    opencv_file(tmp_path / "c.yml", camera_matrix=K, distortion=D)
+    base = '[calibration]\nfile = "c.yml"\nprojector = false\n'
+    (tmp_path / "a.toml").write_text(f"{base}{f'[{header}]' * (header != 'calibration')}\n{key}\n")
+    with pytest.raises(InputError) as refusal:
+        read_calibration(tmp_path / "a.toml", SIZE)
+    assert refusal.value.field == f"{header}.{key.split()[0]}"
+    assert f"after the header [{header}]" in refusal.value.hint or "did you mean 'scale'" in refusal.value.hint
+
+
 def test_units_of_length(tmp_path):
     pair = {"K1": K, "D1": D, "K2": K2, "D2": D, "R": R}
     read = read_calibration(opencv_file(tmp_path / "a.yml", **pair, T=T), SIZE)

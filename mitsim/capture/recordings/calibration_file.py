@@ -37,6 +37,7 @@ from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.opencv_calibration import CalibrationTable, has_pair, with_calibration
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.sensor_file import OpticsTable
+from mitsim.sensor.unknowns import UnknownsTable
 
 
 @dataclass(frozen=True)
@@ -58,11 +59,15 @@ class Calibrated:
 
 
 class RigFile(Document):
-    """A small TOML file: ``name`` of the sensor, and its cameras as in a sensor TOML."""
+    """A small TOML file: ``name`` of the sensor, and its cameras as in a sensor TOML.
+
+    Statements use the ``unknowns``, which a sensor file of the same rig has.
+    """
 
     name: str = ""
     calibration: CalibrationTable | None = None
     cameras: dict[str, OpticsTable] = Field(min_length=1, max_length=2)
+    unknowns: UnknownsTable = UnknownsTable()
 
 
 def read_calibration(source: str | Path, size: tuple[int, int] | None = None) -> Calibrated:
@@ -229,7 +234,6 @@ def _of_toml(path: Path, size: tuple[int, int] | None) -> Calibrated:
     if path.suffix.lower() == ".toml":
         written = read_toml_table(path)
         if "technology" not in written:
-            written.pop("unknowns", None)  # of statements; a sensor file of the same rig has them
             content, notes = with_calibration(path, written, size)
             table = validate(path, content, RigFile)
             rig = Rig({name: optics.camera() for name, optics in table.cameras.items()})

@@ -126,6 +126,20 @@ def test_an_unknown_key_gets_the_keys_of_its_own_table(place, field, allowed):
     assert "'scale'" not in caught.value.hint
 
 
+@pytest.mark.parametrize(("place", "table"), [(("cameras", "left"), "cameras.left"), (("groups", 0), "groups")])
+def test_a_key_of_the_whole_file_in_a_table_is_refused_with_the_cause(place, table):
+    content = copy.deepcopy(TABLE)
+    inner = content
+    for part in place:
+        inner = inner[part]
+    inner["note"] = "of the file"
+    with pytest.raises(InputError, match=rf"after the header \[{table}\] belong to that table"):
+        validate("a.toml", content, Whole)
+    with pytest.raises(InputError) as of_json:
+        validate("a.json", content, Whole)
+    assert "header" not in of_json.value.hint
+
+
 def test_the_variant_of_a_table_gives_its_own_keys_and_the_nearest_of_them():
     table = copy.deepcopy(TABLE) | {"exposure": {"rule": "automatic", "seconds": 0.1, "levle": 1}}
     with pytest.raises(InputError, match=r"exposure\.\w+: found an unknown key; allowed: rule, level"):
