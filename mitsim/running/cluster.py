@@ -23,8 +23,9 @@ from typing import Any, TypeVar
 from characterisation.files.checked_files import is_file
 from characterisation.files.errors import InputError, MissingEnvironmentError
 from mitsim.running.build import differences, own_build
-from mitsim.running.executor import finished_orders
+from mitsim.running.executor import finished_orders, never
 from mitsim.running.progress import say
+from mitsim.running.time_limit import OutOfTimeError
 
 Item = TypeVar("Item")
 Plain = TypeVar("Plain")
@@ -61,6 +62,7 @@ class Cluster:
 
     def __init__(self, address: str) -> None:
         self.address, self.client = address, connected(address)
+        self.given_up: Callable[[], bool] = never
         # an unclosed client looks for its scheduler forever, in its own thread
         weakref.finalize(self, self.client.close).atexit = False  # Dask closes it at the end of the process
 
@@ -71,7 +73,7 @@ class Cluster:
         work: Callable[[Plain], Result],
         prepared: Callable[[Item], tuple[Hashable, Hashable]] | None = None,
     ) -> Iterator[tuple[Item, Result]]:
-        """Yield items with their results, as they are finished.
+        """Yield items with their results, as they are finished, until given up.
 
         Parameters
         ----------
@@ -90,6 +92,13 @@ class Cluster:
         build = own_build()
         _compare_builds(self.client, self.address, build)
         executor = self.client.get_executor(pure=False)
+        watch = _Watch(self.client, self.address)
+
+        def idle() -> None:
+            if self.given_up():
+                raise OutOfTimeError
+            watch.check()
+
         try:
             running: dict[Any, Item] = {}
             yield from finished_orders(
@@ -97,9 +106,11 @@ class Cluster:
                 running,
                 lambda item: executor.submit(_of_same_build, self.address, build, work, order(item)),
                 lambda: 0 if len(running) < AHEAD * max(sum(self.client.ncores().values()), 1) else None,
-                _Watch(self.client, self.address).check,
+                idle,
                 _POLL_S,
             )
+        except OutOfTimeError:
+            return
         except (InputError, MissingEnvironmentError):
             raise
         except Exception as error:  # any error of a worker or the network

@@ -28,6 +28,7 @@ from typing import Protocol, TypeVar
 from characterisation.files.errors import InputError, MissingEnvironmentError
 from characterisation.files.threads import keep_blas_to_one_thread, usable_cores
 from mitsim.running.progress import say, track
+from mitsim.running.time_limit import OutOfTimeError
 
 Item = TypeVar("Item")
 Plain = TypeVar("Plain")
@@ -42,6 +43,8 @@ AHEAD = 2
 #: number of processes that may die in a row without any finished order
 DEATHS = 5
 
+#: time between questions whether to give up the orders in work [s]
+_POLL_S = 0.2
 
 #: where Linux tells the memory of a container: limit, use and its parts, and the name of cached files, of versions 2, 1
 _GROUP = Path("/sys/fs/cgroup")
@@ -55,7 +58,12 @@ _GROUP_FILES = (
 
 
 class Executor(Protocol):
-    """Distributes work: :class:`Pool`, or :class:`mitsim.running.cluster.Cluster`."""
+    """Distributes work: :class:`Pool`, or :class:`mitsim.running.cluster.Cluster`.
+
+    ``given_up`` says whether to give up the orders in work, whose results are then lost; see :func:`giving_up`.
+    """
+
+    given_up: Callable[[], bool]
 
     def distribute(
         self,
@@ -83,6 +91,24 @@ class Executor(Protocol):
         MissingEnvironmentError
             If no worker is left.
         """
+
+
+def never() -> bool:
+    """Return that work is not given up."""
+    return False
+
+
+@contextlib.contextmanager
+def giving_up(workers: Executor | None, over: Callable[[], bool]) -> Iterator[None]:
+    """Let workers give up orders in work as soon as ``over``; this process finishes what it has begun."""
+    if workers is None:
+        yield
+        return
+    workers.given_up = over
+    try:
+        yield
+    finally:
+        workers.given_up = never
 
 
 def fitting_processes() -> int:
@@ -151,6 +177,7 @@ class Pool:
 
     def __init__(self, processes: int) -> None:
         self.processes = processes
+        self.given_up: Callable[[], bool] = never
         self._workers: dict[int, ProcessPoolExecutor] = {}
         self._prepared: dict[int, set[tuple[Hashable, Hashable]]] = {}
 
@@ -161,7 +188,7 @@ class Pool:
         work: Callable[[Plain], Result],
         prepared: Callable[[Item], tuple[Hashable, Hashable]] | None = None,
     ) -> Iterator[tuple[Item, Result]]:
-        """Yield items with their results, as they are finished; dead processes are replaced.
+        """Yield items with their results, as they are finished, until given up; dead processes are replaced.
 
         Parameters
         ----------
@@ -186,22 +213,39 @@ class Pool:
             worker_of[future] = chosen
             return future
 
-        while waiting or running:
-            try:
-                for finished in finished_orders(waiting, running, submit, next_of):
-                    deaths = 0
-                    yield finished
-            except BrokenProcessPool:
-                self.close(wait=False)
-                waiting.extendleft(reversed(running.values()))
-                running.clear()
-                deaths += 1
-                if deaths > DEATHS:
-                    raise MissingEnvironmentError(
-                        f"--processes {self.processes}: {deaths} of them died in a row, maybe for lack of memory; "
-                        "finished work is kept: use fewer, and run the same command again"
-                    ) from None
-                say("a worker process died; its work is repeated")
+        try:
+            while waiting or running:
+                try:
+                    for finished in finished_orders(waiting, running, submit, next_of, self._check, _POLL_S):
+                        deaths = 0
+                        yield finished
+                except BrokenProcessPool:
+                    self.close(wait=False)
+                    waiting.extendleft(reversed(running.values()))
+                    running.clear()
+                    deaths += 1
+                    if deaths > DEATHS:
+                        raise MissingEnvironmentError(
+                            f"--processes {self.processes}: {deaths} of them died in a row, maybe for lack of memory; "
+                            "finished work is kept: use fewer, and run the same command again"
+                        ) from None
+                    say("a worker process died; its work is repeated")
+        except OutOfTimeError:
+            return
+        finally:
+            if self.given_up() and any(not future.done() for future in running):
+                self._end()
+
+    def _check(self) -> None:
+        if self.given_up():
+            raise OutOfTimeError
+
+    def _end(self) -> None:
+        """End the processes at once, and lose the results of their orders."""
+        processes = [process for worker in self._workers.values() for process in worker._processes.values()]
+        self.close(wait=False)
+        for process in processes:
+            process.kill()
 
     def close(self, wait: bool = True) -> None:
         """End the processes after their current orders; ``wait`` for these."""

@@ -82,7 +82,7 @@ def ending_in_order() -> Iterator[None]:
         if _stopped:
             raise KeyboardInterrupt
         _stopped = True
-        say("stopping after the trial at hand, and writing what there is; Ctrl-C again stops at once")
+        say("stopping, and writing what there is; Ctrl-C again stops at once")
 
     before = signal.signal(signal.SIGINT, stop)
     try:

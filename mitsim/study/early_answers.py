@@ -58,9 +58,14 @@ class Answers:
         self.longest_s = 0.0
 
     def improve(self, raced: Raced, stated: StatedView | None = None) -> None:
-        """Write the answer so far, if it is time for one. Each takes at most a tenth of the time since the last."""
-        if self.report is None or self.limit.elapsed < self.next_s or self.limit.over():
+        """Write the answer so far, if it is time for one, and the last one is not due when this is ready.
+
+        Each takes at most a tenth of the time since the last.
+        """
+        due = self.report is not None and self.limit.elapsed >= self.next_s
+        if not due or self.limit.over() or self.limit.left < 2 * self.longest_s:
             return
+        assert self.report is not None
         began = time.monotonic()
         session, folder = self.session, self.session.folder
         write_raced(session, self.scores, raced)

@@ -9,8 +9,8 @@ best view (:mod:`mitsim.study.virtual.stated`) -> predicted clouds, and images, 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,20 +33,20 @@ from mitsim.capture.simulated.render_residual import (
 from mitsim.maps.campaign.acquire import coupon_residuals, in_turn, simulated_source
 from mitsim.maps.campaign.run import run_campaign
 from mitsim.maps.prediction.faces_in_sight import faces_in_sight
-from mitsim.running.executor import Executor
+from mitsim.running.executor import Executor, giving_up
 from mitsim.running.progress import say, track
-from mitsim.running.time_limit import TimeLimit, stopped_by_user
+from mitsim.running.time_limit import TimeLimit
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import Study
 from mitsim.study.early_answers import Answers, StepTimes
 from mitsim.study.remedies.change import Shortfall
-from mitsim.study.remedies.confirm import remedies_document
+from mitsim.study.remedies.confirm import Remedies, remedies_document
 from mitsim.study.remedies.in_turn import seeks_remedies, state_and_mend
-from mitsim.study.run_record import draw_clouds, write_record
+from mitsim.study.run_record import draw_clouds, lacking, write_record
 from mitsim.study.scoring import score_study, write_raced
 from mitsim.study.session import Session
 from mitsim.study.statement_document import statement_document
-from mitsim.study.time_plan import time_plan
+from mitsim.study.time_plan import TimePlan, busyness, time_plan
 from mitsim.study.view_sets.confirmed_set import (
     Search,
     TriedSet,
@@ -58,10 +58,9 @@ from mitsim.study.view_sets.confirmed_set import (
     write_set_csv,
 )
 from mitsim.study.virtual.plan import measured_by
-from mitsim.study.virtual.race import ALL, Raced, in_words
+from mitsim.study.virtual.race import ALL, Raced
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.stated import StatedView
-from mitsim.views.scoring_time import not_scored_in_words
 
 #: number of best views per measurement whose predicted clouds are written to the run folder
 SHOWN = 3
@@ -128,54 +127,33 @@ def run_within(
     if whole is not None:
         say(plan.in_words())
     session, clock = Session(study, folder, workers), StepTimes()
-    folder, twin = session.folder, session.renderer
+    folder = session.folder
     session.claim("run")
     (folder / "clouds").mkdir(parents=True, exist_ok=True)
     (folder / "captures").mkdir(exist_ok=True)
-    residuals = [] if study.campaign is None or twin is None else coupon_residuals(twin.simulated, study.campaign)
-    performance_map = _map(study, twin, folder)
+    residuals = _coupon_residuals(session)
+    performance_map = _map(session)
     clock.lap("characterise")
 
     scores, chosen, search = score_study(session, performance_map, plan.screening_limit(limit))
     clock.lap("score")
+    plan = replace(plan, busy=busyness(limit.elapsed))
     answers = Answers(session, performance_map, scores, limit, clock, report)
-    minutes_of_race = study.file.race.minutes
-    race_limit = TimeLimit(minutes_of_race and 60 * minutes_of_race)
-    if whole is not None:
-        race_limit = min(race_limit, plan.race_limit(limit), key=lambda each: each.left)
-    raced = session.race(scores, None, race_limit, answers.improve)
-    scores = write_raced(session, scores, raced)
-    clock.lap("race")
-    plan = replace(plan, page_s=answers.longest_s)
-    leaders = list(dict.fromkeys(raced.leaders().values()))
-    stated, rest_limit = None, plan.rest_limit(limit)
-    if leaders and (not limit.over() or session.trials.known(leaders[0])):  # a first trial may take minutes
-        statement_limit = plan.statement_limit(limit)
-        stated = session.state(
-            study.view(leaders[0]), None, statement_limit, lambda stated_view: answers.improve(raced, stated_view)
-        )
-        stated = stated if len(stated.statements) and stated.statements[0].trials else None
-    if stated is not None:
-        write_json(folder / "statement.json", statement_document(session, stated))
-    clock.lap("state")
-    remedies = None
-    if stated is not None and not limit.over():
-        twin = None  # its memory is for the changed studies
-        now = Shortfall(session, stated, scores, raced, search)
-        stated, remedies = state_and_mend(session, now, rest_limit, clock)
-        twin = session.renderer
-    tried = [] if limit.over() else _confirm(session, chosen, search, plan.last_limit(limit))
-    chosen = tried[-1].chosen if tried else chosen
-    clock.lap("confirm")
-    pictured = plan.last_limit(limit)
-    first = dict.fromkeys([*leaders, *(chosen.views if chosen else ()), *_best(scores)])
+    with giving_up(workers, lambda: replace(plan, page_s=answers.longest_s).closing(limit)):
+        measured = _measure(answers, plan, chosen, search)
+    scores, leaders, stated = measured.scores, measured.leaders, measured.stated
+    pictured = replace(plan, page_s=answers.longest_s).last_limit(limit)
+    first = dict.fromkeys([*leaders, *(measured.chosen.views if measured.chosen else ()), *_best(scores)])
     drawn = sorted(draw_clouds(session, performance_map, list(first), pictured))
-    shown = leaders[: study.file.check.views] if twin is not None else []
-    if twin is not None:
+    renderer = session.renderer
+    shown = leaders[: study.file.check.views] if renderer is not None else []
+    if renderer is not None:
         began = time.monotonic()
-        shown = _show(twin, shown, folder, {} if stated is None else {leaders[0]: stated.planned}, pictured)
+        shown = _show(renderer, shown, folder, {} if stated is None else {leaders[0]: stated.planned}, pictured)
         picture_s = (time.monotonic() - began) / max(1, len(shown))
-        residuals += [_residual(twin, number) for number in shown[:1] if pictured.left > _RESIDUAL_PICTURES * picture_s]
+        residuals += [
+            _residual(renderer, number) for number in shown[:1] if pictured.left > _RESIDUAL_PICTURES * picture_s
+        ]
     clock.lap("pictures")
     largest = largest_residual(residuals)
     reported = leaders[:1] or _best(scores)[:1]
@@ -188,65 +166,70 @@ def run_within(
     write_record(
         session,
         performance_map,
-        raced,
+        measured.raced,
         drawn,
         shown,
         stated=stated is not None,
         render_residual=None if largest is None else asdict(largest),
         faces_in_sight=in_sight,
-        view_sets=[] if chosen is None else [_set_record(study, chosen, tried)],
-        remedies=None if remedies is None else remedies_document(remedies),
+        view_sets=[] if measured.chosen is None else [_set_record(study, measured.chosen, measured.tried)],
+        remedies=None if measured.remedies is None else remedies_document(measured.remedies),
         seconds=clock.steps,
-        lacks=lacking(study, scores, raced, stated, tried, limit),
+        lacks=lacking(study, scores, measured.raced, stated, measured.tried, limit),
         finished=not limit.over(),
     )
     return [] if stated is None else stated.statements
 
 
-def lacking(
-    study: Study,
-    scores: xr.Dataset,
-    raced: Raced,
-    stated: StatedView | None,
-    tried: Sequence[TriedSet],
-    limit: TimeLimit,
-) -> list[str]:
-    """Return what a run with a limit has not done, each in a few words; nothing for a run that ended by its own rules.
+@dataclass(frozen=True)
+class _Measured:
+    """What virtual measurements of a run have given, and the scores with the results of the race."""
 
-    Parameters
-    ----------
-    study
-        Study of the run.
-    scores, raced, stated, tried
-        Results of screening, race and statement, and sets of views that were measured, the best last.
-    limit
-        Time of the run.
-    """
-    out = list[str]()
-    if not limit.over() and limit.end is None:
-        return out
-    out += filter(None, [not_scored_in_words(scores)])
-    if len(raced.views) and not raced.decided:
-        raced_by = f"{raced.trials} trial{'s' if raced.trials > 1 else ''}"
-        out.append(
-            f"views compared by {raced_by}: view {raced.leader(ALL)} leads, "
-            f"{in_words(raced.standings[ALL], raced.margin)}"
+    scores: xr.Dataset
+    raced: Raced
+    stated: StatedView | None
+    remedies: Remedies | None
+    chosen: ViewSet | None
+    tried: list[TriedSet]
+
+    @property
+    def leaders(self) -> list[int]:
+        """Numbers of the leading views: for all measurements together, and for each."""
+        return list(dict.fromkeys(self.raced.leaders().values()))
+
+
+def _measure(answers: Answers, plan: TimePlan, chosen: ViewSet | None, search: Search) -> _Measured:
+    """Race the views of a scored study, state the best, look for changes that fit, and measure a set of views."""
+    session, limit, clock = answers.session, answers.limit, answers.clock
+    study, scores = session.study, answers.scores
+    minutes_of_race = study.file.race.minutes
+    race_limit = TimeLimit(minutes_of_race and 60 * minutes_of_race)
+    if limit.end is not None:
+        race_limit = min(race_limit, plan.race_limit(limit), key=lambda each: each.left)
+    raced = session.race(scores, None, race_limit, answers.improve)
+    scores = write_raced(session, scores, raced)
+    clock.lap("race")
+    plan = replace(plan, page_s=answers.longest_s)
+    leader = raced.leader(ALL) if len(raced.views) else None
+    stated, rest_limit = None, plan.rest_limit(limit)
+    if leader is not None and (not plan.closing(limit) or session.trials.known(leader)):  # a trial may take minutes
+        stated = session.state(
+            study.view(leader),
+            None,
+            plan.statement_limit(limit),
+            lambda stated_view: answers.improve(raced, stated_view),
         )
-    if len(raced.views) and stated is None:
-        out.append("no statement of uncertainty")
-    elif stated is not None:
-        open_ones = [statement.measurement for statement in stated.statements if not statement.settled]
-        if open_ones:
-            trials = stated.statements[0].trials
-            by = f"{trials} trial{'s' if trials > 1 else ''}"
-            out.append(f"statement from {by}: {len(open_ones)} of {len(stated.statements)} not settled")
-        if not any(statement.budget for statement in stated.statements):
-            out.append("no budget")
-    if study.file.set is not None and tried and tried[-1].trials < study.file.set.trials:
-        out.append(f"set of views: {tried[-1].trials} of {study.file.set.trials} trials")
-    if limit.over():
-        out.append("pictures" if not stopped_by_user() else "stopped by the user")
-    return out
+        stated = stated if len(stated.statements) and stated.statements[0].trials else None
+    if stated is not None:
+        write_json(session.folder / "statement.json", statement_document(session, stated))
+    clock.lap("state")
+    remedies = None
+    if stated is not None and not limit.over():
+        now = Shortfall(session, stated, scores, raced, search)
+        stated, remedies = state_and_mend(session, now, rest_limit, clock)
+    tried = [] if limit.over() else _confirm(session, chosen, search, plan.last_limit(limit))
+    clock.lap("confirm")
+    return _Measured(scores, raced, stated, remedies, tried[-1].chosen if tried else chosen, tried)
 
 
 def measures_set(study: Study) -> bool:
@@ -285,12 +268,20 @@ def _best(scores: xr.Dataset) -> list[int]:
     return sorted({int(view) for view in np.flatnonzero(((ranks <= SHOWN) & able).any(axis=0))})
 
 
-def _map(study: Study, twin: RenderedMeasurements | None, folder: Path) -> PerformanceMap:
+def _coupon_residuals(session: Session) -> list[RenderResidual]:
+    """Return the render noise of the coupons of a study's own campaign."""
+    campaign, renderer = session.study.campaign, session.renderer
+    return [] if campaign is None or renderer is None else coupon_residuals(renderer.simulated, campaign)
+
+
+def _map(session: Session) -> PerformanceMap:
+    """Return the map of a study, made now if it has a campaign."""
+    study, folder, renderer = session.study, session.folder, session.renderer
     if study.performance_map is not None:
         study.performance_map.save(folder / "map.nc")
         return study.performance_map
-    assert study.campaign is not None and twin is not None
-    take = simulated_source(twin.simulated, study.campaign.file.samples_per_pixel)
+    assert study.campaign is not None and renderer is not None
+    take = simulated_source(renderer.simulated, study.campaign.file.samples_per_pixel)
     return run_campaign(study.campaign, in_turn(take, study.campaign), folder)
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import platform
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
 
@@ -18,15 +19,16 @@ from characterisation.files.atomic_io import write_json
 from characterisation.maps.performance_map import PerformanceMap
 from mitsim.maps.prediction import performance
 from mitsim.running.progress import track
-from mitsim.running.time_limit import TimeLimit
+from mitsim.running.time_limit import TimeLimit, stopped_by_user
 from mitsim.running.version import __version__
 from mitsim.scene.surface.lay import lay_left_out
-from mitsim.study import finishes_of_features
+from mitsim.study import Study, finishes_of_features
 from mitsim.study.run_files import TASK, digests_of
 from mitsim.study.scoring import write_inputs, write_raced
 from mitsim.study.session import Session
-from mitsim.study.virtual.race import ALL, Raced
-from mitsim.study.virtual.stated import compared
+from mitsim.study.view_sets.confirmed_set import TriedSet
+from mitsim.study.virtual.race import ALL, Raced, in_words
+from mitsim.study.virtual.stated import StatedView, compared
 from mitsim.views.scoring_time import not_scored_in_words
 
 #: number of runners-up in the record of a run
@@ -195,3 +197,49 @@ def complete_winner(session: Session, scores: xr.Dataset, raced: Raced, leaders:
     draw_clouds(session, performance_map, drawn)
     lacks = list(filter(None, [not_scored_in_words(scores)]))
     write_record(session, performance_map, raced, drawn, [], stated=True, leaders=leaders, lacks=lacks)
+
+
+def lacking(
+    study: Study,
+    scores: xr.Dataset,
+    raced: Raced,
+    stated: StatedView | None,
+    tried: Sequence[TriedSet],
+    limit: TimeLimit,
+) -> list[str]:
+    """Return what a run with a limit has not done, each in a few words; nothing for a run that ended by its own rules.
+
+    Parameters
+    ----------
+    study
+        Study of the run.
+    scores, raced, stated, tried
+        Results of screening, race and statement, and sets of views that were measured, the best last.
+    limit
+        Time of the run.
+    """
+    out = list[str]()
+    if not limit.over() and limit.end is None:
+        return out
+    out += filter(None, [not_scored_in_words(scores)])
+    if len(raced.views) and not raced.decided:
+        raced_by = f"{raced.trials} trial{'s' if raced.trials > 1 else ''}"
+        out.append(
+            f"views compared by {raced_by}: view {raced.leader(ALL)} leads, "
+            f"{in_words(raced.standings[ALL], raced.margin)}"
+        )
+    if len(raced.views) and stated is None:
+        out.append("no statement of uncertainty")
+    elif stated is not None:
+        open_ones = [statement.measurement for statement in stated.statements if not statement.settled]
+        if open_ones:
+            trials = stated.statements[0].trials
+            by = f"{trials} trial{'s' if trials > 1 else ''}"
+            out.append(f"statement from {by}: {len(open_ones)} of {len(stated.statements)} not settled")
+        if not any(statement.budget for statement in stated.statements):
+            out.append("no budget")
+    if study.file.set is not None and tried and tried[-1].trials < study.file.set.trials:
+        out.append(f"set of views: {tried[-1].trials} of {study.file.set.trials} trials")
+    if limit.over():
+        out.append("pictures" if not stopped_by_user() else "stopped by the user")
+    return out

@@ -182,7 +182,7 @@ class Session:
         limit
             Time of the race; by default its rules alone end it.
         after_round
-            Receives the state after every round but the last.
+            Receives the state before the first trial, and after every round but the last.
         """
         rules = self.study.file.race if rules is None else rules
         limit = TimeLimit() if limit is None else limit

@@ -50,7 +50,10 @@ _REMEDIES_SHARE = 0.6
 
 @dataclass(frozen=True)
 class TimePlan:
-    """Planned seconds of the steps of a run; ``page_s`` is what clouds and page of an earlier answer took."""
+    """Planned seconds of the steps of a run.
+
+    ``page_s`` is what clouds and page of an earlier answer took, ``busy`` the wall time of a second of processor time.
+    """
 
     screening: float
     race: float
@@ -59,6 +62,7 @@ class TimePlan:
     remedies: float = 0.0
     sets: float = 0.0
     page_s: float = 0.0
+    busy: float = 1.0
 
     @property
     def total(self) -> float:
@@ -107,9 +111,23 @@ class TimePlan:
         return max(self.page(limit), min(self.report, _LARGEST_REPORT_SHARE * limit.left))
 
     def page(self, limit: TimeLimit) -> float:
-        """Return the time [s] of clouds and page: as they took before, or by how busy the machine has been so far."""
-        busy = min(max(limit.elapsed / max(time.process_time(), 0.1), 0.5), _BUSIEST)
-        return min(max(busy * _PAGE_S, self.page_s), _PAGE_SHARE * limit.left)
+        """Return the time [s] of clouds and page, which start at the latest with the end of what starts now."""
+        return min(self._page(), _PAGE_SHARE * limit.left)
+
+    def closing(self, limit: TimeLimit) -> bool:
+        """Return whether clouds and page have to start now, so that virtual measurements in work are given up."""
+        if limit.end is None:
+            return limit.over()
+        return limit.left <= min(self._page(), _PAGE_SHARE * (limit.end - limit.began))
+
+    def _page(self) -> float:
+        """Return the time [s] of clouds and page: as they took before, or as the machine is busy."""
+        return max(self.busy * _PAGE_S, self.page_s)
+
+
+def busyness(elapsed_s: float) -> float:
+    """Return the wall time [s] of a second of processor time so far, of the work of this process."""
+    return min(max(elapsed_s / max(time.process_time(), 0.1), 0.5), _BUSIEST)
 
 
 def time_plan(seconds: float, views: int, remedies: bool = False, sets: bool = False) -> TimePlan:

@@ -26,7 +26,7 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
-from mitsim.running.executor import Executor
+from mitsim.running.executor import Executor, giving_up
 from mitsim.running.numbers import two_digits
 from mitsim.running.progress import say
 from mitsim.running.time_limit import TimeLimit
@@ -85,10 +85,11 @@ def choose_sensor(
         )
         _say(results, f"{number} of {len(candidates)} screened", limit)
     report_results(ordered(results), False)
-    _measure_in_rounds(results, limit, report_results)
-    leader = ordered(results)[0]
-    if leader.stated and not limit.over():
-        refine_leader(leader, limit.part(1.0, _reserve(limit)))
+    with giving_up(workers, lambda: limit.left <= _reserve(limit)):
+        _measure_in_rounds(results, limit, report_results)
+        leader = ordered(results)[0]
+        if leader.stated and not limit.over():
+            refine_leader(leader, limit.part(1.0, _reserve(limit)))
     _complete(ordered(results)[0])
     report_results(ordered(results), True)
     return ordered(results)

@@ -203,7 +203,7 @@ def run_race(
     over
         Returns whether time is over; asked after every trial.
     after_round
-        Receives the state after every round, and within long rounds.
+        Receives the state before the first trial, after every round, and within long rounds.
 
     See Also
     --------
@@ -246,6 +246,7 @@ def run_race(
                     return
 
     wanted = dict.fromkeys(numbers, FIRST)
+    after_round(state(wanted))
     while True:
         measure(wanted)
         raced = state(wanted)

@@ -1,8 +1,10 @@
 """Work handed out to processes: the same results in any number of them, also where one dies or says no."""
 
+import multiprocessing
 import os
 import pickle
 import signal
+import time
 from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +18,7 @@ from mitsim.capture.devices.device_error import DeviceError
 from mitsim.cli.options import requested_workers
 from mitsim.cli.program import app
 from mitsim.running import executor
-from mitsim.running.executor import Pool, fitting_processes, results_of
+from mitsim.running.executor import Pool, fitting_processes, giving_up, results_of
 from tests.smaller_sensors import coarse_sensor
 
 pytestmark = pytest.mark.timeout(300)
@@ -136,6 +138,39 @@ def test_a_process_that_dies_loses_no_work(pool, tmp_path, capsys):
     found = [item for item, _ in pool.distribute(range(8), lambda n: (n, str(tmp_path / "died")), die_once)]
     assert sorted(found) == list(range(8)) and (tmp_path / "died").exists()
     assert "a worker process died" in capsys.readouterr().err
+
+
+def last_a_minute(mark):
+    Path(mark).write_text("")
+    time.sleep(60)
+    return mark
+
+
+def test_orders_in_work_are_given_up_when_time_is_over(pool, tmp_path):
+    """The results of two orders of a minute are not waited for, and what comes after finds free processes."""
+    marks = [tmp_path / "first", tmp_path / "second"]
+    with giving_up(pool, lambda: all(mark.exists() for mark in marks)):
+        assert list(pool.distribute(map(str, marks), str, last_a_minute)) == []
+    assert results_of([3], squared, pool, "") == [9]
+
+
+def test_who_stops_asking_after_the_end_leaves_no_process_at_work(pool, tmp_path):
+    mark, over = tmp_path / "other", []
+    with giving_up(pool, lambda: bool(over)):
+        asked = pool.distribute([str(mark), 3], lambda order: order, last_a_minute_or_square)
+        assert next(asked) == (3, 9)
+        while not mark.exists():
+            time.sleep(0.05)
+        working = multiprocessing.active_children()
+        over.append(True)
+        asked.close()
+    for process in working:
+        process.join(10)
+    assert working and not any(process.is_alive() for process in working)
+
+
+def last_a_minute_or_square(order):
+    return order**2 if isinstance(order, int) else last_a_minute(order)
 
 
 def test_processes_that_always_die_are_given_up(monkeypatch):

@@ -146,7 +146,7 @@ def test_the_first_round_tells_its_state_while_it_lasts(tmp_path, monkeypatch):
     monkeypatch.setattr("mitsim.study.virtual.race._SAY_EVERY_S", -1.0)
     scores, states = scores_of(np.array(SPREADS) * 1.3), []
     raced = race(KnownMaker(SPREADS), scores, tmp_path / "told", after_round=states.append)
-    assert [one.trials for one in states[:5]] == [1, 2, 3, 4, 5]
+    assert [one.trials for one in states[:6]] == [0, 1, 2, 3, 4, 5]
     np.testing.assert_array_equal(raced.errors, race(KnownMaker(SPREADS), scores, tmp_path / "quiet").errors)
 
 
