@@ -10,7 +10,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from mitsim.running.version import __version__ as __version__
+from characterisation.words.version import __version__ as __version__
 
 #: name -> module that defines it
 _NAMES = {

@@ -22,12 +22,12 @@ from characterisation.files.checked_files import content_checksum
 from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
 from characterisation.files.threads import in_threads
+from characterisation.words.version import __version__
 from mitsim.capture.calibration import CalibrationDocument, PoseDocument, calibration_table, pose_table
 from mitsim.capture.capture import DERIVED_UNITS, Capture
 from mitsim.capture.capture_document import FRAME, SCHEMA_VERSION, UNITS, CaptureDocument
 from mitsim.capture.decoding import settings_table
 from mitsim.capture.npy import encode_npy
-from mitsim.running.version import __version__
 from mitsim.sensor.png import LONGEST_SIDE_PX, encode_png
 
 #: allowed names of cameras and files

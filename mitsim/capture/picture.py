@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from characterisation.files.errors import InputError
 from characterisation.plots.clouds import depth_limits
 from characterisation.plots.style import SEQUENTIAL, VERMILION, axes_for, side_bar
-from mitsim.running.numbers import percent
+from characterisation.words.numbers import percent
 
 #: percentiles of the grey values shown as black and white; chosen: the few highlights of metal may be white
 STRETCH_PERCENTILES = (5, 99.9)

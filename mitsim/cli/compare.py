@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 
 from characterisation.files.errors import InputError
+from characterisation.words.progress import say
 from mitsim.cli import options
-from mitsim.running.progress import say
 
 
 def compare(

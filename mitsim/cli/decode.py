@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from characterisation.words.progress import say
 from mitsim.cli import options
-from mitsim.running.progress import say
 
 if TYPE_CHECKING:
     from mitsim.capture.capture import Capture

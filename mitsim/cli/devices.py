@@ -9,8 +9,8 @@ from typing import Annotated, Any
 import typer
 
 from characterisation.files.errors import InputError
+from characterisation.words.progress import say, track
 from mitsim.cli import options
-from mitsim.running.progress import say, track
 
 _KINDS = "ensenso:SERIAL, depthai or depthai:ID"
 

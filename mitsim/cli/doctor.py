@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from characterisation.files.errors import MissingEnvironmentError
-from mitsim.running.version import __version__
+from characterisation.words.version import __version__
 from mitsim.scene import backend
 
 Verdict = Literal["ok", "missing", "absent"]

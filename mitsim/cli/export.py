@@ -9,9 +9,9 @@ import typer
 
 from characterisation.files.atomic_io import write_text
 from characterisation.files.errors import InputError
+from characterisation.words.numbers import how_many
+from characterisation.words.progress import say
 from mitsim.cli import options
-from mitsim.running.numbers import how_many
-from mitsim.running.progress import say
 
 if TYPE_CHECKING:
     from characterisation.point_cloud import PointCloud

@@ -12,8 +12,8 @@ import typer
 
 from characterisation.files.atomic_io import write_json
 from characterisation.files.errors import InputError
+from characterisation.words.progress import say
 from mitsim.cli import options
-from mitsim.running.progress import say
 
 
 def finish(

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 from characterisation.files.documents import read_toml
 from characterisation.files.errors import InputError
-from mitsim.running.numbers import time_in_words
-from mitsim.running.progress import say
+from characterisation.words.numbers import time_in_words
+from characterisation.words.progress import say
 
 if TYPE_CHECKING:
     from characterisation.maps.performance_map import PerformanceMap

@@ -9,9 +9,9 @@ from typing import Annotated, Literal
 import typer
 
 from characterisation.files.atomic_io import write_json
+from characterisation.words.progress import say, track
 from mitsim.cli import options
 from mitsim.cli.devices import mount
-from mitsim.running.progress import say, track
 
 #: why a campaign with a device has no workers, and what is allowed
 _ONE_AT_A_TIME = ("a campaign with a [device]", "no such option: a device takes one capture at a time")

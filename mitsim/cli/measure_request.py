@@ -26,9 +26,9 @@ from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from characterisation.tasks.result import Result, failed
 from characterisation.tasks.windows import PairKind, Shape, WindowPlan, measure_windows, window_slices
+from characterisation.words.progress import track_if_long
 from mitsim.decoding.input_clouds import InputCloud
 from mitsim.decoding.plate import Plate, image_on_grid, measure_plate
-from mitsim.running.progress import track_if_long
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

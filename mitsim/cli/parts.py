@@ -9,8 +9,8 @@ import typer
 
 from characterisation.files.atomic_io import write_text
 from characterisation.files.errors import InputError
+from characterisation.words.progress import say
 from mitsim.cli import options
-from mitsim.running.progress import say
 
 if TYPE_CHECKING:
     from mitsim.scene.authoring.check import Authored

@@ -23,6 +23,8 @@ import typer
 from characterisation.files.atomic_io import FULL
 from characterisation.files.errors import InputError, MissingEnvironmentError
 from characterisation.files.threads import keep_blas_to_one_thread
+from characterisation.words.progress import be_quiet
+from characterisation.words.version import __version__
 from mitsim.cli import (
     acceptance,
     calibrations,
@@ -41,8 +43,6 @@ from mitsim.cli import (
     talk,
 )
 from mitsim.cli.options import Group, command_group, release_folders
-from mitsim.running.progress import be_quiet
-from mitsim.running.version import __version__
 
 
 class Commands(Group):

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from characterisation.files.errors import InputError
+from characterisation.words.progress import say
 from mitsim.cli import options
 from mitsim.cli.decode import decoding_step
 from mitsim.cli.folder_lock import remove_partial_beside
-from mitsim.running.progress import say
 
 if TYPE_CHECKING:
     from mitsim.running.executor import Executor

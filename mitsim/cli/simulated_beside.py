@@ -17,10 +17,10 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 from characterisation.region_of_interest import Roi
 from characterisation.tasks.result import Result, failed
+from characterisation.words.numbers import aligned
+from characterisation.words.progress import say
 from mitsim.decoding.input_clouds import InputCloud
 from mitsim.decoding.measured_document import number_with_decimals, uncertainty_text
-from mitsim.running.progress import say
-from mitsim.running.text_table import aligned
 from mitsim.sensor.fitted_to import shows_the_fit
 
 

@@ -12,8 +12,8 @@ import typer
 
 from characterisation.files.atomic_io import write_json
 from characterisation.files.errors import InputError
+from characterisation.words.progress import say
 from mitsim.cli import options
-from mitsim.running.progress import say
 from mitsim.running.time_limit import TimeLimit, ending_in_order, stopped_by_user
 
 if TYPE_CHECKING:

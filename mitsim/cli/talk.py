@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
+from characterisation.words.progress import say
 from mitsim.cli import options
-from mitsim.running.progress import say
 from mitsim.running.time_limit import TimeLimit, ending_in_order, stopped_by_user
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from characterisation import cloud_files
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
+from characterisation.words.progress import say
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
 from mitsim.capture.recordings.any_recording import KINDS, ReadOptions, read_recording
@@ -24,7 +25,6 @@ from mitsim.decoding.cloud import Settings, decoder_settings
 from mitsim.decoding.coded_images import decoded_once
 from mitsim.decoding.kept_clouds import kept_cloud
 from mitsim.decoding.plain_clouds import is_array_or_text, is_map_of_depths, plain_cloud, read_plain_cloud
-from mitsim.running.progress import say
 from mitsim.sensor.matcher import MatcherSettings
 
 #: suffixes of cloud files that are found in a folder

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from characterisation.tasks.result import NOT_INCLUDED, Repeatability, Result
-from mitsim.running.numbers import or_none
-from mitsim.running.text_table import aligned
-from mitsim.running.version import __version__
+from characterisation.words.numbers import aligned, or_none
+from characterisation.words.version import __version__
 
 #: significant digits of an uncertainty. A value has as many decimals as its uncertainty, at least 3 and at most 6
 _DIGITS = 2

@@ -31,6 +31,7 @@ from characterisation.features.fits import fit_plane, fit_sphere
 from characterisation.features.robust_fit import FitError
 from characterisation.files.arrays import Floats
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, PointCloud
+from characterisation.words.progress import track
 from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.decoding.cloud import capture_cloud
@@ -38,7 +39,6 @@ from mitsim.maps.campaign.acquire import coupon_cloud
 from mitsim.maps.campaign.orders import prepared_sensor
 from mitsim.maps.campaign.plan import coupon_pose
 from mitsim.running.executor import Executor, results_of
-from mitsim.running.progress import track
 from mitsim.scene.load import Scene
 from mitsim.scene.test_targets import FINISHES, ball, ball_on_plate, plate
 from mitsim.sensor.noise_sources import Noise

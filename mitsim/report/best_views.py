@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import xarray as xr
 
+from characterisation.words.numbers import percent, two_digits
 from mitsim.report.findings import ranked_views
-from mitsim.running.numbers import percent, two_digits
 from mitsim.views.no_view import why_no_view
 
 _HEAD = (

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from characterisation.plots.style import FIELD, MUTED, OTHER_SHAPE, SEQUENTIAL, SHAPES, bare, drawing
 from characterisation.region_of_interest import Roi
+from characterisation.words.numbers import percent
 from mitsim.report.style import colour_scale
-from mitsim.running.numbers import percent
 from mitsim.scene.light_transport.light_from_faces import LightFromFaces, light_from_faces
 from mitsim.scene.load import Scene
 from mitsim.scene.visible_surfaces import VisibleSurfaces

@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 from characterisation.files.atomic_io import write_text
 from characterisation.plots.style import BLUE, FIELD, VERMILION, drawing
 from characterisation.point_cloud import Status
+from characterisation.words.numbers import percent
 from mitsim.report.cloud_figures import REASONS
 from mitsim.report.style import colour_scale, write_png
-from mitsim.running.numbers import percent
 from mitsim.twin.compare.captures_run import Shown
 
 #: percentile of |residual| at the ends of the colour scale, so that a few wrong matches do not set it

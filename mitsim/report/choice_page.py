@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from characterisation.files.errors import InputError
+from characterisation.words.numbers import NONE, listed, percent, quantity, rounded, two_digits, with_degree_signs
 from mitsim.report.first_rows import breakable, exact, tolerance_words
 from mitsim.report.first_screen import of_choice, sensor_rows
 from mitsim.report.placement_figure import VERDICTS
 from mitsim.report.pose_texts import pose_texts
 from mitsim.report.templates import write_page
-from mitsim.running.numbers import NONE, listed, percent, quantity, rounded, two_digits, with_degree_signs
 from mitsim.study.choice_document import CHOICE, CellEntry, ChoiceDocument, SensorEntry, best_statement, read_choice
 from mitsim.study.scene_geometry import read_scene_geometry
 

@@ -18,11 +18,11 @@ from characterisation.plots.clouds import depth_limits
 from characterisation.plots.style import FIELD, SEQUENTIAL, drawing
 from characterisation.point_cloud import PointCloud, Status
 from characterisation.region_of_interest import Roi
+from characterisation.words.numbers import percent
 from mitsim.capture.capture import Capture
 from mitsim.capture.picture import STRETCH_EXPONENT, grey_limits
 from mitsim.report.findings import reason_shares
 from mitsim.report.style import colour_scale
-from mitsim.running.numbers import percent
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.png import encode_png
 

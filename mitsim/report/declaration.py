@@ -17,6 +17,7 @@ from pathlib import Path
 from scipy.spatial.transform import Rotation
 
 from characterisation.statements.statement import AT_THE_LIMIT, FAR_FROM_NOMINAL
+from characterisation.words.numbers import NONE, count, listed, quantity, rounded, signed, two_digits
 from mitsim.report.first_rows import ResultRow, bias_words
 from mitsim.report.first_screen import FirstScreen, of_choice, of_run
 from mitsim.report.pose_texts import angles_in_words, origin_text, pose_of_view
@@ -28,7 +29,6 @@ from mitsim.report.statement_section import (
     stated_rules,
 )
 from mitsim.report.unknowns_words import unknowns_in_words
-from mitsim.running.numbers import NONE, count, listed, quantity, rounded, signed, two_digits
 from mitsim.study.choice_document import CHOICE, ChoiceDocument, PoseEntry, SensorEntry, best_statement, read_choice
 from mitsim.study.run_folder import Run, read_run
 from mitsim.study.scene_geometry import SceneGeometry

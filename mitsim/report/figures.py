@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from characterisation.maps.performance_map import PerformanceMap, lambert_projection
 from characterisation.plots.discs import disc_image, disc_view, noise_limits, plain_log_ticks
 from characterisation.plots.style import FIELD, NOISE, SEQUENTIAL, drawing
+from characterisation.words.numbers import count, finish_name
 from mitsim.report.findings import incidence_of_nodes
 from mitsim.report.style import colour_scale, write_png
-from mitsim.running.numbers import count, finish_name
 
 #: cells across a disc in which patches are counted
 _CELLS = 61

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from characterisation.files.arrays import Floats
 from characterisation.maps.performance_map import PerformanceMap, inverse_lambert_projection
 from characterisation.point_cloud import PointCloud, Status
-from mitsim.running.numbers import finish_name, quantity, rounded, two_digits
+from characterisation.words.numbers import finish_name, quantity, rounded, two_digits
 
 #: incidence up to which the noise of a surface is summarised [deg]
 NOISE_UP_TO_DEG = 45.0

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from characterisation.plots.style import FIELD, drawing
-from mitsim.running.numbers import percent, two_digits
+from characterisation.words.numbers import percent, two_digits
 from mitsim.twin.finish.run import CouponFit
 
 #: least range of the residual's colours, in standard deviations

@@ -15,8 +15,18 @@ from markupsafe import Markup, escape
 
 from characterisation.tasks.decision_table import BIAS_SUBTRACTED
 from characterisation.tasks.task_file import effective_deviations
+from characterisation.words.numbers import (
+    MINUS,
+    NONE,
+    accepted_text,
+    beside,
+    count,
+    listed,
+    percent,
+    quantity,
+    unit_symbol,
+)
 from mitsim.report.placement_figure import VERDICTS
-from mitsim.running.numbers import MINUS, NONE, accepted_text, beside, count, listed, percent, quantity, unit_symbol
 
 #: beginning of the names of rules whose demand is the share of the tolerance over the largest share that fits
 _BY_SHARE = ("ISO 14253-1", "simple acceptance")

@@ -30,12 +30,12 @@ from characterisation.statements.verdict_words import (
     result_reasons,
 )
 from characterisation.tasks.covariance import LEAST_CHANCE
+from characterisation.words.numbers import NONE, count, how_many, or_nan, with_degree_signs
 from mitsim.report.first_rows import ResultRow, RowValues, measured_words
 from mitsim.report.placement_figure import face_verdicts, placement_figure
 from mitsim.report.pose_texts import pose_of_view, pose_words
 from mitsim.report.set_words import with_sets
 from mitsim.report.style import Picture, as_svg
-from mitsim.running.numbers import NONE, count, how_many, or_nan, with_degree_signs
 from mitsim.study.choice_document import TIME_OVER, ChoiceDocument, SensorEntry, judged
 from mitsim.study.choose.table import best_reasons
 from mitsim.study.remedies.entries import remedies_in_words

@@ -20,8 +20,8 @@ from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.plots.discs import disc, disc_image, disc_view, noise_limits
 from characterisation.plots.style import NOISE, SEQUENTIAL, drawing
+from characterisation.words.numbers import finish_name
 from mitsim.report.figures import colour_bar, matt_to_shiny
-from mitsim.running.numbers import finish_name
 
 Sample = tuple[str, float]
 

@@ -22,6 +22,7 @@ import numpy as np
 from characterisation.point_cloud import Status
 from characterisation.scores.coverage import NORMAL_COVERAGE
 from characterisation.tasks.covariance import LEAST_CHANCE, PERSISTENT_REACH_PX, PERSISTENT_TURN
+from characterisation.words.numbers import NONE, count, listed, percent, quantity, rounded, two_digits
 from mitsim.report import findings
 from mitsim.report.agreement import Agreement, agreement, chance_level
 from mitsim.report.cloud_figures import REASONS
@@ -32,7 +33,6 @@ from mitsim.report.pose_texts import expected_texts, pose_of_view, pose_texts
 from mitsim.report.statement_section import rules_in_words, stated_rules, statement_section
 from mitsim.report.templates import write_page
 from mitsim.report.view_sphere import view_sphere
-from mitsim.running.numbers import NONE, count, listed, percent, quantity, rounded, two_digits
 from mitsim.study.run_folder import Run, RunnerUp, read_run
 from mitsim.study.scene_geometry import read_scene_geometry
 from mitsim.study.virtual.race import ALL

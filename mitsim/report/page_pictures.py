@@ -15,6 +15,7 @@ from markupsafe import Markup
 
 from characterisation.plots.discs import NOISE_PERCENTILES, noise_limits
 from characterisation.point_cloud import Status
+from characterisation.words.numbers import count, finish_name, listed, percent, quantity, rounded, two_digits
 from mitsim.report import figures, findings
 from mitsim.report.agreement import CHANCE, CONFIRMED, TOO_FEW, Agreement, chance_level
 from mitsim.report.cloud_figures import REASONS, camera_images, cloud_figure
@@ -22,7 +23,6 @@ from mitsim.report.pose_texts import angles_in_words, pose_of_view
 from mitsim.report.style import Picture, as_svg
 from mitsim.report.view_data import LIMITS
 from mitsim.report.view_figures import agreement_figure, uncertainty_figure
-from mitsim.running.numbers import count, finish_name, listed, percent, quantity, rounded, two_digits
 from mitsim.study.run_folder import Run
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from mitsim.running.numbers import NONE, SPACE, count, percent, quantity, rounded, two_digits
+from characterisation.words.numbers import NONE, SPACE, count, percent, quantity, rounded, two_digits
 from mitsim.study.choice_document import PoseEntry
 from mitsim.study.run_folder import Run
 

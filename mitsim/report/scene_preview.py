@@ -23,7 +23,7 @@ from characterisation.files.arrays import Floats
 from characterisation.plots.labels import cut, round_length, scale_bar
 from characterisation.plots.part_pictures import EDGE_SHADE, shape_edges
 from characterisation.plots.style import FIELD, INK, MUTED, OTHER_SHAPE, SHAPES, bare, drawing
-from mitsim.running.numbers import finish_name
+from characterisation.words.numbers import finish_name
 from mitsim.scene.first_hits import first_hits
 from mitsim.scene.inspect import SceneFacts, ShapeFacts
 from mitsim.scene.load import Scene

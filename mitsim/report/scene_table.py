@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from characterisation.statements.verdict_words import named
-from mitsim.running.numbers import or_none
-from mitsim.running.text_table import aligned
+from characterisation.words.numbers import aligned, or_none
 from mitsim.scene.authoring.finding import SceneFinding
 from mitsim.scene.inspect import SceneFacts, ShapeFacts
 from mitsim.scene.visible_surfaces import VisibleSurfaces

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from characterisation.statements.verdict_words import OFTEN, Reason, in_words
-from mitsim.running.numbers import two_digits
+from characterisation.words.numbers import two_digits
 from mitsim.study.run_folder import ConfirmedEntry, ViewSetEntry
 
 _OUT_OF_REACH = " is out of reach"

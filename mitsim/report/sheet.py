@@ -17,11 +17,11 @@ from matplotlib.figure import Figure
 
 from characterisation.files.atomic_io import atomic_write
 from characterisation.plots.style import INK, MUTED, drawing
+from characterisation.words.numbers import NONE
 from mitsim.report.declaration import Declaration, DeclaredRow, read_declaration
 from mitsim.report.first_screen import FirstScreen, Tone
 from mitsim.report.placement_figure import draw_placement
 from mitsim.report.sheet_layout import ACROSS, FOOT, GAP, HEIGHT, LINE, MARGIN, Columns, Page, text_width, wrapped
-from mitsim.running.numbers import NONE
 from mitsim.study.scene_geometry import SceneGeometry, read_scene_geometry
 
 # Sizes of this page are chosen, not fitted.

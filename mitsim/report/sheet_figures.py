@@ -15,12 +15,12 @@ from scipy.ndimage import map_coordinates
 from characterisation.files.errors import InputError
 from characterisation.plots.style import BLUE, FIELD, INK, MUTED, VERMILION, drawing
 from characterisation.point_cloud import PointCloud, Status
+from characterisation.words.numbers import two_digits
 from mitsim.capture.capture import Capture
 from mitsim.capture.picture import STRETCH_EXPONENT
 from mitsim.maps.data_sheet import DataSheet, Recovery
 from mitsim.report.cloud_figures import REASONS, draw_status
 from mitsim.report.style import plain_log
-from mitsim.running.numbers import two_digits
 from mitsim.sensor.preset_covariance import preset_covariance
 
 _LINES = ("-", "--", ":", "-.")

@@ -13,9 +13,9 @@ from typing import Any
 from characterisation.plots.statements import GROUPS
 from characterisation.statements.losses import Loss, lost_features
 from characterisation.statements.statement import AT_THE_LIMIT, FAR_FROM_NOMINAL
+from characterisation.words.numbers import NONE, SPACE, interval_text, listed, percent, quantity
 from mitsim.report.first_rows import bias_words, exact
 from mitsim.report.unknowns_words import unknowns_in_words
-from mitsim.running.numbers import NONE, SPACE, interval_text, listed, percent, quantity
 from mitsim.study.dependence_words import dependences_in_words, remedies_in_words
 from mitsim.study.statement_file import BudgetEntry, ExposureEntry, StatedMeasurement, StatementDocument
 

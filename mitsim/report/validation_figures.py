@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from characterisation.maps.validation import Pair, within_limits
 from characterisation.plots.style import BLUE, VERMILION, drawing
-from mitsim.running.numbers import finish_name
+from characterisation.words.numbers import finish_name
 
 #: residuals are drawn up to this many standard deviations
 HISTOGRAM_REACH = 4.0

@@ -19,6 +19,7 @@ from matplotlib.colors import to_hex
 from numpy.typing import ArrayLike, NDArray
 
 from characterisation.plots.style import NOISE, SEQUENTIAL
+from characterisation.words.numbers import count, percent
 from mitsim.report.agreement import agreement
 from mitsim.report.view_clouds import (
     MOST_POINTS,
@@ -30,7 +31,6 @@ from mitsim.report.view_clouds import (
     packed_part,
     shown_cloud,
 )
-from mitsim.running.numbers import count, percent
 from mitsim.study.run_folder import Run
 
 #: Okabe and Ito's palette, for the features

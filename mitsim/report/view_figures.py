@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from characterisation.files.arrays import Floats
 from characterisation.plots.discs import disc
 from characterisation.plots.style import BLUE, FIELD, INK, MUTED, PAPER, SEQUENTIAL, VERMILION, drawing
+from characterisation.words.numbers import rounded, signed, unit_symbol
 from mitsim.report.agreement import Agreement
 from mitsim.report.figures import colour_bar
 from mitsim.report.style import plain_log
-from mitsim.running.numbers import rounded, signed, unit_symbol
 
 _RINGS_DEG = (60, 30, 0, -30, -60)
 

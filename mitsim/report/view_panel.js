@@ -10,7 +10,7 @@ const rounded = (value, places = 0) => (known(value) ? signed((Number(value.toFi
 const counted = (value) => (known(value) ? Math.round(value).toString().replace(/\B(?=(\d{3})+$)/g, '\u202f') : NONE);
 const degrees = (value) => `${rounded(value)}°`;
 
-// Two significant digits, as mitsim.running.numbers writes them.
+// Two significant digits, as characterisation.words.numbers writes them.
 function twoDigits(value) {
   if (!known(value)) return NONE;
   if (value === 0) return '0';

@@ -19,12 +19,12 @@ from __future__ import annotations
 from typing import Any
 
 from characterisation.tasks.covariance import LEAST_CHANCE
+from characterisation.words.numbers import count, percent, quantity, rounded, two_digits
 from mitsim.report import findings
 from mitsim.report.first_rows import bias_words
 from mitsim.report.pose_texts import expected_texts, pose_of_view, pose_texts
 from mitsim.report.templates import joined_script, script_content
 from mitsim.report.view_data import as_json, solids, view_data
-from mitsim.running.numbers import count, percent, quantity, rounded, two_digits
 from mitsim.study.run_folder import Run, TriedEntry, ViewSetEntry
 
 #: views in the table that replaces the sphere

@@ -1,1 +1,1 @@
-"""How the program runs: worker processes, progress, tables and numbers for readers, the version."""
+"""How the program runs: worker processes and clusters, limits of time, the build of a process."""

@@ -13,7 +13,7 @@ from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 
-from mitsim.running.version import __version__
+from characterisation.words.version import __version__
 
 #: packages whose files make up the build
 _OWN = ("characterisation", "mitsim")

@@ -22,9 +22,9 @@ from typing import Any, TypeVar
 
 from characterisation.files.checked_files import is_file
 from characterisation.files.errors import InputError, MissingEnvironmentError
+from characterisation.words.progress import say
 from mitsim.running.build import differences, own_build
 from mitsim.running.executor import finished_orders, never
-from mitsim.running.progress import say
 from mitsim.running.time_limit import OutOfTimeError
 
 Item = TypeVar("Item")

@@ -27,7 +27,7 @@ from typing import Protocol, TypeVar
 
 from characterisation.files.errors import InputError, MissingEnvironmentError
 from characterisation.files.threads import keep_blas_to_one_thread, usable_cores
-from mitsim.running.progress import say, track
+from characterisation.words.progress import say, track
 from mitsim.running.time_limit import OutOfTimeError
 
 Item = TypeVar("Item")

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
-from mitsim.running.progress import say
+from characterisation.words.progress import say
 
 Item = TypeVar("Item")
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from characterisation.files.documents import Document, Name, missing_error, missing_keys, read_toml_table, validate
 from characterisation.files.errors import InputError, nearest
-from mitsim.running.progress import say
+from characterisation.words.progress import say
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.exposure import exposure_policy
 from mitsim.sensor.imager import Imager

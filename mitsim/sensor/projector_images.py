@@ -23,7 +23,7 @@ from pydantic import Field
 from characterisation.files.checked_files import read_bounded
 from characterisation.files.documents import Document
 from characterisation.files.errors import InputError
-from mitsim.running.progress import say
+from characterisation.words.progress import say
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.png import decode_png
 

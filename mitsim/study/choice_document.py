@@ -18,7 +18,7 @@ from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
 from characterisation.statements.verdict_words import Judged, fits_in_words
 from characterisation.tasks.task_file import tolerance_size
-from mitsim.running.numbers import or_nan, two_digits
+from characterisation.words.numbers import or_nan, two_digits
 from mitsim.study.statement_file import PartialDocument, StatementDocument, read_statement
 
 #: name of the file in the folder

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from characterisation.statements.size_dependence import SizeDependence
-from mitsim.running.numbers import percent, quantity
+from characterisation.words.numbers import percent, quantity
 
 #: phrases for low and for high values of a number, by group and name
 _PHRASES = {

@@ -10,7 +10,7 @@ import xarray as xr
 
 from characterisation.files.atomic_io import write_json
 from characterisation.maps.performance_map import PerformanceMap
-from mitsim.running.progress import say
+from characterisation.words.progress import say
 from mitsim.running.time_limit import TimeLimit
 from mitsim.study.run_record import draw_clouds, write_record
 from mitsim.study.scoring import write_raced

@@ -14,7 +14,7 @@ import math
 from collections.abc import Sequence
 
 from characterisation.tasks.task_file import Measurement
-from mitsim.running.numbers import listed, two_digits
+from characterisation.words.numbers import listed, two_digits
 from mitsim.sensor.sensor import Sensor
 
 #: share of the maker's figure below which a statement says why

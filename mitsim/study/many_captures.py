@@ -21,6 +21,8 @@ from pydantic import Field, field_validator
 from characterisation.files.checked_files import read_json_object
 from characterisation.files.documents import Document, read_toml
 from characterisation.files.errors import InputError
+from characterisation.words.progress import track
+from characterisation.words.version import __version__
 from mitsim.capture.folder import write_packed
 from mitsim.capture.packed_files import packed
 from mitsim.capture.simulated.rendering import Rendering
@@ -28,8 +30,6 @@ from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.capture.simulated.truth import encode_exr, true_images
 from mitsim.maps.campaign.orders import prepared_sensor
 from mitsim.running.executor import check_same_file
-from mitsim.running.progress import track
-from mitsim.running.version import __version__
 from mitsim.scene.load import Scene, load_scene
 from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.scene.surface.scatter import Deviation

@@ -20,6 +20,7 @@ from characterisation.maps.samples import Samples
 from characterisation.maps.shipped import map_path, shipped_maps
 from characterisation.tasks.task_file import Task
 from characterisation.tasks.task_reading import check_features, check_nominal_values, read_task
+from characterisation.words.progress import say
 from mitsim.maps.campaign.missing_finishes import (
     Ask,
     NeededFinishes,
@@ -29,7 +30,6 @@ from mitsim.maps.campaign.missing_finishes import (
     unknown_finishes,
 )
 from mitsim.maps.campaign.plan import Campaign, check_exposure, read_campaign
-from mitsim.running.progress import say
 from mitsim.scene.authoring.check_task import report_geometry
 from mitsim.scene.load import Scene, load_scene
 from mitsim.scene.materials import Finish

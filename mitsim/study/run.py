@@ -22,6 +22,7 @@ from characterisation.files.atomic_io import write_json
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.statement import Statement
+from characterisation.words.progress import say, track
 from mitsim.capture.folder import write_capture
 from mitsim.capture.simulated.render_residual import (
     LIMIT,
@@ -34,7 +35,6 @@ from mitsim.maps.campaign.acquire import coupon_residuals, in_turn, simulated_so
 from mitsim.maps.campaign.run import run_campaign
 from mitsim.maps.prediction.faces_in_sight import faces_in_sight
 from mitsim.running.executor import Executor, giving_up
-from mitsim.running.progress import say, track
 from mitsim.running.time_limit import TimeLimit
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import Study

@@ -17,7 +17,7 @@ from pathlib import Path
 from characterisation.files.atomic_io import write_json
 from characterisation.files.checked_files import read_json_object
 from characterisation.files.errors import InputError
-from mitsim.running.version import __version__
+from characterisation.words.version import __version__
 
 #: name of the file that records the owner of a folder's results
 OWNER = "run_of.json"

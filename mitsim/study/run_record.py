@@ -17,10 +17,10 @@ import xarray as xr
 from characterisation.cloud_files import write_cloud
 from characterisation.files.atomic_io import write_json
 from characterisation.maps.performance_map import PerformanceMap
+from characterisation.words.progress import track
+from characterisation.words.version import __version__
 from mitsim.maps.prediction import performance
-from mitsim.running.progress import track
 from mitsim.running.time_limit import TimeLimit, stopped_by_user
-from mitsim.running.version import __version__
 from mitsim.scene.surface.lay import lay_left_out
 from mitsim.study import Study, finishes_of_features
 from mitsim.study.run_files import TASK, digests_of

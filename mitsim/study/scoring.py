@@ -24,9 +24,9 @@ from characterisation.scores.task_sets import SetJoining, choose_set
 from characterisation.scores.view_score import write_scores
 from characterisation.scores.view_sets import ViewSet
 from characterisation.tasks.measurement_model import InputQuantity
+from characterisation.words.numbers import two_digits
+from characterisation.words.progress import say
 from mitsim.maps.campaign.run import write_netcdf
-from mitsim.running.numbers import two_digits
-from mitsim.running.progress import say
 from mitsim.running.time_limit import TimeLimit
 from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.study import SetTable, Study

@@ -20,10 +20,10 @@ from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.statements.statement import Statements
 from characterisation.tasks.measurement_model import InputQuantity
+from characterisation.words.progress import say
 from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.prediction import Predictor
 from mitsim.running.executor import Executor
-from mitsim.running.progress import say
 from mitsim.running.time_limit import TimeLimit
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import RaceTable, StatementTable, Study

@@ -8,7 +8,7 @@ from typing import Any
 
 from characterisation.files.atomic_io import json_values
 from characterisation.statements.statement import Statement
-from mitsim.running.version import __version__
+from characterisation.words.version import __version__
 from mitsim.study.maker_accuracy import maker_sigma
 from mitsim.study.session import Session
 from mitsim.study.virtual.influences import influences

@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from characterisation.maps.performance_map import PerformanceMap
+from characterisation.words.numbers import finish_name, listed
 from mitsim.report.figures import matt_to_shiny
-from mitsim.running.numbers import finish_name, listed
 from mitsim.talk import sensor_figures as figures
 from mitsim.talk.results import Results
 from mitsim.talk.slides import Claim, Slide, collected, largest_of, mean_of, median_of, verdict

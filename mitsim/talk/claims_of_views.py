@@ -10,7 +10,7 @@ import xarray as xr
 
 from characterisation.scores.rank_agreement import spearman
 from characterisation.tasks.task_reading import read_task
-from mitsim.running.numbers import listed, two_digits, unit_symbol
+from characterisation.words.numbers import listed, two_digits, unit_symbol
 from mitsim.study import MINIMUM_POINTS
 from mitsim.talk import view_figures as figures
 from mitsim.talk.judged_views import QUANTITIES, SCORES, JudgedViews, true_error

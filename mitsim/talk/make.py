@@ -14,9 +14,9 @@ from typing import Any
 
 import xarray as xr
 
+from characterisation.words.numbers import time_in_words
+from characterisation.words.progress import say_progress, track
 from mitsim.running.executor import Executor
-from mitsim.running.numbers import time_in_words
-from mitsim.running.progress import say_progress, track
 from mitsim.running.time_limit import TimeLimit
 from mitsim.study.session import Session
 from mitsim.study.virtual.plan import rendering_of

@@ -18,10 +18,10 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
+from characterisation.words.progress import track
 from mitsim.capture.folder import read_capture, read_settings_and_pose
 from mitsim.decoding.cloud import capture_cloud, decoder_settings
 from mitsim.decoding.input_clouds import margin_of
-from mitsim.running.progress import track
 from mitsim.sensor.transforms import Transform
 from mitsim.study.task_measurement import measure_task
 from mitsim.talk.talk_file import ArtefactEntry, Talk

@@ -17,9 +17,9 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from characterisation.files.atomic_io import write_text
+from characterisation.words.numbers import listed
 from mitsim.report.style import write_png
 from mitsim.report.templates import write_page
-from mitsim.running.numbers import listed
 from mitsim.talk import claims_of_coupons, claims_of_sensors, claims_of_views
 from mitsim.talk.results import Results
 from mitsim.talk.sensor_figures import opening_figure

@@ -21,10 +21,10 @@ from characterisation.plots.clouds import depth_limits, residual_limit
 from characterisation.plots.discs import noise_limits, plain_log_ticks
 from characterisation.plots.style import BLUE, DIVERGING, FIELD, INK, MUTED, NOISE, SEQUENTIAL, VERMILION, drawing
 from characterisation.point_cloud import Status
+from characterisation.words.numbers import finish_name
 from mitsim.report.cloud_figures import REASONS, draw_status
 from mitsim.report.figures import colour_bar, matt_to_shiny
 from mitsim.report.style import colour_scale
-from mitsim.running.numbers import finish_name
 from mitsim.talk.coupon_pieces import NO_POINT, STEP_MM
 from mitsim.talk.noise_pieces import TwoNormals
 

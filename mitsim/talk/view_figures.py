@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from characterisation.files.arrays import Floats
 from characterisation.plots.discs import disc
 from characterisation.plots.style import BLUE, INK, MUTED, SEQUENTIAL, VERMILION, drawing, figure_of
+from characterisation.words.numbers import unit_symbol
 from mitsim.report.style import colour_scale, plain_log
 from mitsim.report.view_figures import sphere_of_views, view_places
-from mitsim.running.numbers import unit_symbol
 from mitsim.talk.judged_views import QUANTITIES, SCORES, JudgedViews, true_error
 
 

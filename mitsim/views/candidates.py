@@ -23,7 +23,7 @@ from characterisation.coupon.orientations import sphere_directions
 from characterisation.features.surfaces import unit
 from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
-from mitsim.running.progress import track_if_long
+from characterisation.words.progress import track_if_long
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform, look_at
 from mitsim.sensor.working_volume import in_image

@@ -13,7 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.statements.verdict_words import named
-from mitsim.running.numbers import listed
+from characterisation.words.numbers import listed
 from mitsim.views.limiting_factor import OCCLUDED
 
 #: share of the points in matt white below which the finish is a cause of their loss

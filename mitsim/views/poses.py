@@ -21,8 +21,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from characterisation.files.atomic_io import write_folder
-from mitsim.running.progress import say
-from mitsim.running.version import __version__
+from characterisation.words.progress import say
+from characterisation.words.version import __version__
 from mitsim.sensor.transforms import Transform
 from mitsim.views.candidates import Candidates, View
 from mitsim.views.table import ViewsTable

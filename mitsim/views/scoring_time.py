@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from mitsim.running.progress import say
+from characterisation.words.progress import say
 from mitsim.running.time_limit import TimeLimit
 from mitsim.views import View
 

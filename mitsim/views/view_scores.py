@@ -32,6 +32,7 @@ from characterisation.tasks.prediction import (
     expected_measurement,
 )
 from characterisation.tasks.task_file import Task
+from characterisation.words.progress import track
 from mitsim.maps.campaign.acquire import one_ahead
 from mitsim.maps.prediction import (
     CharacterisedScene,
@@ -46,7 +47,6 @@ from mitsim.maps.prediction import (
     performance,
     together,
 )
-from mitsim.running.progress import track
 from mitsim.running.time_limit import TimeLimit, in_time
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish

@@ -21,11 +21,11 @@ from pathlib import Path
 import numpy as np
 
 from characterisation.point_cloud import PointCloud
+from characterisation.words.numbers import aligned
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decoding.cloud import capture_cloud, sensor_geometry
 from mitsim.maps.prediction import Predictor
-from mitsim.running.text_table import aligned
 from mitsim.scene.load import load_scene
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.pattern import DotPattern, another_mask

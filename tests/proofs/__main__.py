@@ -43,7 +43,7 @@ def scores(
     Example: python -m tests.proofs scores scenes/parts/validation.toml -o runs/validated
     """
     start(variant)
-    from mitsim.running.progress import say
+    from characterisation.words.progress import say
     from tests.proofs.part_cases import read_part_cases
     from tests.proofs.screening_page import described_screening, write_screening_page
     from tests.proofs.screening_run import screen_cases
@@ -79,7 +79,7 @@ def statements(
     Example: python -m tests.proofs statements scenes/parts/validation.toml -o runs/validated
     """
     start(variant)
-    from mitsim.running.progress import say
+    from characterisation.words.progress import say
     from tests.proofs.part_cases import described, read_part_cases
     from tests.proofs.statement_page import write_statement_page
     from tests.proofs.statement_run import run_cases
@@ -129,7 +129,7 @@ def losses(
     """
     start(variant)
     from characterisation.files.atomic_io import write_text
-    from mitsim.running.progress import say
+    from characterisation.words.progress import say
     from tests.proofs.loss_fit import fitted_loss, losses_document, points_of_cases
     from tests.proofs.part_cases import read_part_cases
 
@@ -179,7 +179,7 @@ def maps(
     import tempfile
 
     from characterisation.files.atomic_io import write_text
-    from mitsim.running.progress import say
+    from characterisation.words.progress import say
     from tests.proofs.map_comparison import beyond_map_document, compare_case, judged_table
     from tests.proofs.part_cases import read_part_cases
     from tests.proofs.tables import markdown
@@ -247,7 +247,7 @@ def laboratory(
     Example: python -m tests.proofs laboratory tests/proofs/laboratory/cases.toml -o runs/laboratory
     """
     start(variant)
-    from mitsim.running.progress import say
+    from characterisation.words.progress import say
     from tests.proofs.laboratory.cases import read_cases
     from tests.proofs.laboratory.page import write_laboratory_page
     from tests.proofs.laboratory.run import run_rows

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, Status
+from characterisation.words.progress import say, track
 from mitsim.maps.prediction import Predictor, SceneView, performance
 from mitsim.maps.prediction.faces_in_sight import faces_in_sight
 from mitsim.maps.prediction.interreflections import InterreflectionEffect
-from mitsim.running.progress import say, track
 from mitsim.study import Study
 from mitsim.study.virtual.plan import measurements_of
 from mitsim.study.virtual.rendered import RenderedMeasurements

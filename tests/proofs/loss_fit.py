@@ -24,9 +24,9 @@ from scipy.optimize import minimize
 from threadpoolctl import threadpool_limits
 
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, Status
+from characterisation.words.progress import say, track
 from mitsim.maps.prediction import Predictor, performance
 from mitsim.maps.prediction.interreflections import InterreflectionEffect, LossCurve
-from mitsim.running.progress import say, track
 from mitsim.study import Study
 from mitsim.study.virtual.beyond_map import CODED, FLIGHT, MATCHED, kind_of
 from mitsim.study.virtual.plan import measurements_of

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsim.running.progress import say, track
+from characterisation.words.progress import say, track
 from mitsim.study.session import Session
 from mitsim.study.virtual.beyond_map import CODED, FLIGHT, MATCHED, BeyondMap, Sizes, drawn_sizes, kind_of
 from mitsim.study.virtual.mapped import MappedMeasurements

@@ -33,9 +33,9 @@ from numpy.typing import NDArray
 
 from characterisation.point_cloud import Status
 from characterisation.statements.selection import chance_after, posterior
+from characterisation.words.progress import say
 from mitsim.maps.prediction import Predictor
 from mitsim.running.executor import Executor
-from mitsim.running.progress import say
 from mitsim.study import Study
 from mitsim.study.virtual.race import FIRST, combined_cost, first_of_each, prior_risk
 from mitsim.views.view_scores import RAYS, screening_risk

@@ -18,8 +18,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.statements.statement import Statement
+from characterisation.words.progress import say
 from mitsim.running.executor import Executor
-from mitsim.running.progress import say
 from mitsim.study import Study
 from mitsim.study.session import Session
 from mitsim.study.virtual.race import ALL, Raced

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from characterisation.words.numbers import count, listed, percent, rounded, two_digits
 from mitsim.report import findings
-from mitsim.running.numbers import count, listed, percent, rounded, two_digits
 
 
 def scores_of(u, possible=None, tolerance=None):

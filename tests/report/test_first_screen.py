@@ -9,11 +9,11 @@ import pytest
 
 from characterisation.statements.verdict_words import Judged, Reason
 from characterisation.tasks.definitions import DEFINITIONS
+from characterisation.words.numbers import with_degree_signs
 from mitsim.report.choice_page import write_choice_page
 from mitsim.report.first_rows import RowValues, measured_words, tolerance_words
 from mitsim.report.first_screen import FirstScreen, of_choice, of_run, sensor_rows, tone_of
 from mitsim.report.page import write_report
-from mitsim.running.numbers import with_degree_signs
 from mitsim.study.choice_document import read_choice
 from mitsim.study.choose.ranking import OUT_BY_FAR
 from mitsim.study.run_folder import read_run

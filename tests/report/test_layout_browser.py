@@ -6,9 +6,9 @@ import shutil
 import pytest
 
 from characterisation.plots.statements import GROUPS
+from characterisation.words.numbers import percent
 from mitsim.report.choice_page import write_choice_page
 from mitsim.report.page import write_report
-from mitsim.running.numbers import percent
 from tests.report.choice_run import write_choice
 from tests.report.chromium import BROWSER
 from tests.report.conftest import plain_pictures

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
+from characterisation.words.numbers import percent
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.capture.exr import EXR_MAGIC, exr_depths
@@ -26,7 +27,6 @@ from mitsim.capture.recordings.array_file import arrays_in, disparities, is_disp
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
 from mitsim.capture.recordings.cloud_numbers import FAR_BEYOND, FARTHEST_MM, METRES_UNDER, NEITHER_ABOVE
 from mitsim.capture.recordings.stated_scale import check_scale, stated_scales
-from mitsim.running.numbers import percent
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.png import LONGEST_SIDE_PX
 

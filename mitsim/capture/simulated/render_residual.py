@@ -21,12 +21,12 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.words.numbers import two_digits
+from characterisation.words.progress import say
 from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.indirect_light import IndirectLight
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.running.numbers import two_digits
-from mitsim.running.progress import say
 from mitsim.scene.load import Scene
 from mitsim.scene.visible_surfaces import sees_nothing
 from mitsim.sensor.imager import Imager

@@ -11,6 +11,7 @@ import numpy as np
 
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
+from characterisation.words.numbers import percent
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Settings
 from mitsim.decoding.checks.gray_origin import gray_origin_warning
@@ -21,7 +22,6 @@ from mitsim.decoding.checks.row_texture import measured_row_error
 from mitsim.decoding.cloud import decoder_settings
 from mitsim.decoding.coded_images import CodedImages
 from mitsim.decoding.matching.stereo import StereoGeometry, stereo_geometry
-from mitsim.running.numbers import percent
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 

@@ -25,6 +25,7 @@ from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 from characterisation.region_of_interest import Roi
+from characterisation.words.progress import say
 from mitsim.capture.calibration import calibration_table
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture, read_settings_and_pose
@@ -36,7 +37,6 @@ from mitsim.decoding.depth_range import depths_of, range_warning
 from mitsim.maps.campaign.plan import Campaign, Shot, view_axes
 from mitsim.maps.campaign.pose_doubt import DIRECTION, fits, fits_inverted, may_be_inverted, pose_doubt
 from mitsim.maps.campaign.store import Finished
-from mitsim.running.progress import say
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 

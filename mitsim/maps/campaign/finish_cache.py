@@ -21,9 +21,9 @@ from characterisation.files.atomic_io import write_json
 from characterisation.files.checked_files import is_file, read_json_object
 from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
+from characterisation.words.progress import say
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.maps.campaign.one_finish import OneFinish, characterise_finish
-from mitsim.running.progress import say
 
 #: number of captures of a campaign at one distance: mean of twelve, ``python tests/benchmarks/any_finish.py``
 USUAL_CAPTURES = 250

@@ -24,11 +24,11 @@ from characterisation.maps.light import Light
 from characterisation.maps.nearest import Nearest, nearest_sample, standing_for
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.samples import Samples
+from characterisation.words.numbers import time_in_words
+from characterisation.words.progress import say
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.maps.campaign.finish_cache import cache_folder, expected_seconds, keep_rate, kept_finish, made_finish
 from mitsim.maps.campaign.one_finish import OneFinish, largest_incidence_deg
-from mitsim.running.numbers import time_in_words
-from mitsim.running.progress import say
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
 from mitsim.sensor.sensor import Sensor

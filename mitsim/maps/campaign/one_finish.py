@@ -23,6 +23,7 @@ from characterisation.coupon.view_frame import view_frame
 from characterisation.maps.joined import mean_over, with_directions
 from characterisation.maps.lay import mirror_direction, tangent_at
 from characterisation.maps.performance_map import PerformanceMap
+from characterisation.words.version import __version__
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.maps.campaign.acquire import in_turn, simulated_source
 from mitsim.maps.campaign.coupons import CouponRecipe, Sample
@@ -38,7 +39,6 @@ from mitsim.maps.campaign.plan import (
     view_axes,
 )
 from mitsim.maps.campaign.run import run_campaign
-from mitsim.running.version import __version__
 from mitsim.scene.load import flat_coupon
 from mitsim.scene.materials import Finish
 from mitsim.sensor.sensor import Sensor

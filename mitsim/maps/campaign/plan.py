@@ -28,10 +28,10 @@ from characterisation.files.documents import Document, read_toml
 from characterisation.files.errors import InputError
 from characterisation.maps.building import Variant
 from characterisation.stage.angles import Stage
+from characterisation.words.version import __version__
 from mitsim.capture.devices.maker_captures import DeviceTable
 from mitsim.maps.campaign.coupons import VARIANTS, CouponRecipe, Sample, load_sample
 from mitsim.maps.campaign.stage_pose import StageTable
-from mitsim.running.version import __version__
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.sensor_text import written
 from mitsim.sensor.transforms import Transform

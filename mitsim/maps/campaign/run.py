@@ -24,11 +24,11 @@ from characterisation.files import atomic_io
 from characterisation.files.errors import InputError
 from characterisation.maps.building import SampleTable, build_map
 from characterisation.maps.performance_map import PerformanceMap
+from characterisation.words.progress import say, track
+from characterisation.words.version import __version__
 from mitsim.maps.campaign.acquire import Source
 from mitsim.maps.campaign.plan import Campaign, Series, Shot
 from mitsim.maps.campaign.store import Finished, read_shot, remove_partial, write_shot
-from mitsim.running.progress import say, track
-from mitsim.running.version import __version__
 from mitsim.sensor.sensor_text import sensor_checksum
 
 #: folder of the shots of a campaign

@@ -37,10 +37,10 @@ from characterisation.files.checked_files import (
 from characterisation.files.datasets import check_dataset
 from characterisation.files.documents import Document, validate
 from characterisation.files.errors import InputError, MissingEnvironmentError
+from characterisation.words.version import __version__
 from mitsim.capture.capture import Capture
 from mitsim.capture.packed_files import packed
 from mitsim.maps.campaign.plan import Shot
-from mitsim.running.version import __version__
 
 #: longest accepted header of a table [bytes]; some thirty columns take 1,100
 _LONGEST_HEADER = 10_000

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from characterisation.words.numbers import percent
 from mitsim.maps.prediction.predictor import Predictor
-from mitsim.running.numbers import percent
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.self_view import seen_faces
 from mitsim.sensor.transforms import Transform

@@ -27,10 +27,10 @@ from characterisation.files.checked_files import read_json_object
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status, ViewGrid
 from characterisation.region_of_interest import Roi
+from characterisation.words.progress import track
+from characterisation.words.version import __version__
 from mitsim.capture.folder import read_capture
 from mitsim.report.export.bop_frame import Frame, bop_frame
-from mitsim.running.progress import track
-from mitsim.running.version import __version__
 from mitsim.scene.load import Scene, load_scene
 from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.sensor.png import encode_png

@@ -20,9 +20,9 @@ from characterisation.files.atomic_io import atomic_write
 from characterisation.files.errors import InputError
 from characterisation.statements.statement import ANY_PART
 from characterisation.tasks.task_file import effective_deviations
+from characterisation.words.version import __version__
 from mitsim.report.declaration import Declaration
 from mitsim.report.export.results import ExpectedResult, RunResults
-from mitsim.running.version import __version__
 
 #: XML namespace of digital calibration certificates
 DCC = "https://ptb.de/dcc"

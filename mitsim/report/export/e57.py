@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.atomic_io import atomic_write_named
+from characterisation.words.version import __version__
 from mitsim.report.export.cloud_points import COVARIANCE, CloudPoints
 from mitsim.report.export.cloud_writers import about
 from mitsim.report.export.needed import needed
 from mitsim.report.export.run_scene import quaternion
-from mitsim.running.version import __version__
 from mitsim.sensor.transforms import Transform
 
 #: prefix of the fields that E57 does not define

@@ -19,9 +19,9 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.files.atomic_io import atomic_write_named
 from characterisation.point_cloud import ViewGrid
+from characterisation.words.version import __version__
 from mitsim.report.export.needed import needed
 from mitsim.report.export.run_scene import RunScene, frustum, quaternion, sensor_from_grid
-from mitsim.running.version import __version__
 from mitsim.sensor.transforms import Transform
 
 #: length of the drawn frusta [mm]

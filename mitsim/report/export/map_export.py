@@ -16,8 +16,8 @@ from characterisation.files.atomic_io import write_folder
 from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.tables import to_probit
+from characterisation.words.version import __version__
 from mitsim.report.export import map_kernel
-from mitsim.running.version import __version__
 
 _README = """# Performance map of {sensor}
 

@@ -19,6 +19,7 @@ from xml.etree.ElementTree import Element, ElementTree, indent, tostring
 from characterisation.files.atomic_io import atomic_write
 from characterisation.tasks.definitions import DEFINITIONS
 from characterisation.tasks.task_file import Measurement
+from characterisation.words.version import __version__
 from mitsim.report.export.qif_document import (
     FEATURES,
     GEOMETRIC,
@@ -35,7 +36,6 @@ from mitsim.report.export.qif_document import (
     zone,
 )
 from mitsim.report.export.results import ExpectedResult, RunResults
-from mitsim.running.version import __version__
 
 NAMESPACE = "http://qifstandards.org/xsd/qif3"
 

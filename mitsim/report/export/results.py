@@ -18,8 +18,8 @@ from characterisation.statements.statement import ANY_PART, AT_THE_LIMIT
 from characterisation.tasks.deviations import fold_of
 from characterisation.tasks.task_file import Measurement, Task
 from characterisation.tasks.task_reading import read_task
+from characterisation.words.version import __version__
 from mitsim.report.export.run_scene import view_pose
-from mitsim.running.version import __version__
 from mitsim.sensor.transforms import Transform
 from mitsim.study.run_files import TASK
 from mitsim.study.run_folder import read_run

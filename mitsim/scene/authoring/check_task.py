@@ -19,7 +19,7 @@ from characterisation.files.errors import nearest
 from characterisation.tasks.decision_table import Decision
 from characterisation.tasks.task_file import Feature, Measurement, Task
 from characterisation.tasks.task_reading import misstated, read_task
-from mitsim.running.progress import say
+from characterisation.words.progress import say
 from mitsim.scene.authoring.face import surface_distance
 from mitsim.scene.authoring.finding import SceneFinding, Severity
 from mitsim.scene.authoring.naming import ROUND, round_angle

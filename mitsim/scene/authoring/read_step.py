@@ -26,7 +26,7 @@ import numpy as np
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
 from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
-from mitsim.running.progress import say_progress
+from characterisation.words.progress import say_progress
 from mitsim.scene.authoring import step_mesh, step_worker
 from mitsim.scene.authoring.face import Face, Ints, Surface, Torus, centred, mesh_distances, outward_normals
 from mitsim.scene.authoring.join_faces import join_faces

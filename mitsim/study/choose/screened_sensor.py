@@ -14,8 +14,8 @@ from characterisation.files.errors import InputError
 from characterisation.statements.decision import demand
 from characterisation.statements.tolerance import tolerance_of
 from characterisation.tasks.task_file import Task
+from characterisation.words.progress import say
 from mitsim.maps.campaign.run import write_netcdf
-from mitsim.running.progress import say
 from mitsim.running.time_limit import TimeLimit
 from mitsim.study.choose.candidates import CandidateSensor
 from mitsim.study.choose.sensor_result import SensorResult

@@ -26,9 +26,9 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
+from characterisation.words.numbers import two_digits
+from characterisation.words.progress import say
 from mitsim.running.executor import Executor, giving_up
-from mitsim.running.numbers import two_digits
-from mitsim.running.progress import say
 from mitsim.running.time_limit import TimeLimit
 from mitsim.study.choice_document import FEW_TRIALS
 from mitsim.study.choose.candidates import CandidateSensor

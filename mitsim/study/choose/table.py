@@ -17,9 +17,8 @@ from characterisation.statements.decision import Verdict, decide, mostly_lost, n
 from characterisation.statements.statement import Statement
 from characterisation.statements.tolerance import tolerance_of
 from characterisation.statements.verdict_words import Reason, in_words, result_reasons
-from mitsim.running.numbers import or_nan, two_digits
-from mitsim.running.text_table import aligned
-from mitsim.running.version import __version__
+from characterisation.words.numbers import aligned, or_nan, two_digits
+from characterisation.words.version import __version__
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.sensor import Sensor
 from mitsim.study import Study

@@ -19,8 +19,8 @@ from characterisation.files.atomic_io import write_json, write_text
 from characterisation.files.checked_files import read_json_object
 from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
-from mitsim.running.progress import say
-from mitsim.running.text_table import aligned
+from characterisation.words.numbers import aligned
+from characterisation.words.progress import say
 from mitsim.running.time_limit import TimeLimit
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import Study

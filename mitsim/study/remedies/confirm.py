@@ -19,7 +19,7 @@ from typing import Any
 from characterisation.files.atomic_io import json_values
 from characterisation.files.errors import InputError
 from characterisation.statements.statement import Statement
-from mitsim.running.progress import say
+from characterisation.words.progress import say
 from mitsim.running.time_limit import TimeLimit
 from mitsim.study.remedies.change import Change, Shortfall
 from mitsim.study.remedies.changes import changes

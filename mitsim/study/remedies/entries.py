@@ -12,7 +12,7 @@ from typing import Any
 from pydantic import Field, model_validator
 
 from characterisation.statements.verdict_words import NAMED, named
-from mitsim.running.numbers import listed, or_nan, two_digits
+from characterisation.words.numbers import listed, or_nan, two_digits
 from mitsim.study.statement_file import PartialDocument
 
 #: kind of what was not tried, if no change of any kind was

@@ -17,7 +17,7 @@ import xarray as xr
 from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.maps.shipped import shipped_maps
-from mitsim.running.progress import say
+from characterisation.words.progress import say
 from mitsim.running.time_limit import TimeLimit
 from mitsim.sensor.preset import named_sensor, presets
 from mitsim.study import Study

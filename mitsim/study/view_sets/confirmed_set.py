@@ -24,9 +24,8 @@ from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.losses import losses
 from characterisation.statements.statement import Statement, statement
 from characterisation.statements.tolerance import tolerance_of
-from mitsim.running.numbers import beside, percent, two_digits
-from mitsim.running.progress import say, track
-from mitsim.running.text_table import aligned
+from characterisation.words.numbers import aligned, beside, percent, two_digits
+from characterisation.words.progress import say, track
 from mitsim.study import SetTable
 from mitsim.study.exposures.planned import with_exposure
 from mitsim.study.session import Session

@@ -18,9 +18,9 @@ import numpy as np
 
 from characterisation.files.errors import InputError
 from characterisation.tasks.folded import folded_values
+from characterisation.words.version import __version__
 from mitsim.capture.simulated.indirect_light import IndirectLight, KeptSettings
 from mitsim.capture.simulated.rendering import Rendering
-from mitsim.running.version import __version__
 from mitsim.scene.xml_check import named_digests
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.matcher import MatcherSettings

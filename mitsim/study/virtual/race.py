@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.arrays import Floats
 from characterisation.statements.selection import Standing, joint_samples, judge
-from mitsim.running.progress import say, say_progress, track
+from characterisation.words.progress import say, say_progress, track
 from mitsim.running.time_limit import in_time
 from mitsim.study import RaceTable
 from mitsim.study.virtual.trials import Outcome, TrialFolder

@@ -22,8 +22,17 @@ from characterisation.statements.statement import Statement, statement
 from characterisation.statements.tolerance import tolerance_of
 from characterisation.statements.verdict_words import Judged
 from characterisation.tasks.decision_table import BIAS_SUBTRACTED
-from mitsim.running.numbers import MINUS, NONE, SPACE, accepted_text, beside, interval_text, percent, two_digits
-from mitsim.running.text_table import aligned
+from characterisation.words.numbers import (
+    MINUS,
+    NONE,
+    SPACE,
+    accepted_text,
+    aligned,
+    beside,
+    interval_text,
+    percent,
+    two_digits,
+)
 from mitsim.running.time_limit import TimeLimit
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.sensor import Sensor

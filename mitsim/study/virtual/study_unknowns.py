@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from characterisation.files.errors import InputError, nearest
-from mitsim.running.progress import say
+from characterisation.words.progress import say
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.drift import Drift
 from mitsim.sensor.preset import presets

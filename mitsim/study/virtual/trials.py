@@ -31,7 +31,7 @@ from characterisation.statements.one_sided import OneSidedErrors
 from characterisation.tasks.folded import FoldedValue, folded_values
 from characterisation.tasks.result import Result
 from characterisation.tasks.task_file import Task
-from mitsim.running.numbers import or_nan
+from characterisation.words.numbers import or_nan
 from mitsim.study.virtual.world import Trial
 
 

@@ -20,11 +20,11 @@ from characterisation.files.atomic_io import write_json
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
 from characterisation.region_of_interest import Roi
+from characterisation.words.numbers import NONE, rounded, two_digits
+from characterisation.words.progress import say
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.decoding.cloud import Settings, decoder_settings, imager_of_bits, settings_in_words
-from mitsim.running.numbers import NONE, rounded, two_digits
-from mitsim.running.progress import say
 from mitsim.sensor.fitted_to import recorded_in, shows_the_fit
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.pattern import RandomDots

@@ -31,10 +31,10 @@ from scipy.stats import wasserstein_distance
 from characterisation.files.arrays import Floats
 from characterisation.files.atomic_io import json_values
 from characterisation.files.errors import InputError
+from characterisation.words.numbers import two_digits
 from mitsim.capture.capture import Capture
 from mitsim.decoding.cloud import Geometry, Settings, capture_geometry
 from mitsim.decoding.matching.stereo import StereoGeometry
-from mitsim.running.numbers import two_digits
 from mitsim.twin.compare.compared_quantities import QUANTITIES, Quantity
 from mitsim.twin.compare.plain_image import median_level, plain_image
 from mitsim.twin.compare.specimen_patches import PATCH_PX, SpecimenPatches, contrast_window, specimen_patches

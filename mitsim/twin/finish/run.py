@@ -19,11 +19,11 @@ import numpy as np
 from characterisation.files.atomic_io import json_values
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
+from characterisation.words.progress import say, track
 from mitsim.capture.calibration import calibration_table
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
 from mitsim.maps.campaign.coupons import CouponRecipe, load_sample
-from mitsim.running.progress import say, track
 from mitsim.scene.light_transport.ambient import has_emitters
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.sensor import Sensor

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.arrays import Floats
-from mitsim.running.progress import say_progress
+from characterisation.words.progress import say_progress
 
 #: features (n,) and their covariance (n, n) of simulation number i at parameters (k,)
 Simulate = Callable[[Floats, int], tuple[Floats, Floats]]

@@ -17,8 +17,8 @@ import numpy as np
 
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
+from characterisation.words.progress import say
 from mitsim.decoding.cloud import decoder_settings
-from mitsim.running.progress import say
 from mitsim.sensor.fitted_to import FittedCapture, images_digest
 from mitsim.sensor.light_code import LightCode
 from mitsim.sensor.pattern import DotPattern

@@ -21,7 +21,7 @@ from typing import Literal
 
 from scipy.stats import chi2
 
-from mitsim.running.numbers import percent
+from characterisation.words.numbers import percent
 from mitsim.twin.compare.compared_quantities import NOISE_FACTOR
 
 Word = Literal["good", "fair", "bad", "not tested"]

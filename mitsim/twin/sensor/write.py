@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from characterisation.files.atomic_io import atomic_write
-from mitsim.running.numbers import two_digits
+from characterisation.words.numbers import two_digits
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.fitted_to import FittedCapture
 from mitsim.sensor.preset import load_sensor

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mitsim.running.progress import track
+from characterisation.words.progress import track
 from mitsim.scene.surface.scatter import Deviation
 from mitsim.study import Study
 from mitsim.study.virtual.drawn_finish import finish_deviation

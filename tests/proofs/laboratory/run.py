@@ -16,8 +16,8 @@ import numpy as np
 
 from characterisation.statements.statement import Statement
 from characterisation.tasks.task_file import Task
+from characterisation.words.progress import say, track
 from mitsim.running.executor import Executor
-from mitsim.running.progress import say, track
 from mitsim.sensor.sensor_text import sensor_checksum
 from mitsim.study import StatementTable, Study
 from mitsim.study.session import Session

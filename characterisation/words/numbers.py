@@ -1,9 +1,10 @@
-"""Format numbers for readers: with a unit, and with significant digits only; convert those that may be missing."""
+"""Format numbers for readers, with a unit and with significant digits only, and tables; convert missing numbers."""
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 
 #: sign of negative numbers
 MINUS = "\N{MINUS SIGN}"
@@ -128,3 +129,14 @@ def or_none(value: float) -> float | None:
 def or_nan(value: float | None) -> float:
     """Return a number as it is, and NaN for None."""
     return math.nan if value is None else value
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a table with columns as wide as their widest cell and two spaces between columns.
+
+    The first row is the header. A cell beyond its columns, such as a reason, widens no column.
+    """
+    widths = [max(len(row[k]) for row in rows if len(row) > k) for k in range(len(rows[0]))]
+    return [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, [*widths, 0], strict=False)).rstrip() for row in rows
+    ]

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from mitsim.running.numbers import SPACE, accepted_text, beside, interval_text, percent
+from characterisation.words.numbers import SPACE, accepted_text, beside, interval_text, percent
 
 
 @pytest.mark.parametrize(

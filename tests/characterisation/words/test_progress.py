@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mitsim.running.progress import time_left
+from characterisation.words.progress import time_left
 
 
 def test_what_is_prepared_before_the_first_item_is_no_part_of_the_rest():
