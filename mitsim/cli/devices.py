@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -12,12 +12,10 @@ from characterisation.files.errors import InputError
 from characterisation.words.progress import say, track
 from mitsim.cli import options
 
-_KINDS = "ensenso:SERIAL, depthai or depthai:ID"
-
 
 def capture(
     output: options.Out,
-    device: Annotated[str, typer.Option(help=f"Camera: {_KINDS}.")],
+    device: Annotated[str, typer.Option(help="Camera: ensenso:SERIAL, depthai or depthai:ID.")],
     settings: Annotated[
         Path | None,
         typer.Option(help="TOML file of camera settings, with the keys of [device.settings] in a campaign."),
@@ -28,7 +26,7 @@ def capture(
 
     Example: mitsim capture --device ensenso:150358 --repeats 20 -o captures/sheet
     """
-    from mitsim.capture.devices.maker_captures import device_capture, open_device
+    from mitsim.capture.devices.maker_captures import device_capture, device_table, open_device
     from mitsim.capture.folder import write_capture
 
     table = device_table(device, settings)
@@ -41,29 +39,6 @@ def capture(
             folder = write_capture(taken.capture, output / f"{number:04d}", vendor=taken.originals)
             print(folder)
     say(f"captures: {output}")
-
-
-def device_table(device: str, settings: Path | None) -> Any:
-    """Return the ``[device]`` table for the options of a command.
-
-    Raises
-    ------
-    InputError
-        For an unknown kind of camera, or settings that the camera does not have.
-    """
-    from characterisation.files.documents import read_toml, validate
-    from mitsim.capture.devices.depthai_settings import DepthaiSettings
-    from mitsim.capture.devices.ensenso import EnsensoSettings
-    from mitsim.capture.devices.maker_captures import DepthaiTable, EnsensoTable
-
-    kind, _, name = device.partition(":")
-    if kind == "ensenso" and name:
-        chosen = EnsensoSettings() if settings is None else read_toml(settings, EnsensoSettings)
-        return validate("--device", {"kind": kind, "serial": name, "settings": chosen}, EnsensoTable)
-    if kind == "depthai":
-        set_to = DepthaiSettings() if settings is None else read_toml(settings, DepthaiSettings)
-        return validate("--device", {"kind": kind, "id": name, "settings": set_to}, DepthaiTable)
-    raise InputError("--device", "", repr(device), _KINDS)
 
 
 def mount(sample: str, distance: float) -> None:

@@ -10,12 +10,11 @@ import numpy as np
 
 from characterisation.files.documents import read_toml
 from characterisation.stage.calibration import axis_deviations, calibrate_with_board, calibration_angles
-from mitsim.capture.devices.maker_captures import device_capture, open_device
+from mitsim import Transform
+from mitsim.capture.devices.maker_captures import device_capture, device_table, open_device
 from mitsim.capture.devices.stage import open_stage
 from mitsim.capture.devices.stage_connection import StageConnection
-from mitsim.cli.devices import device_table
 from mitsim.maps.campaign.stage_pose import write_stage_calibration
-from mitsim.sensor.transforms import Transform
 
 dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
 board = cv2.aruco.CharucoBoard((7, 5), 15.0, 11.0, dictionary)  # squares and markers [mm]

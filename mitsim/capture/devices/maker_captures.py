@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from characterisation.files.documents import Document
+from characterisation.files.documents import Document, read_toml, validate
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import read_settings
@@ -60,6 +60,24 @@ class DepthaiTable(Document):
 OpenDevice = EnsensoCamera | DepthaiCamera
 
 DeviceTable = Annotated[EnsensoTable | DepthaiTable, Field(discriminator="kind")]
+
+
+def device_table(device: str, settings: Path | None) -> EnsensoTable | DepthaiTable:
+    """Return the ``[device]`` table of a camera that is named in one word, with the settings of a TOML file.
+
+    Raises
+    ------
+    InputError
+        For an unknown kind of camera, or settings that the camera does not have.
+    """
+    kind, _, name = device.partition(":")
+    if kind == "ensenso" and name:
+        chosen = EnsensoSettings() if settings is None else read_toml(settings, EnsensoSettings)
+        return validate("--device", {"kind": kind, "serial": name, "settings": chosen}, EnsensoTable)
+    if kind == "depthai":
+        set_to = DepthaiSettings() if settings is None else read_toml(settings, DepthaiSettings)
+        return validate("--device", {"kind": kind, "id": name, "settings": set_to}, DepthaiTable)
+    raise InputError("--device", "", repr(device), "ensenso:SERIAL, depthai or depthai:ID")
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from characterisation.files.errors import InputError, MissingEnvironmentError
 from mitsim.capture.devices.device_error import DeviceError
 from mitsim.capture.devices.ensenso import EnsensoSettings, open_ensenso
-from mitsim.capture.devices.maker_captures import ensenso_capture, points_in_left_camera
+from mitsim.capture.devices.maker_captures import device_table, ensenso_capture, points_in_left_camera
 from mitsim.capture.folder import read_capture, write_capture
 from tests.capture.devices.nxlib_standin import NO_STRIP, StandInCamera, counted_frames, installed, small_node
 
@@ -279,8 +279,6 @@ def test_points_that_agree_in_neither_frame_are_not_taken(camera):
 
 @given(text=st.text(max_size=30))
 def test_any_text_as_a_device_is_a_camera_or_is_refused(text):
-    from mitsim.cli.devices import device_table
-
     try:
         table = device_table(text, None)
     except InputError as error:
@@ -291,6 +289,4 @@ def test_any_text_as_a_device_is_a_camera_or_is_refused(text):
 
 @given(serial=st.from_regex("[A-Za-z0-9][A-Za-z0-9._-]{0,49}", fullmatch=True))
 def test_a_serial_number_is_taken_as_it_is(serial):
-    from mitsim.cli.devices import device_table
-
     assert device_table(f"ensenso:{serial}", None).serial == serial
