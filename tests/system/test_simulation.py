@@ -21,10 +21,10 @@ from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decoding.cloud import capture_cloud
 from mitsim.decoding.matching.stereo import stereo_geometry
 from mitsim.maps.campaign.acquire import coupon_cloud, coupon_residuals, in_turn, simulated_source
-from mitsim.maps.campaign.coupons import VARIANTS
 from mitsim.maps.campaign.plan import CampaignFile, coupon_pose, plan_campaign, read_campaign
 from mitsim.maps.campaign.run import run_campaign
 from mitsim.maps.prediction import Predictor, feature_statistics, performance
+from mitsim.scene.coupons import VARIANTS
 from mitsim.scene.load import load_scene
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor

@@ -27,12 +27,12 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.validation import Pair
 from characterisation.point_cloud import PointCloud
 from mitsim.maps.campaign.acquire import CaptureSource, coupon_cloud, coupon_place, own_sensor, simulated_source
-from mitsim.maps.campaign.coupons import Sample
 from mitsim.maps.campaign.live import LiveCampaign, plan_live
 from mitsim.maps.campaign.orders import Order, PreparedSensor, order_of, prepared_sensor
 from mitsim.maps.campaign.plan import Campaign, CampaignFile, Shot, plan_campaign
 from mitsim.maps.prediction import performance
 from mitsim.running.executor import check_same_file
+from mitsim.scene.coupons import Sample
 from mitsim.sensor.sensor import Sensor
 
 #: relative extent in |V| of a patch on either side of its middle

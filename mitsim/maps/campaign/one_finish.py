@@ -26,7 +26,6 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.words.version import __version__
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.maps.campaign.acquire import in_turn, simulated_source
-from mitsim.maps.campaign.coupons import CouponRecipe, Sample
 from mitsim.maps.campaign.plan import (
     MEASUREMENT_VERSION,
     Band,
@@ -39,6 +38,7 @@ from mitsim.maps.campaign.plan import (
     view_axes,
 )
 from mitsim.maps.campaign.run import run_campaign
+from mitsim.scene.coupons import CouponRecipe, Sample
 from mitsim.scene.load import flat_coupon
 from mitsim.scene.materials import Finish
 from mitsim.sensor.sensor import Sensor

@@ -18,12 +18,12 @@ from mitsim.capture.simulated.render import simulated_sensor
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.campaign.acquire import Source, measured, simulated_source
-from mitsim.maps.campaign.coupons import CouponRecipe, Sample, load_sample
 from mitsim.maps.campaign.plan import Campaign, Series, Shot
 from mitsim.maps.campaign.store import Finished
 from mitsim.maps.prediction import Predictor
 from mitsim.running.executor import Executor, check_same_file
 from mitsim.scene import backend
+from mitsim.scene.coupons import CouponRecipe, Sample, load_sample
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.sensor_text import once_for_sensor
 from mitsim.sensor.transforms import Transform

@@ -30,8 +30,8 @@ from characterisation.maps.building import Variant
 from characterisation.stage.angles import Stage
 from characterisation.words.version import __version__
 from mitsim.capture.devices.maker_captures import DeviceTable
-from mitsim.maps.campaign.coupons import VARIANTS, CouponRecipe, Sample, load_sample
 from mitsim.maps.campaign.stage_pose import StageTable
+from mitsim.scene.coupons import VARIANTS, CouponRecipe, Sample, load_sample
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.sensor_text import written
 from mitsim.sensor.transforms import Transform

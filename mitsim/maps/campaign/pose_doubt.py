@@ -18,7 +18,7 @@ from characterisation.coupon.patches import Coupon
 from characterisation.features.fits import fit_plane
 from characterisation.features.robust_fit import FitError
 from characterisation.point_cloud import PointCloud
-from mitsim.maps.campaign.coupons import Sample
+from mitsim.scene.coupons import Sample
 from mitsim.sensor.transforms import Transform
 
 #: largest tilt that raises no doubt [deg]; a sensor's own is smaller; chosen

@@ -23,7 +23,7 @@ from characterisation.words.progress import say, track
 from mitsim.capture.calibration import calibration_table
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
-from mitsim.maps.campaign.coupons import CouponRecipe, load_sample
+from mitsim.scene.coupons import CouponRecipe, load_sample
 from mitsim.scene.light_transport.ambient import has_emitters
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.sensor import Sensor

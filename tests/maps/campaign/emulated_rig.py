@@ -62,7 +62,7 @@ def node_of(sensor):
 def rendering_camera(counts_now):
     """A camera that sees the coupon where the stage holds it, ``counts_now()`` from zero."""
     from mitsim.capture.simulated.simulate import SimulatedSensor
-    from mitsim.maps.campaign.coupons import CouponRecipe, load_sample
+    from mitsim.scene.coupons import CouponRecipe, load_sample
     from mitsim.sensor.preset import load_sensor
     from mitsim.sensor.transforms import Transform
 
