@@ -83,7 +83,7 @@ def compare_case(case: PartCase, folder: Path, views: int, worlds: int) -> Compa
     names = tuple(study.task.measurements)
     drawn = np.full((len(names), len(some), worlds), np.nan)
     jobs = [Job(view, trial) for view in some for trial in trials]
-    for job, outcome in track(runner.run(runner.in_order(jobs)), case.name, len(jobs)):
+    for job, outcome in track(runner.run(jobs), case.name, len(jobs)):
         drawn[:, some.index(job.view), job.trial.day] = [outcome.errors[name] for name in names]
     rendered = np.stack([truth.trials.errors(view.number, trials) for view in some], axis=1)
     predicted = scores["predicted_uncertainty"].sel(measurement=list(names)).transpose("measurement", "view").values

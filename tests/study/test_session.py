@@ -151,9 +151,6 @@ class NormalErrors:
     def __init__(self, names, long_tail):
         self.names, self.long_tail = list(names), long_tail
 
-    def in_order(self, jobs):
-        return list(jobs)
-
     def run(self, jobs):
         for job in jobs:
             rng = np.random.default_rng([job.trial.day, job.trial.capture])

@@ -78,10 +78,6 @@ class MappedMeasurements:
         self._predicted: dict[int, dict[str, float]] = {}
         self._folded = folded_values(study.task)
 
-    def in_order(self, jobs: Iterable[Job]) -> list[Job]:
-        """Return the jobs sorted by view."""
-        return sorted(jobs, key=lambda job: job.view.number)
-
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, Outcome]]:
         """Yield the outcome of every virtual measurement, job by job.
 

@@ -65,9 +65,6 @@ class TrialRunner(Protocol):
 
     source: str
 
-    def in_order(self, jobs: Iterable[Job]) -> list[Job]:
-        """Return the jobs in the order that takes the least work."""
-
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, Outcome]]:
         """Yield the outcome of every virtual measurement, job by job."""
 
@@ -97,7 +94,7 @@ def complete(
     missing = [job for job in jobs if job.trial not in trials.known(job.view.number)]
     if not missing:
         return
-    for job, outcome in track(runner.run(in_time(runner.in_order(missing), over)), label, len(missing)):
+    for job, outcome in track(runner.run(in_time(missing, over)), label, len(missing)):
         trials.add(job.view.number, job.trial, outcome)
         if over():
             break

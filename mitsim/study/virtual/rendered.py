@@ -7,10 +7,10 @@ temperature and form of the part -> measurement at the assumed pose -> error of 
 
 The paths of interreflections are those of the nominal pose and calibration of the view
 (:mod:`mitsim.capture.simulated.kept_light`). Their images, and those of the room light, move to where the random pose
-and calibration show the part (:mod:`mitsim.capture.simulated.image_motion`). Trials sorted by view (:func:`in_order`)
-trace the paths once for each view. With ``separate_light``, every trial renders all of its light at its own pose and
-calibration. That takes several times as long, and is the reference for this approximation. The interreflections of
-scenes with emitters, or with finishes inside other BSDFs, are rendered anew for every finish.
+and calibration show the part (:mod:`mitsim.capture.simulated.image_motion`). Trials of a view that follow one another
+trace its paths once. With ``separate_light``, every trial renders all of its light at its own pose and calibration.
+That takes several times as long, and is the reference for this approximation. The interreflections of scenes with
+emitters, or with finishes inside other BSDFs, are rendered anew for every finish.
 
 Temperature and form displace the decoded points together with the surface, to first order. At 50 um on 500 mm, the
 change of the image position is far below a pixel, and that of the brightness far below a grey level.
@@ -124,10 +124,6 @@ class RenderedMeasurements:
         other = copy.copy(self)
         other.rendering, other.views = rendering, LightOfViews()
         return other
-
-    def in_order(self, jobs: Iterable[Job]) -> list[Job]:
-        """Return the jobs sorted by view: paths are traced once for each view."""
-        return sorted(jobs, key=lambda job: job.view.number)
 
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, Outcome]]:
         """Yield the outcome of every virtual measurement, job by job.

@@ -80,10 +80,6 @@ class SpreadMeasurements:
         other._order = replace(self._order, rendering=rendering)
         return other
 
-    def in_order(self, jobs: Iterable[Job]) -> list[Job]:
-        """Return the jobs sorted by view."""
-        return self.renderer.in_order(jobs)
-
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, Outcome]]:
         """Yield the outcome of every virtual measurement, job by job as they arrive."""
         orders = [replace(self._order, jobs=row) for row in self._rows(jobs)]

@@ -216,7 +216,7 @@ def test_virtual_measurements_are_the_same_on_a_cluster_though_a_worker_is_kille
     study = study_of(coarse)
     unknowns = study_unknowns(study)
     here = measurements_of(study, unknowns)
-    jobs = here.in_order(Job(view, Trial(day)) for view in study.views[:2] for day in range(2))
+    jobs = [Job(view, Trial(day)) for view in study.views[:2] for day in range(2)]
     dask_workers = Cluster(cluster.scheduler_address)
     there = SpreadMeasurements(dask_workers, here, trial_digest(study, unknowns, "render"))
     workers = dask_workers.client.run(os.getpid)

@@ -374,7 +374,6 @@ def test_a_statement_from_a_few_trials(coarse_n10, tmp_path):
 
     class Nobody:
         source = "render"
-        in_order = staticmethod(list)
 
         @staticmethod
         def run(jobs):

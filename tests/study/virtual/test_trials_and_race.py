@@ -35,9 +35,6 @@ class KnownMaker:
     def __init__(self, spreads, stop_after=None, failing=()):
         self.spreads, self.stop_after, self.failing, self.made = np.asarray(spreads), stop_after, failing, 0
 
-    def in_order(self, jobs):
-        return sorted(jobs, key=lambda job: (job.view.number, job.trial.day))
-
     def run(self, jobs):
         for job in jobs:
             if self.stop_after is not None and self.made >= self.stop_after:
