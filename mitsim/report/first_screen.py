@@ -145,7 +145,7 @@ def of_run(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
     results = [_judged(name, measurement) for name, measurement in document.measurements.items()]
     view_scores = run.scores.sel(view=document.view)
     asked = {
-        name: (run.about.measurements[name].faces, measurement.verdict)
+        name: (run.about.measurements[name].shapes, measurement.verdict)
         for name, measurement in document.measurements.items()
     }
     poses: list[tuple[str, ArrayLike]] = [(f"view {document.view}", view_scores["world_from_sensor"].values)]
@@ -188,7 +188,7 @@ def _without_statement(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
         for name, measurement in about.measurements.items()
     ]
     verdicts = face_verdicts(
-        {name: (measurement.faces, "not decided") for name, measurement in about.measurements.items()}
+        {name: (measurement.shapes, "not decided") for name, measurement in about.measurements.items()}
     )
     made = how_many(about.race_trials, "virtual measurement")
     return FirstScreen(

@@ -225,9 +225,9 @@ def _table(run: Run, name: str) -> dict[str, Any]:
             | expected_texts(run, name, view)
             | {
                 "rank": rank,
-                "points": [count(round(float(points.sel(feature=feature)))) for feature in entry.faces],
+                "points": [count(round(float(points.sel(feature=feature)))) for feature in entry.shapes],
                 "checked": view in run.checked,
             }
         )
     tolerance = math.isfinite(float(run.scores["tolerance"].sel(measurement=name)))
-    return {"name": name, "features": entry.faces, "tolerance": tolerance, "rows": rows}
+    return {"name": name, "features": entry.shapes, "tolerance": tolerance, "rows": rows}

@@ -101,7 +101,7 @@ def _measurement(run: Run, name: str) -> dict[str, Any]:
         "unit": entry.unit,
         "nominal": entry.nominal,
         "tolerance": _numbers(here["tolerance"].values),
-        "features": [features.index(feature) for feature in entry.faces if feature in features],
+        "features": [features.index(feature) for feature in entry.shapes if feature in features],
         "able": here["uncertainty_possible"].values.astype(int).tolist(),
         "possible": here["possible"].values.astype(int).tolist(),
         "limit": here["limit"].values.astype(str).tolist(),

@@ -115,12 +115,7 @@ class MeasurementEntry(PartialDocument):
     features: list[str]
     kind: str = ""
     tolerance: float | tuple[float, float] | None = None
-    shapes: list[str] = Field(default_factory=list)
-
-    @property
-    def faces(self) -> list[str]:
-        """Return the faces whose points decide the measurement; files of older versions name its features alone."""
-        return self.shapes or self.features
+    shapes: list[str]
 
 
 class ResidualEntry(PartialDocument):
@@ -346,7 +341,7 @@ def read_run(folder: str | Path) -> Run:
             raise InputError(folder / name, "measurement", ", ".join(measurements), allowed)
     seen = {str(feature) for feature in scores["feature"].values}
     for name, entry in about.measurements.items():
-        if absent := sorted(set(entry.faces) - seen):
+        if absent := sorted(set(entry.shapes) - seen):
             allowed = "features of scores.nc"
             raise InputError(folder / "run.json", f"measurements.{name}.shapes", absent[0], allowed)
     named = [("checks.nc", "view", checks["view"].values.tolist())]

@@ -175,7 +175,7 @@ def write_run(folder: Path, checked: list[int] = CHECKED) -> Path:
         "render_residual": {"noise": 0.0, "quadrature": 0.0614, "outliers": 0.013},
         "features": dict.fromkeys(FEATURES, "steel/ground Ra 0.4 um"),
         "measurements": {
-            name: {"nominal": m.nominal, "unit": m.unit, "features": list(m.features)}
+            name: {"nominal": m.nominal, "unit": m.unit, "features": list(m.features), "shapes": list(m.features)}
             for name, m in task.measurements.items()
         },
         "seconds": {"predict and score": 1.25},

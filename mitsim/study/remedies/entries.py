@@ -65,19 +65,6 @@ class RemediesEntry(PartialDocument):
     tried: list[TriedChangeEntry]
     untried: list[UntriedChange] = Field(default_factory=list)
 
-    @model_validator(mode="before")
-    @classmethod
-    def _of_older_runs(cls, document: Any) -> Any:
-        """Take the words alone, as older versions wrote them, as changes for every measurement."""
-        if not isinstance(document, dict) or not isinstance(document.get("untried"), list):
-            return document
-        names = list(document["measurements"]) if isinstance(document.get("measurements"), dict) else []
-        untried = [
-            {"change": "", "words": entry, "measurements": names} if isinstance(entry, str) else entry
-            for entry in document["untried"]
-        ]
-        return {**document, "untried": untried}
-
     @model_validator(mode="after")
     def _of_tried(self) -> RemediesEntry:
         for name, measurement in self.measurements.items():

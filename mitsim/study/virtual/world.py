@@ -3,9 +3,9 @@
 Signal chain: number of a trial -> a stream of random numbers for each group of unknowns -> true geometry of the sensor,
 finish, form, light, temperatures, pose of the part, and the seeds of all noise.
 
-There are two kinds of groups. All captures of one day share those in :data:`COMMON`, which therefore do not average out
-over repeated captures. Those in :data:`FRESH` are drawn for every capture. A trial states its day and its capture, and
-these alone determine its draw, on every machine and in any order. Views are compared with the same draws (common random
+There are two kinds of groups. Those in :data:`FRESH` are drawn for every capture. All captures of one day share the
+others, which therefore do not average out over repeated captures. A trial states its day and its capture, and these
+alone determine its draw, on every machine and in any order. Views are compared with the same draws (common random
 numbers).
 
 Some groups draw only a seed. Certain days of a statement keep the seed of the day before, so that the covariance of the
@@ -36,9 +36,6 @@ FRESH = ("pose", "noise")
 
 #: all groups; the index of a group in this tuple seeds its stream, so that a new one comes last
 GROUPS = ("calibration", "finish", "form", "light", "temperature", "unit", *FRESH, BEYOND, "decoder", "coat")
-
-#: groups that all captures of a day share
-COMMON = tuple(group for group in GROUPS if group not in (*FRESH, BEYOND))
 
 #: days of a race start at 0; first day of draws that judge the choice of a view
 JUDGING_DAYS = 1 << 19

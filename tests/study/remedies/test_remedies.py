@@ -277,18 +277,6 @@ def test_what_was_not_tried_is_told_of_the_measurements_that_it_was_for() -> Non
     ]
 
 
-def test_remedies_of_an_older_run_still_read() -> None:
-    document = remedies_document(Remedies(missed("a", "b"))) | {"untried": ["changes for a", "with another sensor"]}
-    assert remedies_in_words(RemediesEntry.model_validate(document)) == [
-        "not tried for lack of time: changes for a; with another sensor"
-    ]
-    for wrong in ("spray", [1], [{"words": "with spray"}]):
-        with pytest.raises(ValidationError, match="untried"):
-            RemediesEntry.model_validate(document | {"untried": wrong})
-    with pytest.raises(ValidationError, match="measurements"):
-        RemediesEntry.model_validate(document | {"measurements": 3})
-
-
 @pytest.mark.parametrize("fits_by, name", [(0, "b"), (1, "a"), (-1, "a")])
 def test_a_measurement_that_fits_by_no_change_tried_is_refused(fits_by: int, name: str) -> None:
     """Before, a change without the measurement gave a KeyError, and one that does not exist no line at all."""
