@@ -1,7 +1,8 @@
-"""Draw the finishes of a trial: the size and the shape of the light that each finish reflects.
+"""Draw the finishes of a trial, the size and the shape of the light that each reflects, and show the part in them.
 
 Signal chain: number of the finishes of a trial, id of a finish -> independent standard normals, one for each unknown
-property -> sizes and centres of ``[unknowns.finish]`` -> a :class:`~mitsim.scene.surface.scatter.Deviation`.
+property -> sizes and centres of ``[unknowns.finish]`` -> a :class:`~mitsim.scene.surface.scatter.Deviation` -> the
+scene of the part with these finishes, and the directional albedos of its shapes.
 
 One finish is one draw: faces of the same BSDF have the same alpha, shares and direction of the lay, each in its own
 frame. All directions of a lay are equally likely.
@@ -10,17 +11,21 @@ frame. All directions of a lay are equally likely.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy.special import ndtr
 
+from characterisation.files.arrays import Floats
+from mitsim.scene.light_transport.plain_scene import distinct_bsdfs
+from mitsim.scene.light_transport.room_light import directional_albedos
+from mitsim.scene.load import Scene, load_scene
 from mitsim.scene.surface.scatter import LARGEST_DEVIATION, Deviation
-
-if TYPE_CHECKING:
-    from mitsim.study.virtual.world import Unknowns
+from mitsim.study import Study
+from mitsim.study.virtual.world import Unknowns
 
 #: seed of the stream of finishes, different from those of the groups
 _FINISH_STREAM = 8
@@ -71,3 +76,36 @@ def deviation_of(prior: Mapping[str, tuple[float, float]], numbers: Mapping[str,
     lay_deg = 180.0 * float(ndtr(numbers["lay_direction"])) if prior["lay"][1] > 0 else None
     alpha, wide_angle, reflectance, tail, lay = (drawn(name) for name in DRAWN[:5])
     return Deviation(alpha, wide_angle, reflectance, tail, lay, lay_deg)
+
+
+class DrawnPart:
+    """The part of a study in finishes that are drawn. There is one scene: a call changes the scene of the call before.
+
+    Dr.Jit compiles a material call for the materials of every scene in memory, therefore there is no second.
+    """
+
+    def __init__(self, study: Study, unknowns: Unknowns) -> None:
+        self._study, self._unknowns = study, unknowns
+        self._finished: tuple[int, Scene, list[Floats]] | None = None
+        self._scene: Scene | None = None
+
+    def in_finish(self, number: int) -> tuple[Scene, list[Floats]]:
+        """Return the part in the finishes of a number, and the directional albedos of its shapes."""
+        if self._finished is None or self._finished[0] != number:
+            scene = self.deviated(partial(finish_deviation, self._unknowns, number))
+            self._finished = number, scene, directional_albedos(scene)
+        return self._finished[1:]
+
+    def bsdfs(self, number: int) -> list[Any]:
+        """Return the distinct BSDFs of the part in the finishes of a number; none if it has BSDFs inside others."""
+        return distinct_bsdfs(self.deviated(partial(finish_deviation, self._unknowns, number))) or []
+
+    def deviated(self, deviation: Callable[[str], Deviation]) -> Scene:
+        """Return the part with finishes that deviate, each by its BSDF's id."""
+        self._finished = None
+        if self._scene is None or not self._scene.changeable:
+            file, scene = self._study.file, self._study.scene
+            parameters = {name: str(value) for name, value in file.parameters.items()}
+            wavelength_nm = self._study.sensor.wavelength_nm
+            self._scene = load_scene(scene.where, wavelength_nm, parameters, deviation, file.sprayed)
+        return self._scene.deviated(deviation) if self._scene.changeable else self._scene

@@ -49,7 +49,7 @@ from mitsim.sensor.transforms import Transform
 from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.study.virtual.displacement import RealFaces
 from mitsim.study.virtual.drawn_decoder import drawn_decoder
-from mitsim.study.virtual.drawn_part import DrawnPart
+from mitsim.study.virtual.drawn_finish import DrawnPart
 from mitsim.study.virtual.form import measured_with_form
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.trials import Outcome

@@ -33,9 +33,8 @@ from mitsim.study.session import Session
 from mitsim.study.statement_document import statement_document
 from mitsim.study.virtual import rendered
 from mitsim.study.virtual.displacement import displaced
-from mitsim.study.virtual.drawn_finish import finish_deviation
+from mitsim.study.virtual.drawn_finish import DrawnPart, finish_deviation
 from mitsim.study.virtual.drawn_numbers import drawn_numbers
-from mitsim.study.virtual.drawn_part import DrawnPart
 from mitsim.study.virtual.influences import influences
 from mitsim.study.virtual.plan import measurements_of, race_rendering, trial_digest
 from mitsim.study.virtual.race import Job
