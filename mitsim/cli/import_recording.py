@@ -184,7 +184,7 @@ def _posed(capture: Capture, window: tuple[int, int, int, int], where: str) -> C
     """Return a capture of a coupon with the pose that the plane of its points gives."""
     from characterisation.region_of_interest import Roi
     from mitsim.decoding.cloud import capture_cloud, decoder_settings
-    from mitsim.twin.finish.coupon_pose import pose_over_coupon
+    from mitsim.twin.finish.specimen import pose_over_coupon
 
     settings, imager = decoder_settings(capture, None, None)
     pose = pose_over_coupon(capture_cloud(capture, settings, imager=imager), Roi(*window), where)

@@ -6,6 +6,10 @@ Signal chain without a pose: cloud -> plane through most of its points, by RANSA
 along the normal, toward the sensor -> cells of a grid in the plane that contain points -> holes filled -> largest
 connected region. RANSAC: Fischler & Bolles, Commun. ACM 24, 1981.
 
+Signal chain of the pose over a coupon: cloud and the window of its pixels that shows the coupon -> plane through most
+of the points there -> a frame in that plane: origin where the middle of the window meets it, x along the window's rows,
+z along the normal, toward the sensor. The offset of the points from the true surface is not seen.
+
 The bend of a sheet is a low-order surface over its plane: median heights of square cells -> Legendre polynomials of
 total degree d by least squares, for several d -> the degree with the smallest leave-one-out error. The leave-one-out
 residuals are r_i / (1 - h_ii), with h_ii the leverages (Allen, Technometrics 16 (1974) 125). Allen's PRESS is the sum
@@ -15,7 +19,7 @@ degree is chosen only if it predicts cells that were not used in its fit, so a f
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.polynomial.legendre import legvander2d
@@ -24,7 +28,8 @@ from scipy import ndimage
 
 from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
-from characterisation.point_cloud import PointCloud
+from characterisation.point_cloud import PointCloud, Status
+from characterisation.region_of_interest import Roi
 from mitsim.sensor.transforms import Transform
 
 #: number of cells along the longer side of the recovered points
@@ -46,6 +51,9 @@ _BEND_POINTS = 20
 
 #: least number of cells for each coefficient of a degree
 _CELLS_PER_TERM = 5
+
+#: least cosine of the incidence: a plane seen at 85 deg, beyond the limit of a campaign's orientations
+_LEAST_COSINE = 0.087
 
 
 @dataclass(frozen=True)
@@ -152,6 +160,46 @@ def specimen_in_cloud(cloud: PointCloud, where: str) -> Specimen:
         points = points[occupied[row, column]]
     off = pose.points(points)[:, 2]
     return Specimen(pose, low, cell, occupied, float(np.sqrt(np.mean(off**2))))
+
+
+def pose_over_coupon(cloud: PointCloud, window: Roi, where: str) -> Transform:
+    """Return ``world_from_sensor``, with the frame of a coupon as the world.
+
+    Parameters
+    ----------
+    cloud
+        Points of the coupon [mm] in the sensor frame, and of other things.
+    window
+        Pixels of the cloud that show only the coupon.
+    where
+        Name of the capture in messages.
+
+    Raises
+    ------
+    InputError
+        If the window is not in the cloud, too few of its points lie in one plane, or the plane is seen edge-on.
+    """
+    grid = cloud.grid
+    asked = f"{window.left} {window.top} {window.width} {window.height}"
+    if not window.fits(grid.width, grid.height):
+        raise InputError("--coupon", "", asked, f"COLUMN ROW WIDTH HEIGHT within {grid.width} x {grid.height} pixels")
+    outside = np.ones(cloud.status.shape, bool)
+    outside[window.slices] = False
+    points, status = cloud.points.copy(), cloud.status.copy()
+    points[outside], status[outside] = np.nan, Status.NO_SURFACE
+    plane = specimen_in_cloud(replace(cloud, points=points, status=status), where).world_from_sensor
+    normal = plane.rotation[2]  # in the sensor frame
+    middle = window.top + window.height // 2
+    columns = np.array([window.left, window.left + window.width // 2, window.right - 1])
+    rays = grid.rays_at(columns, np.full(3, middle))
+    cosines = -rays @ normal
+    if cosines.min() < _LEAST_COSINE:
+        raise InputError("--coupon", "", f"{asked}, a plane seen edge-on", "a coupon tilted by less than 85 deg")
+    left, origin, right = (
+        grid.origin + rays * (((grid.origin - plane.inverse().translation) @ normal) / cosines)[:, None]
+    )
+    across = (right - left) / np.linalg.norm(right - left)
+    return Transform(np.stack([across, np.cross(normal, across), normal], axis=1), origin).inverse()
 
 
 def plane_points(points: Floats) -> NDArray[np.bool_]:

@@ -9,7 +9,7 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.region_of_interest import Roi
 from mitsim.sensor.transforms import Transform, look_at
-from mitsim.twin.finish.coupon_pose import pose_over_coupon
+from mitsim.twin.finish.specimen import pose_over_coupon
 
 GRID = ViewGrid(fx=300, fy=300, cx=159.5, cy=119.5, width=320, height=240)
 WINDOW = Roi(110, 80, 101, 81)
