@@ -2,7 +2,7 @@
 
 Signal chain: study, map -> score of every view (:mod:`mitsim.study.virtual.screening`) -> fewest views that measure
 together (:mod:`characterisation.scores.task_sets`) -> ``scores.csv``, ``scores.nc``, ``poses/``, ``part.ply``,
-``task.json``.
+``task.json``. After a race, the scores have its ranks, and ``checks.nc`` its errors by trial.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from characterisation.scores.task_sets import SetJoining, choose_set
 from characterisation.scores.view_score import write_scores
 from characterisation.scores.view_sets import ViewSet
 from characterisation.tasks.measurement_model import InputQuantity
+from characterisation.tasks.task_file import Task
 from characterisation.words.numbers import two_digits
 from characterisation.words.progress import say
 from mitsim.maps.campaign.run import write_netcdf
@@ -35,8 +36,7 @@ from mitsim.study.scene_geometry import write_scene_geometry
 from mitsim.study.screened_errors import stated_shares
 from mitsim.study.session import Session
 from mitsim.study.view_sets.confirmed_set import Search, joining_in_words
-from mitsim.study.virtual.race import Raced
-from mitsim.study.virtual.race_tables import raced_errors, with_race
+from mitsim.study.virtual.race import ALL, Raced
 from mitsim.views import write_views
 from mitsim.views.no_view import TOGETHER, apart_in_words
 
@@ -69,6 +69,52 @@ def write_raced(session: Session, scores: xr.Dataset, raced: Raced) -> xr.Datase
     write_netcdf(ranked, folder / "scores.nc")
     write_netcdf(raced_errors(raced, session.study.task), folder / "checks.nc")
     return ranked
+
+
+def with_race(scores: xr.Dataset, raced: Raced) -> xr.Dataset:
+    """Add ``measured_risk``, ``trials`` and ``final_rank`` (measurement, view) from the race.
+
+    Measured views come first, by their risk; the others follow in the order of screening.
+    """
+    names = [str(name) for name in scores["measurement"].values]
+    indices = {int(view): index for index, view in enumerate(scores["view"].values)}
+    shape = (len(names), scores.sizes["view"])
+    risk, count = np.full(shape, np.nan), np.zeros(shape, int)
+    columns = [indices[int(view)] for view in raced.views]
+    if columns:
+        risk[:, columns] = [raced.standings[name].risk for name in names]
+        count[:, columns] = (~np.isinf(raced.errors)).sum(axis=2)
+    screened = scores["uncertainty_rank"].transpose("measurement", "view").values
+    order = np.lexsort((screened, np.where(np.isfinite(risk), risk, np.inf)), axis=1)
+    rank = np.empty(shape, int)
+    np.put_along_axis(rank, order, np.broadcast_to(np.arange(1, shape[1] + 1), shape), axis=1)
+    by = ("measurement", "view")
+    out = scores.copy()
+    name = "root mean square error of virtual measurements over the square root of the share with a value"
+    out["measured_risk"] = (by, risk, {"long_name": name, "units": "mm or deg"})
+    out["trials"] = (by, count, {"long_name": "virtual measurements of the race", "units": "1"})
+    out["final_rank"] = (by, rank, {"long_name": "rank by race, then by screening; 1 is best", "units": "1"})
+    return out
+
+
+def raced_errors(raced: Raced, task: Task) -> xr.Dataset:
+    """Return the errors of the race (measurement, view, repeat), NaN without a value; the best view comes first.
+
+    ``tried`` distinguishes a trial without a value from one that was not made.
+    """
+    order = np.argsort(raced.standings[ALL].risk, kind="stable") if len(raced.views) else np.empty(0, int)
+    tried = ~np.isinf(raced.errors[:, order])
+    errors = np.where(tried, raced.errors[:, order], np.nan)
+    dims = ("measurement", "view", "repeat")
+    nominal = np.array([measurement.nominal for measurement in task.measurements.values()])[:, None, None]
+    return xr.Dataset(
+        {
+            "error": (dims, errors, {"units": "mm or deg"}),
+            "value": (dims, errors + nominal, {"units": "mm or deg"}),
+            "tried": (dims, tried.astype(np.int8), {"units": "1"}),
+        },
+        coords={"measurement": list(task.measurements), "view": raced.views[order]},
+    )
 
 
 def write_inputs(session: Session) -> None:
