@@ -218,7 +218,7 @@ def _recorded(path: Path, output: Path, board: str | None) -> None:
         say(f"left out: {line}")
     say(f"calibrating {', '.join(corners.sizes)}: {len(corners.boards)} poses, and two halves of them")
     source = f"recorded corners: {path.name}, {chequerboard}"[:400]
-    checked = calibrate_checked(corners.boards, chequerboard, corners.sizes, source, where=str(path))
+    checked = calibrate_checked(corners, source, str(path))
     print(calibration_table(checked), end="")
     rig_file = write_calibration(checked, output)
     say(f"calibration: {output}, {rig_file}; in a sensor file:")

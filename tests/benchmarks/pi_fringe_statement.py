@@ -39,7 +39,7 @@ from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.transforms import Transform
 from mitsim.study.calibration.board import Board
 from mitsim.study.calibration.bundle import eye_jacobian, homographies
-from mitsim.study.calibration.recorded import RecordedBoard, RecordedCalibration, calibrate_recorded
+from mitsim.study.calibration.recorded import RecordedBoard, RecordedCalibration, RecordedCorners, calibrate_recorded
 
 Floats = NDArray[np.float64]
 BOARD = Board(CORNERS[0] + 1, CORNERS[1] + 1, SQUARE_MM, "paper")
@@ -55,7 +55,9 @@ def calibrated(corners: Sequence[Corners], own_units: bool) -> RecordedCalibrati
     ]
     poses = ", ".join(str(one.pose) for one in corners)
     sizes = {"camera": CAMERA, "projector": PROJECTOR}
-    return calibrate_recorded(boards, BOARD, sizes, f"pi_fringe, poses {poses}: {BOARD}", own_units=own_units)
+    return calibrate_recorded(
+        RecordedCorners(BOARD, boards, sizes), f"pi_fringe, poses {poses}: {BOARD}", own_units=own_units
+    )
 
 
 def measured(rig: Rig, pixels: Floats, columns: Floats) -> dict[str, float]:

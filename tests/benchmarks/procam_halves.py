@@ -19,7 +19,7 @@ from characterisation.files.errors import InputError
 from mitsim.sensor.rig_parameters import parameter_differences
 from mitsim.study.calibration.board import Board
 from mitsim.study.calibration.halves import calibrate_checked, in_words
-from mitsim.study.calibration.recorded import RecordedBoard, calibrate_recorded
+from mitsim.study.calibration.recorded import RecordedBoard, RecordedCorners, calibrate_recorded
 
 POSES, ROWS, COLUMNS, PITCH_MM = 12, 7, 21, 10.0
 SIZES = {"camera": (1920, 1200), "projector": (1280, 800)}
@@ -45,7 +45,7 @@ def main(data: Path) -> None:
     board = Circles(COLUMNS, 2 * ROWS, PITCH_MM / 2, "glass")
     every = np.arange(ROWS * COLUMNS)
     boards = [RecordedBoard(every, {eye: one[pose] for eye, one in pixels.items()}) for pose in range(POSES)]
-    halves = [calibrate_recorded(boards[first::2], board, SIZES, "procam_points") for first in (0, 1)]
+    halves = [calibrate_recorded(RecordedCorners(board, boards[first::2], SIZES), "procam_points") for first in (0, 1)]
     parameters = halves[0].covariance.names
     apart = parameter_differences(halves[0].rig, halves[1].rig, parameters)
     sigma = np.hypot(*[half.covariance.one_sigma for half in halves])
@@ -53,7 +53,7 @@ def main(data: Path) -> None:
     for name, difference, one in zip(parameters, apart, sigma, strict=True):
         print(f"| {name} | {difference:.4g} | {difference / one:.1f} |")
     try:
-        print(in_words(calibrate_checked(boards, board, SIZES, "procam_points", where="procam_points")))
+        print(in_words(calibrate_checked(RecordedCorners(board, boards, SIZES), "procam_points", "procam_points")))
     except InputError as error:
         print(error)
 

@@ -21,7 +21,6 @@ import csv
 import io
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +35,7 @@ from mitsim.capture.grey_image import SUFFIXES, read_grey
 from mitsim.sensor.calibration_formats import read_documents
 from mitsim.sensor.fitted_to import FittedCapture, joined_digest, stack_digest
 from mitsim.study.calibration.board import Board
-from mitsim.study.calibration.recorded import RecordedBoard
+from mitsim.study.calibration.recorded import RecordedBoard, RecordedCorners
 
 #: pixel (2,) of every corner, by pose and camera
 Seen = dict[str, dict[str, dict[int, Floats]]]
@@ -59,18 +58,6 @@ _OF_ARRAYS = (".npz", ".yml", ".yaml", ".xml", ".json")
 _COLUMNS = ("pose", "camera", "column", "row", "x_px", "y_px")
 
 
-@dataclass(frozen=True)
-class RecordedCorners:
-    """Poses of a board, and ``sizes`` (width, height) [px] of the eyes, the reference camera first.
-
-    ``left_out`` describes poses that were not used.
-    """
-
-    boards: list[RecordedBoard]
-    sizes: dict[str, tuple[int, int]]
-    left_out: list[str]
-
-
 def read_corners(path: str | Path, board: Board) -> RecordedCorners:
     """Read the corners of a board, in any of the forms of this module.
 
@@ -91,10 +78,12 @@ def read_corners(path: str | Path, board: Board) -> RecordedCorners:
     else:
         allowed = "a folder of images, or a file .csv, .npz, .yml, .yaml, .xml or .json"
         raise InputError(path, "", "a file of another kind" if path.exists() else "nothing there", allowed)
-    return _together(path, seen, sizes, images)
+    return _together(path, board, seen, sizes, images)
 
 
-def _together(path: Path, seen: Seen, sizes: Sizes, images: Mapping[str, FittedCapture]) -> RecordedCorners:
+def _together(
+    path: Path, board: Board, seen: Seen, sizes: Sizes, images: Mapping[str, FittedCapture]
+) -> RecordedCorners:
     """Return the poses whose corners all eyes see; ``seen`` has the pixels (2,) by pose, eye and corner."""
     sizes = dict(sorted(sizes.items(), key=lambda item: item[0] == "projector"))  # the reference is a camera
     if len(sizes) > 2 or set(sizes) == {"projector"}:
@@ -120,7 +109,7 @@ def _together(path: Path, seen: Seen, sizes: Sizes, images: Mapping[str, FittedC
     if not boards:
         reasons = "; ".join(left_out[:3]) or "no pose"
         raise InputError(path, "", reasons, f"poses with {_LEAST_CORNERS} corners or more", "check --board")
-    return RecordedCorners(boards, sizes, left_out)
+    return RecordedCorners(board, boards, sizes, left_out)
 
 
 def _check_inside(path: Path, pose: str, pixels: dict[str, Floats], sizes: Sizes) -> None:

@@ -13,7 +13,6 @@ that by which the worst parameter exceeds its limit, if that is more.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,11 +21,10 @@ from scipy.stats import chi2, norm
 from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from mitsim.sensor.rig_parameters import parameter_differences
-from mitsim.study.calibration.board import Board
 from mitsim.study.calibration.recorded import (
     LEAST_POSES,
-    RecordedBoard,
     RecordedCalibration,
+    RecordedCorners,
     calibrate_recorded,
     largest_tilt,
     tilt_hint,
@@ -57,44 +55,23 @@ class CheckedCalibration:
     tilt_deg: float
 
 
-def calibrate_checked(
-    boards: Sequence[RecordedBoard],
-    board: Board,
-    sizes: Mapping[str, tuple[int, int]],
-    source: str,
-    *,
-    where: str = "boards",
-) -> CheckedCalibration:
+def calibrate_checked(corners: RecordedCorners, source: str, where: str = "boards") -> CheckedCalibration:
     """Calibrate a rig from recorded corners, and widen its covariance until two halves of the poses agree within it.
 
-    Parameters
-    ----------
-    boards
-        One for each pose; every eye has the same corners.
-    board
-        Board that was recorded.
-    sizes
-        Width and height [px] of every eye, the reference camera first; a projector is named ``projector``.
-    source
-        Source text for the covariance's file.
-    where
-        Name of the recordings in an error.
+    ``source`` is the text of the covariance's file, and ``where`` the name of the recordings in an error.
 
     Raises
     ------
     InputError
         If there are too few poses, the adjustment does not converge, or the halves differ by more than a factor of
         :data:`MOST_WIDENED` explains.
-
-    See Also
-    --------
-    calibrate_recorded : the calibration alone
     """
-    whole = calibrate_recorded(boards, board, sizes, source)
+    boards = corners.boards
+    whole = calibrate_recorded(corners, source)
     tilt = largest_tilt(whole.poses)
     if len(boards) < 2 * LEAST_POSES:
         return CheckedCalibration(whole, math.nan, "", math.nan, tilt)
-    halves = [calibrate_recorded(boards[first::2], board, sizes, source) for first in (0, 1)]
+    halves = [calibrate_recorded(replace(corners, boards=boards[first::2]), source) for first in (0, 1)]
     difference, covariance = _difference(*halves)
     sigma = np.sqrt(np.diag(covariance))
     standard = np.divide(difference, sigma, out=np.zeros_like(difference), where=sigma > 0)

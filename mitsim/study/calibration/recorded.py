@@ -79,6 +79,20 @@ class RecordedBoard:
 
 
 @dataclass(frozen=True)
+class RecordedCorners:
+    """Corners of a ``board`` at poses, the ``boards``, and ``sizes`` (width, height) [px] of the eyes.
+
+    Every eye has the same corners of a pose. The reference camera is the first eye; a projector is named ``projector``.
+    ``left_out`` describes poses that were not used.
+    """
+
+    board: Board
+    boards: Sequence[RecordedBoard]
+    sizes: Mapping[str, tuple[int, int]]
+    left_out: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
 class RecordedCalibration:
     """Result of a calibration: ``rig``, ``poses`` sensor_from_board, ``covariance``, observation noise.
 
@@ -97,34 +111,17 @@ class RecordedCalibration:
     board_effect: Floats
 
 
-def calibrate_recorded(
-    boards: Sequence[RecordedBoard],
-    board: Board,
-    sizes: Mapping[str, tuple[int, int]],
-    source: str,
-    *,
-    own_units: bool = False,
-) -> RecordedCalibration:
-    """Calibrate a rig of perspective eyes (cameras and a projector).
+def calibrate_recorded(corners: RecordedCorners, source: str, *, own_units: bool = False) -> RecordedCalibration:
+    """Calibrate a rig of perspective eyes (cameras and a projector); ``source`` is the text of the covariance's file.
 
-    Parameters
-    ----------
-    boards
-        One for each pose; every eye has the same corners.
-    board
-        Board that was recorded.
-    sizes
-        Width and height [px] of every eye, the reference camera first; a projector is named ``projector``.
-    source
-        Source text for the covariance's file.
-    own_units
-        Lengths are in the board's own squares, so the covariance excludes the error of its scale.
+    With ``own_units``, lengths are in the board's own squares, so the covariance excludes the error of its scale.
 
     Raises
     ------
     InputError
         If there are too few poses, the adjustment does not converge, or the model of the lens does not fit.
     """
+    board, boards, sizes = corners.board, corners.boards, corners.sizes
     if len(boards) < LEAST_POSES:
         raise InputError("boards", "", f"{len(boards)} poses", f"{LEAST_POSES} or more, tilted against one another")
     observed, (rig, poses) = _Observations(boards, board), _start(boards, board, sizes)

@@ -14,7 +14,7 @@ from mitsim.sensor.transforms import Transform
 from mitsim.study.calibration.board import Board
 from mitsim.study.calibration.bundle import BoardView
 from mitsim.study.calibration.halves import calibrate_checked
-from mitsim.study.calibration.recorded import RecordedBoard, calibrate_recorded
+from mitsim.study.calibration.recorded import RecordedBoard, RecordedCorners, calibrate_recorded
 from mitsim.study.calibration.simulated import simulate_corners
 
 BOARD = Board(9, 7, 10.0, "glass")
@@ -52,7 +52,7 @@ def test_intervals_hold_the_rig():
     """Of 20 parameters in 12 calibrations, errors of one being correlated, 95 % lie within 95 % intervals."""
     errors = []
     for seed in range(12):
-        found = calibrate_recorded(recorded(seed), BOARD, SIZES, "simulated")
+        found = calibrate_recorded(RecordedCorners(BOARD, recorded(seed), SIZES), "simulated")
         names = found.covariance.names
         told = [i for i, name in enumerate(names) if not name.endswith((".k2", ".k3"))]  # those the prior tells
         off = parameter_differences(found.rig, rig(), names)
@@ -79,7 +79,7 @@ def test_the_third_coefficient_of_an_ordinary_lens_is_found(rng, k3):
         views.append(BoardView(place, inside, 0.08, 0.0))
     corners = simulate_corners({"camera": lens}, board, views, rng).pixels["camera"]
     boards = [RecordedBoard(view.corners, {"camera": seen}) for view, seen in zip(views, corners, strict=True)]
-    found = calibrate_recorded(boards, board, {"camera": (1280, 960)}, "simulated")
+    found = calibrate_recorded(RecordedCorners(board, boards, {"camera": (1280, 960)}), "simulated")
     names, sigma = found.covariance.names, found.covariance.one_sigma
     off = parameter_differences(found.rig, Rig({"camera": lens}), names)
     assert sigma[names.index("camera.k3")] < 0.02
@@ -89,7 +89,7 @@ def test_the_third_coefficient_of_an_ordinary_lens_is_found(rng, k3):
 
 def test_two_poses_are_too_few():
     with pytest.raises(InputError, match="3 or more"):
-        calibrate_recorded(recorded(1, 2), BOARD, SIZES, "simulated")
+        calibrate_recorded(RecordedCorners(BOARD, recorded(1, 2), SIZES), "simulated")
 
 
 def test_a_lens_beyond_the_model_is_refused():
@@ -104,7 +104,7 @@ def test_a_lens_beyond_the_model_is_refused():
         shown = 2000 * (np.arctan2(radius, points[:, 2]) / radius)[:, None] * points[:, :2]
         boards.append(RecordedBoard(np.arange(len(points)), {"camera": shown + np.array([2999.5, 1999.5])}))
     with pytest.raises(InputError, match=r"residuals of .* px") as caught:
-        calibrate_recorded(boards, wide, {"camera": (6000, 4000)}, "simulated")
+        calibrate_recorded(RecordedCorners(wide, boards, {"camera": (6000, 4000)}), "simulated")
     assert "nan" not in str(caught.value)
 
 
@@ -119,5 +119,5 @@ def test_corners_of_a_transposed_board_are_refused(poses):
         seen, _ = cv2.projectPoints(board.corners - (135, 90, 0), rng.uniform(-0.5, 0.5, 3), place, matrix, lens)
         boards.append(RecordedBoard(np.arange(70), {"camera": seen[:, 0] + rng.normal(0, 0.05, (70, 2))}))
     with pytest.raises(InputError, match=r"order of --board") as caught:
-        calibrate_checked(boards, told, {"camera": (1280, 800)}, "simulated")
+        calibrate_checked(RecordedCorners(told, boards, {"camera": (1280, 800)}), "simulated")
     assert "nan" not in str(caught.value)

@@ -22,12 +22,13 @@ from mitsim.sensor.transforms import Transform
 from mitsim.study.calibration.board import Board
 from mitsim.study.calibration.corner_files import read_corners
 from mitsim.study.calibration.halves import calibrate_checked, in_words
-from mitsim.study.calibration.recorded import RecordedBoard
+from mitsim.study.calibration.recorded import RecordedBoard, RecordedCorners
 from mitsim.study.calibration.written import write_calibration
 from tests.shell import mitsim_here
 
 BOARD = Board(9, 7, 20.0, "glass")
 SIZE = (1280, 960)
+SIZES = {"left": SIZE, "right": SIZE}
 
 
 def pair() -> Rig:
@@ -82,7 +83,7 @@ def test_every_form_gives_the_same_corners(tmp_path):
     (tmp_path / "spaced.csv").write_text(spaced)
     for file in sorted(tmp_path.iterdir()):
         found = read_corners(file, BOARD)
-        assert found.sizes == {"left": SIZE, "right": SIZE} and not found.left_out
+        assert found.sizes == SIZES and not found.left_out
         for number, board in enumerate(found.boards):
             for name in pixels:
                 np.testing.assert_allclose(board.pixels[name], pixels[name][number], rtol=1e-12, err_msg=file.name)
@@ -119,7 +120,7 @@ def test_corners_in_the_order_of_another_board_are_said(tmp_path):
         name: each.reshape(-1, 6, 8, 2).transpose(0, 2, 1, 3).reshape(-1, 48, 2) for name, each in pixels_of(1).items()
     }
     with pytest.raises(InputError, match="in the order of --board, COLUMNSxROWS"):
-        calibrate_checked(boards_of(mixed), BOARD, {"left": SIZE, "right": SIZE}, "x")
+        calibrate_checked(RecordedCorners(BOARD, boards_of(mixed), SIZES), "x")
 
 
 def write_images(folder, name="{camera}-{pose:04d}.png"):
@@ -151,7 +152,7 @@ def test_images_of_ros_give_the_corners_of_the_board(tmp_path, name):
 def test_the_covariance_keeps_the_images_that_decided_it(tmp_path):
     shown = [FittedCapture(name=f"boards/{k}", images_sha256=f"{k:064x}") for k in range(10)]
     boards = [replace(board, images=one) for board, one in zip(boards_of(pixels_of(2)), shown, strict=True)]
-    checked = calibrate_checked(boards, BOARD, {"left": SIZE, "right": SIZE}, "recorded")
+    checked = calibrate_checked(RecordedCorners(BOARD, boards, SIZES), "recorded")
     write_calibration(checked, tmp_path / "unit.toml")
     again = read_rig_covariance(tmp_path / "unit.toml", checked.calibration.rig)
     drifted = with_drift(
@@ -168,8 +169,7 @@ def test_the_covariance_keeps_the_images_that_decided_it(tmp_path):
 
 def test_a_calibration_whose_halves_agree_is_not_widened():
     factors = [
-        calibrate_checked(boards_of(pixels_of(seed)), BOARD, {"left": SIZE, "right": SIZE}, "x").factor
-        for seed in range(6)
+        calibrate_checked(RecordedCorners(BOARD, boards_of(pixels_of(seed)), SIZES), "x").factor for seed in range(6)
     ]
     assert sorted(factors)[4] == 1.0  # each differs with a probability of 2 % at most
 
@@ -181,11 +181,11 @@ def test_errors_of_the_lens_at_like_poses_are_refused():
         for number in range(12):
             values[number] += 0.5 * np.sin(values[number, :, ::-1] / 150.0 + number)
     with pytest.raises(InputError, match="tilted by 20 to 40 deg"):
-        calibrate_checked(boards_of(pixels), BOARD, {"left": SIZE, "right": SIZE}, "x")
+        calibrate_checked(RecordedCorners(BOARD, boards_of(pixels), SIZES), "x")
 
 
 def test_the_files_written_are_those_that_a_sensor_reads(tmp_path):
-    checked = calibrate_checked(boards_of(pixels_of(2)), BOARD, {"left": SIZE, "right": SIZE}, "recorded")
+    checked = calibrate_checked(RecordedCorners(BOARD, boards_of(pixels_of(2)), SIZES), "recorded")
     write_calibration(checked, tmp_path / "unit.toml")
     table = {"calibration": {"file": "unit.yml", "cameras": ["left", "right"], "projector": False}}
     cameras = with_calibration(tmp_path / "sensor.toml", table)[0]["cameras"]
@@ -244,7 +244,7 @@ def test_the_reference_is_a_camera_whatever_the_order_of_the_sizes(tmp_path):
     write_table(tmp_path / "c.csv", {"projector": pixels["right"], "camera": pixels["left"]})
     found = read_corners(tmp_path / "c.csv", BOARD)
     assert list(found.sizes) == ["camera", "projector"]
-    rig = calibrate_checked(found.boards, BOARD, found.sizes, "x").calibration.rig
+    rig = calibrate_checked(found, "x").calibration.rig
     assert np.linalg.norm(rig.projector.centre) == pytest.approx(100.0, rel=0.02)
 
 
