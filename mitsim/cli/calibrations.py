@@ -103,10 +103,7 @@ def rig(
         count = len([name for name in calibration.covariance.names if not name.startswith("path.")])
         names, sigma = calibration.covariance.names[:count], calibration.covariance.one_sigma[:count]
         stated = dict(zip(names, sigma, strict=True))
-        rng = np.random.default_rng(seed)
-        scores = coverage(
-            chosen.measuring_rig, calibration.eyes, calibration.board, calibration.views, stated, check, rng
-        )
+        scores = coverage(calibration.setup, stated, np.random.default_rng(seed).spawn(check))
         print("\n" + coverage_table(names, scores), end="")
     write_rig_covariance(output, calibration.covariance, chosen.rig)
     say(f"calibration: {output}")

@@ -17,7 +17,7 @@ from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import PATH_NAMES, moved, path_error
 from mitsim.study.calibration.accuracy import _BARS, measured_points, measuring_volume
 from mitsim.study.calibration.board import default_board
-from mitsim.study.calibration.bundle import linearise
+from mitsim.study.calibration.bundle import BoardSetup, linearise
 from mitsim.study.calibration.virtual_calibration import (
     POSES,
     _with_path,
@@ -62,11 +62,11 @@ def main(names: list[str]) -> None:
     print("| " + " | ".join(heads) + " |\n" + "| --- " * len(heads) + "|")
     for name in names:
         found = calibrate(load_sensor(name))
-        corner = [view.camera_px for view in found.views]
+        corner = [view.camera_px for view in found.setup.views]
         alone, drifted = found.accuracy.numbers(), found.accuracy_drifted.numbers()
         cells = [
             name,
-            f"{found.board.square_mm:g} mm, {found.board.grade}",
+            f"{found.setup.board.square_mm:g} mm, {found.setup.board.grade}",
             f"{min(corner):.3f} to {max(corner):.3f}",
             f"{alone['middle_mm']:.0f}, {alone['diagonal_mm']:.0f}",
             *(f"{alone[key]:.3g}, {drifted[key]:.3g}" for key in FIGURES.values()),
@@ -88,7 +88,7 @@ def causes(name: str) -> list[float]:
     eyes = sensor.measuring_eyes
     board = default_board(sensor.rig.reference, float(np.sqrt(np.prod(sensor.working_range_mm))))
     views = board_views(sensor, eyes, board, POSES, 1)
-    linear = linearise(sensor.measuring_rig, eyes, board, views)
+    linear = linearise(BoardSetup(sensor.measuring_rig, eyes, board, views))
     flight = sensor.technology == "time_of_flight"
     parameters = (*linear.names, *PATH_NAMES) if flight else linear.names
     modes = np.arange(len(linear.board_sigma))

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -49,6 +49,15 @@ class BoardView:
     corners: NDArray[np.intp]
     camera_px: float
     coordinate_px: float = 0.0
+
+
+class BoardSetup(NamedTuple):
+    """Nominal ``rig``, its ``eyes`` that are calibrated, the reference camera first, and ``views`` of a ``board``."""
+
+    rig: Rig
+    eyes: Mapping[str, Camera]
+    board: Board
+    views: Sequence[BoardView]
 
 
 @dataclass(frozen=True)
@@ -143,24 +152,9 @@ def stepped(rig: Rig, poses: Sequence[Transform], names: tuple[str, ...], step: 
     ]
 
 
-def linearise(rig: Rig, eyes: Mapping[str, Camera], board: Board, views: Sequence[BoardView]) -> Linearised:
-    """Linearise the bundle adjustment of some eyes of a rig at its nominal values.
-
-    Parameters
-    ----------
-    rig
-        Nominal rig.
-    eyes
-        Cameras and projector that are calibrated, by name, the reference camera first.
-    board
-        Calibration board, with its imperfections.
-    views
-        Poses of the board, with the noise of its corners.
-
-    See Also
-    --------
-    view_jacobian : the derivatives of a single view
-    """
+def linearise(setup: BoardSetup) -> Linearised:
+    """Linearise the bundle adjustment of a calibration at the nominal values of its rig."""
+    rig, eyes, board, views = setup
     projector = "projector" in eyes
     names = tuple(name for name in parameter_names(rig, projector) if name.rpartition(".")[0] in eyes)
     modes, sigma = board.imperfections()

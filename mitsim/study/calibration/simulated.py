@@ -21,7 +21,6 @@ from mitsim.sensor.rig_parameters import distortion_names, parameter_differences
 from mitsim.sensor.rig_parameters import eyes as all_eyes
 from mitsim.sensor.transforms import Transform
 from mitsim.study.calibration import bundle
-from mitsim.study.calibration.board import Board
 
 #: termination of OpenCV's estimate of one eye, which is only a start; that of its tutorials
 _COARSE = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 30, 1e-6)
@@ -41,29 +40,12 @@ class SimulatedCorners:
     pixels: dict[str, list[Floats]]
 
 
-def simulate_corners(
-    eyes: Mapping[str, Camera], board: Board, views: Sequence[bundle.BoardView], rng: np.random.Generator
-) -> SimulatedCorners:
+def simulate_corners(setup: bundle.BoardSetup, rng: np.random.Generator) -> SimulatedCorners:
     """Draw a board and the errors of all its corners.
 
     The model of the errors is that of :func:`mitsim.study.calibration.bundle.linearise`.
-
-    Parameters
-    ----------
-    eyes
-        Cameras and projector by name, the reference camera first.
-    board
-        Nominal board; its imperfections are drawn.
-    views
-        Poses of the board, with the noise of its corners.
-    rng
-        Generator of the draws.
-
-    See Also
-    --------
-    estimate : the calibration from these corners
-    coverage : many of them
     """
+    _, eyes, board, views = setup
     modes, sigma = board.imperfections()
     true = board.corners + np.einsum("m,mni->ni", sigma * rng.standard_normal(len(sigma)), modes)
     pixels: dict[str, list[Floats]] = {name: [] for name in eyes}
@@ -162,36 +144,13 @@ def _flags(eyes: Mapping[str, Camera]) -> int:
     return int(flags)
 
 
-def coverage(
-    rig: Rig,
-    eyes: Mapping[str, Camera],
-    board: Board,
-    views: Sequence[bundle.BoardView],
-    stated: Mapping[str, float],
-    count: int,
-    rng: np.random.Generator,
-) -> Floats:
-    """Return errors over sigma of simulated calibrations, (count, n), each from its own stream.
+def coverage(setup: bundle.BoardSetup, stated: Mapping[str, float], streams: Sequence[np.random.Generator]) -> Floats:
+    """Return errors over sigma of simulated calibrations, (count, n), one from each of the streams.
 
-    Parameters
-    ----------
-    rig, eyes
-        Nominal rig, and those of its eyes that are calibrated, the reference camera first.
-    board, views
-        Board, and its poses with the noise of corners.
-    stated
-        Sigma of the n parameters, by their names.
-    count
-        Number of calibrations.
-    rng
-        Source of the streams.
-
-    See Also
-    --------
-    simulate_corners : one set of corners
+    ``stated`` has sigma of the n parameters, by their names.
     """
     names, sigma, rows = list(stated), np.array(list(stated.values())), []
-    for stream in rng.spawn(count):
-        estimated_rig, _ = estimate(rig, eyes, simulate_corners(eyes, board, views, stream))
-        rows.append(parameter_differences(rig, estimated_rig, names) / sigma)
+    for stream in streams:
+        estimated_rig, _ = estimate(setup.rig, setup.eyes, simulate_corners(setup, stream))
+        rows.append(parameter_differences(setup.rig, estimated_rig, names) / sigma)
     return np.array(rows)

@@ -28,7 +28,7 @@ from mitsim.sensor.rig_parameters import PATH_NAMES
 from mitsim.sensor.sensor import Sensor
 from mitsim.study.calibration.accuracy import Accuracy, accuracy
 from mitsim.study.calibration.board import Board, board_poses, default_board
-from mitsim.study.calibration.bundle import BoardView, Linearised, linearise
+from mitsim.study.calibration.bundle import BoardSetup, BoardView, Linearised, linearise
 from mitsim.study.calibration.corner_noise import coordinate_noise, corner_noise
 
 #: default number of poses; calibration handbooks recommend 15 to 25
@@ -47,9 +47,7 @@ class VirtualCalibration:
     """
 
     sensor: Sensor
-    eyes: dict[str, Camera]
-    board: Board
-    views: list[BoardView]
+    setup: BoardSetup
     covariance: RigCovariance
     drift: Drift
     accuracy: Accuracy
@@ -90,7 +88,8 @@ def calibrate(
     middle = float(np.sqrt(np.prod(sensor.working_range_mm)))
     board = board or default_board(sensor.rig.reference, middle)
     views = board_views(sensor, eyes, board, poses, seed)
-    linear = linearise(sensor.measuring_rig, eyes, board, views)
+    setup = BoardSetup(sensor.measuring_rig, eyes, board, views)
+    linear = linearise(setup)
     names, matrix = linear.names, linear.covariance()
     if sensor.technology == "time_of_flight":
         names, matrix = (*names, *PATH_NAMES), _with_path(linear, board, views)
@@ -103,7 +102,7 @@ def calibrate(
     numbers |= {f"with_drift_{key}": value for key, value in drifted.numbers().items() if key not in ("middle_mm",)}
     numbers |= {f"drift_{key}": value for key, value in drift.numbers().items()}
     covariance = replace(covariance, details=dict(covariance.details) | numbers)
-    return VirtualCalibration(sensor, eyes, board, views, covariance, drift, alone, drifted)
+    return VirtualCalibration(sensor, setup, covariance, drift, alone, drifted)
 
 
 def board_views(sensor: Sensor, eyes: Mapping[str, Camera], board: Board, poses: int, seed: int) -> list[BoardView]:
@@ -194,14 +193,14 @@ def _details(board: Board, views: list[BoardView]) -> dict[str, str | float]:
 
 def calibration_table(calibration: VirtualCalibration) -> str:
     """Return board, noise, standard deviations and accuracy, one per line."""
-    views = calibration.views
+    _, eyes, board, views = calibration.setup
     camera = [view.camera_px for view in views]
     lines = [
-        f"{calibration.sensor.name}: board of {calibration.board}; "
+        f"{calibration.sensor.name}: board of {board}; "
         f"{len(views)} poses, {sum(len(view.corners) for view in views)} corners",
         f"noise of a corner: {min(camera):.3f} to {max(camera):.3f} px in a camera",
     ]
-    if "projector" in calibration.eyes:
+    if "projector" in eyes:
         lines[-1] += f", {max(view.coordinate_px for view in views):.2g} px of the projector's own"
     lines += ["", f"{'parameter':<28} {'one sigma':>10}"]
     lines += [

@@ -12,7 +12,7 @@ from characterisation.files.errors import InputError
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.rig_parameters import moved, parameter_differences, parameter_names
 from mitsim.study.calibration.board import TILTS_DEG, Board, board_poses, default_board, parse_board, seen_by_all
-from mitsim.study.calibration.bundle import BoardView, Linearised, linearise, view_jacobian
+from mitsim.study.calibration.bundle import BoardSetup, BoardView, Linearised, linearise, view_jacobian
 from mitsim.study.calibration.simulated import coverage, estimate, simulate_corners
 from mitsim.study.calibration.virtual_calibration import _with_path
 
@@ -86,7 +86,7 @@ def test_a_board_that_is_too_large_is_refused():
 @pytest.mark.parametrize("name", ["ensenso-n10", "ensenso-n35", "david-sls-3"])
 def test_derivatives_agree_with_finite_differences(name):
     rig, eyes, board, views = setting(name)
-    names = linearise(rig, eyes, board, views).names
+    names = linearise(BoardSetup(rig, eyes, board, views)).names
     view = views[3]
     corners, place = board.corners[view.corners], view.sensor_from_board
     jacobian, _ = view_jacobian(eyes, names, place, corners)
@@ -113,7 +113,7 @@ def test_derivatives_agree_with_finite_differences(name):
 def test_one_camera_has_the_deviations_that_opencv_states(rng):
     """OpenCV's own standard deviations of intrinsics, from one draw: an independent (J^T J)^-1 and its own sigma."""
     rig, eyes, board, views = setting("kinect-v2", 15, Board(11, 8, 60.0, "glass"))
-    found = only_noise(linearise(rig, eyes, board, views))
+    found = only_noise(linearise(BoardSetup(rig, eyes, board, views)))
     ours = np.sqrt(np.diag(found.covariance()))
     camera = rig.reference
     points = [board.corners[view.corners].astype(np.float32) for view in views]
@@ -138,7 +138,7 @@ def test_one_camera_has_the_deviations_that_opencv_states(rng):
 
 def test_the_scale_of_the_board_moves_places_and_nothing_else():
     rig, eyes, board, views = setting("ensenso-n10")
-    found = linearise(rig, eyes, board, views)
+    found = linearise(BoardSetup(rig, eyes, board, views))
     sigma = np.zeros_like(found.board_sigma)
     sigma[0] = 1e-4
     scaled = Linearised(found.names, found.normal, 0 * found.noise, found.board, sigma)
@@ -151,7 +151,7 @@ def test_the_scale_of_the_board_moves_places_and_nothing_else():
 
 
 def test_more_poses_average_noise_out_and_leave_the_scale():
-    few, many = (linearise(*setting("ensenso-n10", poses)) for poses in (10, 80))
+    few, many = (linearise(BoardSetup(*setting("ensenso-n10", poses))) for poses in (10, 80))
     index = few.names.index("right.position_x_mm")
     noise = [np.sqrt(only_noise(each).covariance()[index, index]) for each in (few, many)]
     assert noise[1] < 0.5 * noise[0]  # sqrt(8) and what better places add
@@ -163,10 +163,10 @@ def test_more_poses_average_noise_out_and_leave_the_scale():
 @pytest.mark.parametrize(("name", "board"), [("zivid-2-m70", BOARD), ("ensenso-n35", Board(8, 6, 25.0, "composite"))])
 def test_simulated_calibrations_lie_within_the_stated_interval(name, board, rng):
     rig, eyes, board, views = setting(name, board=board)
-    found = linearise(rig, eyes, board, views)
+    found = linearise(BoardSetup(rig, eyes, board, views))
     count = 60
     stated = dict(zip(found.names, np.sqrt(np.diag(found.covariance())), strict=True))
-    scores = coverage(rig, eyes, board, views, stated, count, rng)
+    scores = coverage(BoardSetup(rig, eyes, board, views), stated, rng.spawn(count))
     inside = np.abs(scores) <= stats.norm.ppf(0.975)
     # every parameter by itself, all of them together at one in a thousand
     least, most = stats.binom.ppf([0.0005 / len(found.names), 1 - 0.0005 / len(found.names)], count, 0.95)
@@ -180,13 +180,13 @@ def test_simulated_calibrations_lie_within_the_stated_interval(name, board, rng)
 def test_offset_and_scale_of_a_path_go_with_the_focal_length(rng):
     """The path is fitted to the distances that the camera's own calibration gives: both err together."""
     rig, eyes, board, views = setting("kinect-v2", 12, Board(11, 8, 60.0, "composite"))
-    found = linearise(rig, eyes, board, views)
+    found = linearise(BoardSetup(rig, eyes, board, views))
     stated = _with_path(found, board, views)
     rows = []
     for stream in rng.spawn(60):
         # the same board that simulate_corners draws first from its stream
         state = stream.bit_generator.state
-        corners = simulate_corners(eyes, board, views, stream)
+        corners = simulate_corners(BoardSetup(rig, eyes, board, views), stream)
         stream.bit_generator.state = state
         modes, sigma = board.imperfections()
         true = board.corners + np.einsum("m,mni->ni", sigma * stream.standard_normal(len(sigma)), modes)
@@ -215,8 +215,9 @@ def test_a_fisheye_has_a_covariance_and_no_check():
         camera.matrix, np.array([0.05, -0.01, 0.002, -5e-4]), camera.width, camera.height, model="fisheye"
     )
     other = type(rig)({"depth": fish})
-    found = linearise(other, other.cameras, board, views)
+    seen = BoardSetup(other, other.cameras, board, views)
+    found = linearise(seen)
     assert found.names == parameter_names(other)
     assert (np.diag(found.covariance()) > 0).all()
     with pytest.raises(InputError, match="fisheye"):
-        estimate(other, other.cameras, simulate_corners(other.cameras, board, views, np.random.default_rng(1)))
+        estimate(other, other.cameras, simulate_corners(seen, np.random.default_rng(1)))

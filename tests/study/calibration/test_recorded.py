@@ -12,7 +12,7 @@ from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.rig_parameters import eyes, parameter_differences
 from mitsim.sensor.transforms import Transform
 from mitsim.study.calibration.board import Board
-from mitsim.study.calibration.bundle import BoardView
+from mitsim.study.calibration.bundle import BoardSetup, BoardView
 from mitsim.study.calibration.halves import calibrate_checked
 from mitsim.study.calibration.recorded import RecordedBoard, RecordedCorners, calibrate_recorded
 from mitsim.study.calibration.simulated import simulate_corners
@@ -41,7 +41,7 @@ def recorded(seed: int, poses: int = 6) -> list[RecordedBoard]:
         )
         for k, turn in enumerate(turns[:poses])
     ]
-    seen = simulate_corners(eyes(rig()), BOARD, views, np.random.default_rng(seed))
+    seen = simulate_corners(BoardSetup(rig(), eyes(rig()), BOARD, views), np.random.default_rng(seed))
     return [
         RecordedBoard(view.corners, {eye: seen.pixels[eye][number] for eye in SIZES})
         for number, view in enumerate(views)
@@ -77,7 +77,7 @@ def test_the_third_coefficient_of_an_ordinary_lens_is_found(rng, k3):
         seen = lens.project(place.points(board.corners))
         inside = np.flatnonzero(((seen > 3) & (seen < (1277, 957))).all(axis=1))
         views.append(BoardView(place, inside, 0.08, 0.0))
-    corners = simulate_corners({"camera": lens}, board, views, rng).pixels["camera"]
+    corners = simulate_corners(BoardSetup(Rig({"camera": lens}), {"camera": lens}, board, views), rng).pixels["camera"]
     boards = [RecordedBoard(view.corners, {"camera": seen}) for view, seen in zip(views, corners, strict=True)]
     found = calibrate_recorded(RecordedCorners(board, boards, {"camera": (1280, 960)}), "simulated")
     names, sigma = found.covariance.names, found.covariance.one_sigma

@@ -23,7 +23,7 @@ from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.rig_parameters import parameter_differences
 from mitsim.sensor.transforms import Transform, look_at
 from mitsim.study.calibration.board import Board
-from mitsim.study.calibration.bundle import BoardView, linearise
+from mitsim.study.calibration.bundle import BoardSetup, BoardView, linearise
 from mitsim.study.calibration.corner_noise import corner_noise
 from mitsim.study.calibration.simulated import SimulatedCorners, estimate
 
@@ -144,7 +144,7 @@ def test_the_estimated_rig_lies_within_its_stated_covariance(corners, n10):
         place = pose.inverse() @ Transform(np.eye(3), MIDDLE)
         views.append(BoardView(place, both, 0.03))
     found, _ = estimate(n10.measuring_rig, n10.rig.cameras, SimulatedCorners(points, pixels))
-    linear = linearise(n10.measuring_rig, n10.rig.cameras, board, views)
+    linear = linearise(BoardSetup(n10.measuring_rig, n10.rig.cameras, board, views))
     exact = replace(linear, board_sigma=0 * linear.board_sigma).covariance()  # the rendered board has no errors
     wrong = parameter_differences(n10.rig, found, linear.names)
     distance = wrong @ np.linalg.solve(exact, wrong)
