@@ -17,12 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.arrays import Floats
-from characterisation.point_cloud import ViewGrid
 from mitsim.scene.load import Scene
-from mitsim.scene.ray_casting.raycast import Surfaces
-from mitsim.sensor.transforms import Transform
 from mitsim.sensor.unknowns import CoatUnknowns
-from mitsim.study.virtual.form import along_rays, random_waves
+from mitsim.study.virtual.form import SeenFaces, random_waves
 
 #: finish of the faces that are sprayed: no part is made of it
 SPRAY = "matt_white"
@@ -71,37 +68,24 @@ def coated_shapes(scene: Scene, table: CoatUnknowns) -> list[int]:
     return [index for index, finish in enumerate(scene.finishes) if finish is not None and finish.name == SPRAY]
 
 
-def coated(
-    points: NDArray[np.float32],
-    surfaces: Surfaces,
-    scene: Scene,
-    table: CoatUnknowns,
-    world_from_sensor: Transform,
-    grid: ViewGrid,
-    seed: int,
-) -> NDArray[np.float32]:
+def coated(points: NDArray[np.float32], seen: SeenFaces, table: CoatUnknowns, seed: int) -> NDArray[np.float32]:
     """Return points (H, W, 3) [mm], sensor frame, displaced along their rays by the coat of their faces.
 
     Parameters
     ----------
     points
         (H, W, 3) points [mm], sensor frame, NaN where there is none. They are not changed.
-    surfaces
-        Shape and normal that each pixel of the grid meets, sensor frame.
-    scene
-        Scene with the shapes.
+    seen
+        Faces that the pixels meet.
     table
         Thickness and spread of the coat.
-    world_from_sensor
-        Pose of the sensor.
-    grid
-        View rays of the pixels.
     seed
         Selects the coat.
     """
-    here = np.isin(surfaces.shape, coated_shapes(scene, table)) & np.isfinite(points[..., 2])
+    scene = seen.scene
+    here = np.isin(seen.surfaces.shape, coated_shapes(scene, table)) & np.isfinite(points[..., 2])
     if not here.any():
         return points
-    positions = world_from_sensor.points(points[here].astype(float))
+    positions = seen.world_from_sensor.points(points[here].astype(float))
     extent = float(np.linalg.norm(scene.bounds[1] - scene.bounds[0]))
-    return along_rays(points, here, drawn_coat(table, seed).thickness(positions, extent), surfaces, grid)
+    return seen.raised(points, here, drawn_coat(table, seed).thickness(positions, extent))

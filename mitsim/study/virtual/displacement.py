@@ -20,7 +20,7 @@ from mitsim.scene.ray_casting.raycast import Surfaces
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.unknowns import UnknownsTable
 from mitsim.study.virtual.coat import coated, coated_shapes
-from mitsim.study.virtual.form import form_deviation, forms_of_faces
+from mitsim.study.virtual.form import SeenFaces, form_deviation, forms_of_faces
 from mitsim.study.virtual.world import DrawnValues
 
 
@@ -70,9 +70,10 @@ class RealFaces:
         points = displaced(cloud, drawn, assumed, scene.centre)
         if surfaces is not None:
             forms = self.forms if drawn.form and with_form else []
-            points = form_deviation(points, surfaces, scene, forms, assumed, cloud.grid, drawn.form)
+            seen = SeenFaces(scene, surfaces, assumed, cloud.grid)
+            points = form_deviation(points, seen, forms, drawn.form)
             if drawn.coat:
-                points = coated(points, surfaces, scene, table.coat, assumed, cloud.grid, drawn.coat)
+                points = coated(points, seen, table.coat, drawn.coat)
         return replace(cloud, points=points, feature=labels, feature_names=scene.names)
 
 

@@ -142,14 +142,32 @@ def forms_of_faces(scene: Scene, task: Task, sizes: Mapping[str, float]) -> list
     return forms
 
 
+@dataclass(frozen=True)
+class SeenFaces:
+    """Faces of a ``scene`` that the pixels of a ``grid`` meet: ``surfaces``, in the frame of the sensor."""
+
+    scene: Scene
+    surfaces: Surfaces
+    world_from_sensor: Transform
+    grid: ViewGrid
+
+    def raised(
+        self, points: NDArray[np.float32], here: NDArray[np.bool_], height: NDArray[np.floating]
+    ) -> NDArray[np.float32]:
+        """Return points (H, W, 3) [mm], sensor frame, of which some move along their rays.
+
+        Those of the pixels ``here`` (H, W) lie by ``height`` (n,) [mm] farther out along the normal of their face.
+        """
+        out = points.copy()
+        rows, columns = np.nonzero(here)
+        rays = self.grid.rays_at(columns, rows)
+        cosine = np.maximum(np.abs((self.surfaces.normal[here] * rays).sum(axis=-1)), _GRAZING)
+        out[here] -= (rays * (height / cosine)[:, None]).astype(np.float32)
+        return out
+
+
 def form_deviation(
-    points: NDArray[np.float32],
-    surfaces: Surfaces,
-    scene: Scene,
-    forms: Iterable[FaceForm],
-    world_from_sensor: Transform,
-    grid: ViewGrid,
-    seed: int,
+    points: NDArray[np.float32], seen: SeenFaces, forms: Iterable[FaceForm], seed: int
 ) -> NDArray[np.float32]:
     """Return points (H, W, 3) [mm], sensor frame, displaced along their rays by the form deviation of their faces.
 
@@ -157,57 +175,23 @@ def form_deviation(
     ----------
     points
         (H, W, 3) points [mm], sensor frame, NaN where there is none. They are not changed.
-    surfaces
-        Shape and normal that each pixel of the grid meets, sensor frame.
-    scene
-        Scene with the shapes.
+    seen
+        Faces that the pixels meet.
     forms
         Forms of the faces that deviate.
-    world_from_sensor
-        Pose of the sensor.
-    grid
-        View rays of the pixels.
     seed
         Selects the form; each face has its own field.
     """
-    out = points
+    out, pose = points, seen.world_from_sensor
     for form in forms:
-        here = (surfaces.shape == scene.names.index(form.name)) & np.isfinite(points[..., 2])
+        here = (seen.surfaces.shape == seen.scene.names.index(form.name)) & np.isfinite(points[..., 2])
         if not here.any():
             continue
-        positions = world_from_sensor.points(points[here].astype(float))
-        toward_sensor = world_from_sensor.directions(surfaces.normal[here].astype(float))
+        positions = pose.points(points[here].astype(float))
+        toward_sensor = pose.directions(seen.surfaces.normal[here].astype(float))
         # a sheet that rises on one side falls on the other
         side = np.where(dots(form.surface.meet(positions, None).normal, toward_sensor) < 0, -1.0, 1.0)
-        out = along_rays(out, here, side * form.heights(positions, seed), surfaces, grid)
-    return out
-
-
-def along_rays(
-    points: NDArray[np.float32],
-    here: NDArray[np.bool_],
-    height: NDArray[np.floating],
-    surfaces: Surfaces,
-    grid: ViewGrid,
-) -> NDArray[np.float32]:
-    """Return points of which some lie farther out along the normal of their face; they move along their rays.
-
-    Parameters
-    ----------
-    points
-        (H, W, 3) points [mm], sensor frame. They are not changed.
-    here
-        (H, W) pixels whose points move.
-    height
-        (n,) heights of these points [mm], toward the sensor.
-    surfaces, grid
-        Normal that each pixel meets, sensor frame, and the view rays of the pixels.
-    """
-    out = points.copy()
-    rows, columns = np.nonzero(here)
-    rays = grid.rays_at(columns, rows)
-    cosine = np.maximum(np.abs((surfaces.normal[here] * rays).sum(axis=-1)), _GRAZING)
-    out[here] -= (rays * (height / cosine)[:, None]).astype(np.float32)
+        out = seen.raised(out, here, side * form.heights(positions, seed))
     return out
 
 

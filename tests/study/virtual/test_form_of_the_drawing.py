@@ -17,7 +17,7 @@ from mitsim.scene.ray_casting.raycast import PixelRays, cast, cloud_points
 from mitsim.sensor.transforms import look_at
 from mitsim.study import SetTable
 from mitsim.study.view_sets.joined import JoinedMeasurements
-from mitsim.study.virtual.form import drawn_form, form_deviation, forms_of_faces, measured_with_form
+from mitsim.study.virtual.form import SeenFaces, drawn_form, form_deviation, forms_of_faces, measured_with_form
 from mitsim.study.virtual.plan import measurements_of
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.stated import budget_groups
@@ -170,7 +170,7 @@ def test_a_bent_sheet_rises_on_one_side_where_it_falls_on_the_other(shapes) -> N
         pose = look_at([0, 0, z], [0, 0, 0], [0, 1, 0])
         surfaces = cast(sheet, PixelRays.of_grid(grid), pose, np.zeros((0, 3)))
         flat = cloud_points(surfaces, grid).astype(np.float32)
-        bent = pose.points(form_deviation(flat, surfaces, sheet, forms, pose, grid, 5).astype(float))
+        bent = pose.points(form_deviation(flat, SeenFaces(sheet, surfaces, pose, grid), forms, 5).astype(float))
         seen = np.isfinite(bent).all(axis=-1)
         place = np.rint(bent[seen][:, :2]).astype(int)
         heights.append(dict(zip(map(tuple, place.tolist()), bent[seen][:, 2].tolist(), strict=True)))
