@@ -43,13 +43,12 @@ _INSIDE = 1.959964
 class VirtualCalibration:
     """Inputs and results of a virtual calibration.
 
-    ``covariance`` and ``accuracy`` are of the calibration alone, ``accuracy_drifted`` includes ``drift`` since then.
+    ``covariance`` and ``accuracy`` are of the calibration alone, ``accuracy_drifted`` includes the drift since then.
     """
 
     sensor: Sensor
     setup: BoardSetup
     covariance: RigCovariance
-    drift: Drift
     accuracy: Accuracy
     accuracy_drifted: Accuracy
 
@@ -102,7 +101,7 @@ def calibrate(
     numbers |= {f"with_drift_{key}": value for key, value in drifted.numbers().items() if key not in ("middle_mm",)}
     numbers |= {f"drift_{key}": value for key, value in drift.numbers().items()}
     covariance = replace(covariance, details=dict(covariance.details) | numbers)
-    return VirtualCalibration(sensor, setup, covariance, drift, alone, drifted)
+    return VirtualCalibration(sensor, setup, covariance, alone, drifted)
 
 
 def board_views(sensor: Sensor, eyes: Mapping[str, Camera], board: Board, poses: int, seed: int) -> list[BoardView]:

@@ -45,12 +45,11 @@ _LEAST = 1e-3
 class FieldFigures:
     """Coefficients (6, 7) of :data:`TERMS` by :data:`FIGURES`, and their ``covariance`` (42, 42), row by row.
 
-    With too few ``patches``, coefficients other than the constant are NaN with zero variance.
+    With too few patches, coefficients other than the constant are NaN with zero variance.
     """
 
     coefficients: Floats
     covariance: Floats
-    patches: int
 
     def of(self, names: list[tuple[str, str]]) -> tuple[Floats, Floats]:
         """Return coefficients (n,) and covariance (n, n) of pairs of feature and term."""
@@ -127,7 +126,7 @@ def field_figures(levels: Floats, field: SpecimenField, window_px: int, black: f
     coefficients[: len(solution)] = solution
     whole = np.zeros((len(TERMS), len(TERMS)))
     whole[: len(solution), : len(solution)] = inverse
-    return FieldFigures(coefficients, np.kron(whole, spread), len(table))
+    return FieldFigures(coefficients, np.kron(whole, spread))
 
 
 def patch_figures(image: Floats, field: SpecimenField, window_px: int) -> Floats:
