@@ -54,7 +54,15 @@ class DepthaiShot:
 
 
 class DepthaiCamera(LiveCamera):
-    """An open camera; a context manager that switches its light off and closes it."""
+    """An open camera; a context manager that switches its light off and closes it.
+
+    ``identifier``: its id, address or USB port, if there are several; ``dai``: the package ``depthai``.
+
+    Raises
+    ------
+    DeviceError
+        If there is no such camera, or it rejects the settings.
+    """
 
     def __init__(self, settings: DepthaiSettings, identifier: str, dai: Any) -> None:
         self.where, self.settings = f"camera depthai{':' + identifier if identifier else ''}", settings
@@ -142,19 +150,6 @@ class DepthaiCamera(LiveCamera):
                 )
 
 
-def open_depthai(settings: DepthaiSettings, identifier: str = "") -> DepthaiCamera:
-    """Open a camera and configure it; ``identifier``: its id, address or USB port, if there are several.
-
-    Raises
-    ------
-    MissingEnvironmentError
-        Without the package ``depthai``.
-    DeviceError
-        If there is no such camera, or it rejects the settings.
-    """
-    return DepthaiCamera(settings, identifier, depthai())
-
-
 def depthai() -> Any:
     """Import the package without its log messages, or raise an error with the installation command."""
     os.environ.setdefault("DEPTHAI_LEVEL", "error")  # it warns if there is no USB bus
@@ -168,7 +163,10 @@ def depthai() -> Any:
 
 
 def stereo_pipeline(pipeline: Any, settings: DepthaiSettings, dai: Any) -> Any:
-    """Add two cameras and a ``StereoDepth`` node to a pipeline that is not started, and return the node."""
+    """Add two cameras and a ``StereoDepth`` node to a pipeline that is not started, and return the node.
+
+    Neither its rectification nor its depth may use design values.
+    """
     outputs = []
     for socket in (dai.CameraBoardSocket.CAM_B, dai.CameraBoardSocket.CAM_C):
         camera = pipeline.create(dai.node.Camera).build(socket)
@@ -179,16 +177,11 @@ def stereo_pipeline(pipeline: Any, settings: DepthaiSettings, dai: Any) -> Any:
         )
     preset = getattr(dai.node.StereoDepth.PresetMode, settings.preset)
     stereo = pipeline.create(dai.node.StereoDepth).build(*outputs, presetMode=preset)
-    configure_matcher(stereo, settings, dai)
-    return stereo
-
-
-def configure_matcher(stereo: Any, settings: DepthaiSettings, dai: Any) -> None:
-    """Apply the settings to a ``StereoDepth`` node; neither rectification nor depth may use design values."""
     configure(stereo.initialConfig, settings, dai)
     stereo.setDisparityToDepthUseSpecTranslation(False)
     stereo.setRectificationUseSpecTranslation(False)
     stereo.setDepthAlignmentUseSpecTranslation(False)
+    return stereo
 
 
 def pixels(frame: Any) -> Image:

@@ -27,7 +27,7 @@ from characterisation.files.documents import Document, read_toml, validate
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import read_settings
-from mitsim.capture.devices.depthai_camera import DepthaiCamera, DepthaiShot, open_depthai
+from mitsim.capture.devices.depthai_camera import DepthaiCamera, DepthaiShot, depthai
 from mitsim.capture.devices.depthai_settings import DepthaiSettings
 from mitsim.capture.devices.device_error import DeviceError
 from mitsim.capture.devices.ensenso import EnsensoCamera, EnsensoSettings, EnsensoShot, open_ensenso
@@ -100,7 +100,7 @@ def open_device(table: EnsensoTable | DepthaiTable) -> OpenDevice:
     """
     if isinstance(table, EnsensoTable):
         return open_ensenso(table.serial, table.settings)
-    return open_depthai(table.settings, table.id)
+    return DepthaiCamera(table.settings, table.id, depthai())
 
 
 def device_capture(shot: EnsensoShot | DepthaiShot) -> DeviceCapture:

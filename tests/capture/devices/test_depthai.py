@@ -21,11 +21,9 @@ from mitsim.capture.devices.depthai_camera import (
     disparity_of,
     fault_of,
     frame_settings,
-    open_depthai,
     pixels,
     stereo_pipeline,
 )
-from mitsim.capture.devices.depthai_matching import grey_frame, match_on_device
 from mitsim.capture.devices.depthai_settings import SIZES, DepthaiSettings, configuration, configure
 from mitsim.capture.devices.device_error import DeviceError
 from mitsim.capture.devices.maker_captures import depthai_capture, depthai_rig
@@ -37,6 +35,14 @@ pytest.importorskip("depthai", reason="pip install depthai: live DepthAI cameras
 dai = depthai()
 
 FOLDER = Path(os.environ.get("MITSIM_REAL_DATA") or Path(__file__).resolve().parents[3].parent / "shared" / "real")
+
+
+def grey_frame(image, number=0):
+    """Make an ``ImgFrame`` of a grey image."""
+    frame = dai.ImgFrame()
+    frame.setCvFrame(image, dai.ImgFrame.Type.GRAY8)
+    frame.setSequenceNum(number)
+    return frame
 
 
 # on the real package
@@ -58,9 +64,9 @@ def test_every_filter_is_off_and_recorded():
 
 def test_a_grey_image_goes_through_a_frame_unchanged(rng):
     image = rng.integers(0, 256, (48, 64), np.uint8)
-    frame = grey_frame(image, dai.CameraBoardSocket.CAM_C, dai, number=7)
+    frame = grey_frame(image, number=7)
     assert np.array_equal(pixels(frame), image)
-    assert (frame.getInstanceNum(), frame.getSequenceNum()) == (2, 7)
+    assert frame.getSequenceNum() == 7
 
 
 def test_raw_disparities_become_pixels_and_zero_is_missing(rng):
@@ -82,7 +88,7 @@ def test_a_coloured_frame_is_refused():
 
 
 def test_what_a_frame_says_of_itself_is_kept():
-    frame = grey_frame(np.zeros((4, 4), np.uint8), dai.CameraBoardSocket.CAM_B, dai, number=12)
+    frame = grey_frame(np.zeros((4, 4), np.uint8), number=12)
     told = frame_settings(frame)
     assert told["sequence_number"] == 12
     assert told["exposure_s"] == 0.0
@@ -92,7 +98,7 @@ def test_what_a_frame_says_of_itself_is_kept():
 def queue_of(numbers):
     queue = dai.MessageQueue("test", 30, False)
     for number in numbers:
-        queue.send(grey_frame(np.full((2, 2), number % 256, np.uint8), dai.CameraBoardSocket.CAM_B, dai, number))
+        queue.send(grey_frame(np.full((2, 2), number % 256, np.uint8), number))
     return queue
 
 
@@ -193,15 +199,13 @@ def test_recorded_calibrations_are_those_of_the_makers_own_reader(size):
 def test_without_a_device_it_is_told(monkeypatch):
     monkeypatch.setenv("DEPTHAI_SEARCH_TIMEOUT", "200")  # ms; by default it looks for ten seconds
     with pytest.raises(DeviceError, match=r"no such camera.*None is connected.*udev"):
-        open_depthai(DepthaiSettings())
-    with pytest.raises(DeviceError, match="no such camera"):
-        match_on_device(np.zeros((8, 8), np.uint8), np.zeros((8, 8), np.uint8), DepthaiSettings())
+        DepthaiCamera(DepthaiSettings(), "", dai)
 
 
 def test_without_the_package_it_is_told_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "depthai", None)
     with pytest.raises(MissingEnvironmentError, match=r"pip install 'mitsim\[depthai\]'"):
-        open_depthai(DepthaiSettings())
+        depthai()
 
 
 @pytest.mark.parametrize(
@@ -416,30 +420,3 @@ def test_a_camera_without_a_projector_is_told():
         DepthaiCamera(DepthaiSettings(), "", FakePackage(laser=False))
     with DepthaiCamera(DepthaiSettings(dot_projector=0, warm_up_frames=0), "", FakePackage(laser=False)) as camera:
         camera.take()
-
-
-@pytest.mark.parametrize("rectified", [True, False])
-def test_a_rendered_pair_is_sent_to_the_devices_matcher_and_its_disparity_comes_back(rng, rectified):
-    fake, pair_sent = FakePackage(), rng.integers(0, 256, (2, 800, 1280), np.uint8)
-    disparity = match_on_device(*pair_sent, DepthaiSettings(subpixel_bits=5), "1844301", rectified, fake)
-    assert fake.last("stereo.setRectification") == (not rectified,)
-    assert fake.last("stereo.setInputResolution") == (1280, 800)
-    assert fake.last("stereo.setRectificationUseSpecTranslation") == (False,)
-    for side, image, socket in zip(("left", "right"), pair_sent, ("CAM_B", "CAM_C"), strict=True):
-        (frame,) = fake.last(f"stereo.{side}.createInputQueue.send")
-        np.testing.assert_array_equal(frame.getCvFrame(), image)
-        assert frame.getInstanceNum() == getattr(dai.CameraBoardSocket, socket).value
-    assert (disparity == 1 / 32).all()  # the first frame that the fake gives, of 1/32 px
-    assert fake.last("pipeline.stop") == fake.last("device.close") == ()
-
-
-def test_a_matcher_that_fails_leaves_the_device_closed(monkeypatch):
-    fake = FakePackage()
-
-    def failing(self, timeout):
-        raise RuntimeError("X_LINK_ERROR")
-
-    monkeypatch.setattr(FakeQueue, "get", failing)
-    with pytest.raises(DeviceError, match="match"):
-        match_on_device(*np.zeros((2, 8, 8), np.uint8), DepthaiSettings(), package=fake)
-    assert fake.last("device.close") == ()
