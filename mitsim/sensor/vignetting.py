@@ -27,69 +27,42 @@ from mitsim.sensor.camera import Camera
 
 def cos4_corner(camera: Camera) -> float:
     """Return the illumination [1] of a camera's farthest corner by the cos^4 law."""
-    (cx, cy), (fx, fy) = camera.matrix[:2, 2], camera.matrix.diagonal()[:2]
-    return float((1.0 + _farthest_squared((cx, cy), (camera.width, camera.height)) / (fx * fy)) ** -2)
+    fx, fy = camera.matrix.diagonal()[:2]
+    return float((1.0 + _farthest_squared(camera) / (fx * fy)) ** -2)
 
 
 def camera_illumination(corner: float | None, camera: Camera) -> NDArray[np.float32] | None:
     """Return the illumination (H, W) of a camera's pixels relative to the principal point [1], None for no loss.
 
-    ``corner`` is that of the farthest corner [1]; None, for an unknown lens, is the cos^4 law.
-    """
-    corner = cos4_corner(camera) if corner is None else corner
-    if corner == 1.0:
-        return None
-    principal = (float(camera.matrix[0, 2]), float(camera.matrix[1, 2]))
-    return relative_illumination(corner, principal, (camera.width, camera.height))
-
-
-def relative_illumination(
-    corner: float, principal: tuple[float, float], size: tuple[int, int], pixels: NDArray[np.floating] | None = None
-) -> NDArray[np.float32]:
-    """Return the illumination of image points relative to the principal point [1].
-
-    Parameters
-    ----------
-    corner
-        Illumination of the image's farthest corner [1]; 1 is a lens without loss.
-    principal, size
-        Principal point (cx, cy) and (width, height) of the image [px].
-    pixels
-        (..., 2) positions as (column, row) [px]; by default all pixel centres, as (height, width, 2).
-
-    Returns
-    -------
-    numpy.ndarray
-        (...) of the pixels, float32: a factor on electrons or on a projector's light.
+    It is a factor on electrons or on a projector's light. ``corner`` is that of the farthest corner [1]; None, for an
+    unknown lens, is the cos^4 law.
 
     Raises
     ------
     InputError
         For a corner outside 0 (excluded) to 1.
-
-    See Also
-    --------
-    camera_illumination : of all pixels of a camera
     """
+    corner = cos4_corner(camera) if corner is None else corner
     if not 0 < corner <= 1:
         raise InputError("lens", "corner_illumination", corner, "over 0, up to 1")
-    (cx, cy), (width, height) = principal, size
-    q = (corner**-0.5 - 1.0) / _farthest_squared(principal, size)
-    if pixels is None:
-        radius_squared = (np.arange(width) - cx) ** 2 + ((np.arange(height) - cy) ** 2)[:, None]
-    else:
-        radius_squared = ((np.asarray(pixels, float) - principal) ** 2).sum(axis=-1)
-    return np.asarray((1.0 + q * radius_squared) ** -2, np.float32)
+    if corner == 1.0:
+        return None
+    q = (corner**-0.5 - 1.0) / _farthest_squared(camera)
+    return np.asarray((1.0 + q * _radius_squared(camera)) ** -2, np.float32)
 
 
 def off_axis_squared(camera: Camera) -> NDArray[np.float32]:
     """Return rho^2 (H, W) of a camera's pixels [1]: 0 at the principal point, 1 in the farthest corner."""
-    cx, cy = float(camera.matrix[0, 2]), float(camera.matrix[1, 2])
-    radius_squared = (np.arange(camera.width) - cx) ** 2 + ((np.arange(camera.height) - cy) ** 2)[:, None]
-    return np.asarray(radius_squared / _farthest_squared((cx, cy), (camera.width, camera.height)), np.float32)
+    return np.asarray(_radius_squared(camera) / _farthest_squared(camera), np.float32)
 
 
-def _farthest_squared(principal: tuple[float, float], size: tuple[int, int]) -> float:
+def _radius_squared(camera: Camera) -> NDArray[np.float64]:
+    """Return the squared distances (H, W) [px^2] of a camera's pixels from the principal point."""
+    cx, cy = camera.matrix[:2, 2]
+    return np.asarray((np.arange(camera.width) - cx) ** 2 + ((np.arange(camera.height) - cy) ** 2)[:, None])
+
+
+def _farthest_squared(camera: Camera) -> float:
     """Return the squared distance [px^2] of the farthest corner pixel from the principal point."""
-    (cx, cy), (width, height) = principal, size
-    return float(max(cx, width - 1 - cx) ** 2 + max(cy, height - 1 - cy) ** 2)
+    cx, cy = camera.matrix[:2, 2]
+    return float(max(cx, camera.width - 1 - cx) ** 2 + max(cy, camera.height - 1 - cy) ** 2)

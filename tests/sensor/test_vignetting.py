@@ -8,24 +8,24 @@ import pytest
 from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.preset import load_sensor, presets
-from mitsim.sensor.vignetting import camera_illumination, cos4_corner, relative_illumination
+from mitsim.sensor.vignetting import camera_illumination, cos4_corner
 
 
-def test_relative_illumination_is_the_law_of_cosines():
+def test_illumination_is_the_law_of_cosines():
     # an ideal lens of focal length f: cos^4, whatever the corner
-    f, size, principal = 600.0, (752, 480), (370.0, 245.0)
+    f = 600.0
+    camera = Camera(np.array([[f, 0, 370], [0, f, 245], [0, 0, 1]]), np.zeros(5), 752, 480)
     rows, columns = np.mgrid[:480, :752]
     cos4 = 1 / (1 + ((columns - 370) ** 2 + (rows - 245) ** 2) / f**2) ** 2
-    found = relative_illumination(cos4.min(), principal, size)
+    found = camera_illumination(cos4.min(), camera)
     assert found.dtype == np.float32
     assert np.allclose(found, cos4, rtol=1e-6)
-    pixels = np.array([[370.0, 245.0], [751.0, 0.0], [12.25, 99.5]])
-    assert np.allclose(relative_illumination(0.4, principal, size, pixels)[:2], [1, 0.4], atol=0.02)
-    assert relative_illumination(0.4, principal, size).min() == pytest.approx(0.4, rel=1e-6)
-    assert np.all(relative_illumination(1.0, principal, size) == 1)
+    given = camera_illumination(0.4, camera)
+    assert np.allclose(given[[245, 0], [370, 751]], [1, 0.4], atol=0.02)
+    assert given.min() == pytest.approx(0.4, rel=1e-6)
     for corner in (0.0, -1.0, 1.01, np.nan):
         with pytest.raises(InputError, match="corner_illumination"):
-            relative_illumination(corner, principal, size)
+            camera_illumination(corner, camera)
 
 
 @pytest.mark.parametrize("name", presets())

@@ -104,9 +104,9 @@ class EnsensoShot:
 class EnsensoCamera(LiveCamera):
     """An open camera; a context manager that restores its previous state."""
 
-    def __init__(self, serial: str, settings: EnsensoSettings, nxlib: Any, library: str | None = None) -> None:
+    def __init__(self, serial: str, settings: EnsensoSettings, nxlib: Any) -> None:
         self.where, self.serial, self.settings = f"camera {serial}", serial, settings
-        self._nxlib, self._session, self._camera = nxlib, nxlib.NxLib(library), None
+        self._nxlib, self._session, self._camera = nxlib, nxlib.NxLib(), None
         self._before: dict[str, Value] = {}
         self._link: dict[str, Any] | None = None
         self._started = False
@@ -244,10 +244,10 @@ class EnsensoCamera(LiveCamera):
         return []
 
 
-def open_ensenso(serial: str, settings: EnsensoSettings, library: str | None = None) -> EnsensoCamera:
+def open_ensenso(serial: str, settings: EnsensoSettings) -> EnsensoCamera:
     """Open a camera by its serial number, and configure it.
 
-    ``library``: path of NxLib's shared library; by default that of the SDK, or ``NXLIB_LIBRARY_PATH``.
+    NxLib's shared library is that of the SDK, or of ``NXLIB_LIBRARY_PATH``.
 
     Raises
     ------
@@ -263,7 +263,7 @@ def open_ensenso(serial: str, settings: EnsensoSettings, library: str | None = N
             "Ensenso cameras need ensenso-nxlib, which is not installed: pip install 'mitsim[ensenso]'"
         ) from None
     try:
-        return EnsensoCamera(serial, settings, nxlib, library)
+        return EnsensoCamera(serial, settings, nxlib)
     except OSError as error:  # CDLL's
         raise no_library(f"camera {serial}", error) from None
 

@@ -179,19 +179,11 @@ class SerialLine:
             ) from None
 
 
-def open_line(port: str, baud: int, where: str, clock: Clock = WALL_CLOCK) -> SerialLine:
+def open_line(port: str, baud: int, where: str) -> SerialLine:
     """Open a port exclusively, 8 data bits, no parity, 1 stop bit.
 
-    Parameters
-    ----------
-    port
-        A device (``/dev/ttyUSB0``, ``COM3``) or a URL of pyserial (``socket://host:4000``, ``rfc2217://host:port``).
-    baud
-        Bits per second; may have no effect for a URL.
-    where
-        Name of the device in messages.
-    clock
-        Measures and waits; by default that of the system.
+    ``port`` is a device (``/dev/ttyUSB0``, ``COM3``) or a URL of pyserial (``socket://host:4000``,
+    ``rfc2217://host:port``), for which ``baud`` may have no effect. Messages name ``where``.
 
     Raises
     ------
@@ -210,7 +202,7 @@ def open_line(port: str, baud: int, where: str, clock: Clock = WALL_CLOCK) -> Se
         raise InputError(where, "port", f"{port!r} ({error})", allowed) from None
     except Exception as error:  # OSError or an error of the platform; termios.error is not an OSError
         raise _not_opened(port, where, error) from None
-    return SerialLine(opened, where, clock)
+    return SerialLine(opened, where)
 
 
 def pyserial() -> Any:

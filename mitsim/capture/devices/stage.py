@@ -283,7 +283,7 @@ class LiveStage:
             ) from error
 
 
-def open_stage(connection: StageConnection, clock: Clock = WALL_CLOCK) -> LiveStage:
+def open_stage(connection: StageConnection) -> LiveStage:
     """Open a stage. Nothing moves; axes left moving by an earlier program are stopped.
 
     Raises
@@ -295,7 +295,7 @@ def open_stage(connection: StageConnection, clock: Clock = WALL_CLOCK) -> LiveSt
     InputError
         If the connection exceeds what the device allows.
     """
-    line = open_line(connection.port, connection.bits_per_second, connection.where, clock)
+    line = open_line(connection.port, connection.bits_per_second, connection.where)
     return start_stage(connection, line)
 
 

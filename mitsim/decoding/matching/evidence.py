@@ -48,25 +48,15 @@ def nearest_value(values: NDArray[np.float32], valid: NDArray[np.bool_], fallbac
 
 
 def right_property(
-    property_of_right: NDArray[np.bool_], columns: NDArray[np.integer], disparity: NDArray[np.float32], outside: bool
+    property_of_right: NDArray[np.bool_], columns: NDArray[np.integer], disparity: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
-    """Return a property of the right strip where left columns match.
+    """Return a property (H, W) of the right strip where left ``columns`` (w,) match; False for a match outside it.
 
-    Parameters
-    ----------
-    property_of_right
-        (H, W) property of the pixels of the right strip.
-    columns
-        (w,) left columns.
-    disparity
-        (h, w) at the left columns [px].
-    outside
-        Result for a match outside the strip.
+    ``disparity`` (h, w) is at the left columns [px].
     """
     right_column = np.rint(columns - disparity).astype(np.intp)
     inside = (right_column >= 0) & (right_column < property_of_right.shape[1])
-    looked_up = np.take_along_axis(property_of_right, np.where(inside, right_column, 0), axis=1)
-    return np.where(inside, looked_up, outside)
+    return np.asarray(inside & np.take_along_axis(property_of_right, np.where(inside, right_column, 0), axis=1))
 
 
 def first_reason(

@@ -245,7 +245,7 @@ def decode_stereo(
     in_range = (depth >= settings.near_mm) & (depth <= settings.far_mm)
     confirmed = matches.disagreement <= settings.left_right_px
     disparity_or_zero = np.where(matched, disparity, 0)
-    right_exists = right_property(seen_right, columns, disparity_or_zero, outside=False)
+    right_exists = right_property(seen_right, columns, disparity_or_zero)
     valid = matched & in_range & confirmed & seen_left & right_exists & ~blank_left
     if settings.speckle_px or settings.median_px:
         kept = np.where(valid, disparity, np.float32(np.nan))
@@ -259,11 +259,11 @@ def decode_stereo(
     saturated_left, saturated_right = (
         np.any([block_saturated(frame, block) for frame in full], axis=0) for full in (left_full, right_full)
     )
-    saturated = saturated_left[:, begin:end] | right_property(saturated_right, columns, expected, outside=False)
+    saturated = saturated_left[:, begin:end] | right_property(saturated_right, columns, expected)
     evidence = [
-        (Status.NO_SURFACE, ~seen_left | ~right_property(seen_right, columns, expected, outside=False)),
+        (Status.NO_SURFACE, ~seen_left | ~right_property(seen_right, columns, expected)),
         (Status.SATURATED, saturated),
-        (Status.LOW_MODULATION, blank_left | right_property(blank_right, columns, expected, outside=False)),
+        (Status.LOW_MODULATION, blank_left | right_property(blank_right, columns, expected)),
         (Status.OUT_OF_RANGE, matched & ~in_range),
         (Status.HIDDEN, ~matches.matched_back | (matches.disagreement > settings.left_right_px)),
     ]
