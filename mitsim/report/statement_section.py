@@ -22,63 +22,37 @@ from mitsim.study.statement_file import BudgetEntry, ExposureEntry, StatedMeasur
 
 def statement_section(document: StatementDocument) -> dict[str, Any]:
     """Return everything that the section of the page shows, as texts."""
-    rows = [_row(name, measurement) for name, measurement in document.measurements.items()]
-    shown = [
-        group
-        for group in GROUPS
-        if any(line.group == group for measurement in document.measurements.values() for line in measurement.budget)
-    ]
+    measured = document.measurements
+    lines = [line for one in measured.values() for line in one.budget]
+    shown = [group for group in GROUPS if any(line.group == group for line in lines)]
+    undrawn = {line.group: line.source for line in lines if line.source}
     return {
         "view": document.view,
         "rendered": document.measured_by == "render",
-        "trials": max((measurement.trials for measurement in document.measurements.values()), default=0),
+        "trials": max((one.trials for one in measured.values()), default=0),
         "calibration": calibration_in_words(document),
         "exposure": exposed_in_words(document.exposure),
-        "rows": rows,
-        "tolerances": any(measurement.tolerance is not None for measurement in document.measurements.values()),
+        "rows": [_row(name, one) for name, one in measured.items()],
+        "tolerances": any(one.tolerance is not None for one in measured.values()),
         "legend": [{"colour": GROUPS[group][0], "name": GROUPS[group][1]} for group in shown],
-        "bars": [_bar(name, measurement) for name, measurement in document.measurements.items() if measurement.budget],
+        "bars": [_bar(name, one) for name, one in measured.items() if one.budget],
         "budget_groups": [GROUPS[group][1] for group in shown],
-        "budget_rows": [
-            _budget_row(name, measurement, shown)
-            for name, measurement in document.measurements.items()
-            if measurement.budget
-        ],
+        "budget_rows": [_budget_row(name, one, shown) for name, one in measured.items() if one.budget],
         "included": [influence.model_dump() for influence in document.influences if influence.included],
-        "open_lines": any(
-            not line.settled for measurement in document.measurements.values() for line in measurement.budget
-        ),
+        "open_lines": any(not line.settled for line in lines),
         "depends": dependences_in_words(
-            (
-                name,
-                measurement.unit,
-                measurement.size_depends_on,
-                None if measurement.decision is None else measurement.decision.needed,
-            )
-            for name, measurement in document.measurements.items()
+            (name, one.unit, one.size_depends_on, None if one.decision is None else one.decision.needed)
+            for name, one in measured.items()
         ),
-        "find_out": remedies_in_words(measurement.size_depends_on for measurement in document.measurements.values()),
-        "undrawn": [
-            {"name": GROUPS.get(group, ("", group))[1], "source": source}
-            for group, source in {
-                line.group: line.source
-                for measurement in document.measurements.values()
-                for line in measurement.budget
-                if line.source
-            }.items()
-        ],
+        "find_out": remedies_in_words(one.size_depends_on for one in measured.values()),
+        "undrawn": [{"name": GROUPS.get(group, ("", group))[1], "source": undrawn[group]} for group in undrawn],
         "missing": [influence.model_dump() for influence in document.influences if not influence.included],
         "losses": lost_features(
-            (name, measurement.trials, [Loss(lost.reason, lost.count) for lost in measurement.losses])
-            for name, measurement in document.measurements.items()
+            (name, one.trials, [Loss(lost.reason, lost.count) for lost in one.losses]) for name, one in measured.items()
         ),
-        "at_limit": [
-            name for name, measurement in document.measurements.items() if measurement.errors_of == AT_THE_LIMIT
-        ],
-        "far": [
-            name for name, measurement in document.measurements.items() if measurement.errors_of == FAR_FROM_NOMINAL
-        ],
-        "unsettled": [name for name, measurement in document.measurements.items() if not measurement.settled],
+        "at_limit": [name for name, one in measured.items() if one.errors_of == AT_THE_LIMIT],
+        "far": [name for name, one in measured.items() if one.errors_of == FAR_FROM_NOMINAL],
+        "unsettled": [name for name, one in measured.items() if not one.settled],
     }
 
 
