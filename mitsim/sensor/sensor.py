@@ -24,8 +24,7 @@ from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.pattern import DotPattern, dot_frames
 from mitsim.sensor.projector import Projector
 from mitsim.sensor.projector_images import ProjectorImages, allowed_images, checked_images
-from mitsim.sensor.published_lengths import PublishedAccuracy, PublishedLengths
-from mitsim.sensor.published_noise import PublishedNoise
+from mitsim.sensor.published_figures import PublishedAccuracy, PublishedLengths, PublishedNoise
 from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.sensor_file import MisalignmentTable, Purpose, RoomTable, needed_keys
 from mitsim.sensor.unknowns import UnknownsTable

@@ -31,8 +31,7 @@ from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.opencv_calibration import CalibrationTable
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.projector_images import ImageFolder
-from mitsim.sensor.published_lengths import PublishedAccuracy, PublishedLengths
-from mitsim.sensor.published_noise import PublishedNoise
+from mitsim.sensor.published_figures import PublishedAccuracy, PublishedLengths, PublishedNoise
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.unknowns import UnknownsTable
 

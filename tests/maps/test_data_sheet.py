@@ -26,7 +26,7 @@ from mitsim.report.sheet_figures import (
 )
 from mitsim.report.style import write_png
 from mitsim.sensor.preset import load_sensor
-from mitsim.sensor.published_noise import PublishedNoise
+from mitsim.sensor.published_figures import PublishedNoise
 from tests.smaller_sensors import binned
 
 FRINGES = Path(__file__).parents[1] / "data" / "fringes.toml"

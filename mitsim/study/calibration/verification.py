@@ -24,7 +24,7 @@ from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.decoding.plate import Plate, image_on_grid, plate_dots, plate_scale
 from mitsim.sensor.camera import Rig
-from mitsim.sensor.published_lengths import PublishedLengths
+from mitsim.sensor.published_figures import PublishedLengths
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import PATH_NAMES, moved, parameter_names, path_error
 from mitsim.sensor.sensor import Sensor

@@ -17,7 +17,7 @@ from mitsim.sensor.camera import Rig
 from mitsim.sensor.fitted_to import images_digest
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.preset_covariance import preset_covariance
-from mitsim.sensor.published_lengths import PublishedLengths
+from mitsim.sensor.published_figures import PublishedLengths
 from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.unknowns import CalibrationUnknowns, TemperatureUnknowns
