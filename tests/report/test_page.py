@@ -14,8 +14,8 @@ from markupsafe import escape
 from characterisation.files.atomic_io import write_netcdf
 from characterisation.files.errors import InputError
 from characterisation.words.numbers import percent, two_digits
-from mitsim.report.card_tables import with_labels
 from mitsim.report.page import write_report
+from mitsim.report.templates import with_labels
 from mitsim.study.run_folder import read_run
 from tests.plain_pages import without_pictures
 from tests.report.conftest import CHECKED, FEATURES, HOSTILE, MEASUREMENTS, plain_pictures, write_run

@@ -22,12 +22,13 @@ from characterisation.files.errors import InputError
 from characterisation.files.threads import in_threads
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
-from mitsim.capture.grey_bits import bits_of, from_bit_0
 from mitsim.capture.grey_image import (
     CHANNELS,
     SUFFIXES,
     Image,
+    bits_of,
     channel_name,
+    from_bit_0,
     is_colour,
     page_count,
     page_labels,
