@@ -122,14 +122,7 @@ class Decoding(Document):
 def read_settings(where: str | Path, table: dict[str, Any], technology: str) -> tuple[Decoding, dict[str, Any]]:
     """Split the table of a ``settings.json`` into what decoding reads and the records.
 
-    Parameters
-    ----------
-    where
-        The file, for messages.
-    table
-        Its content.
-    technology
-        Of the capture; it determines the type of ``decoder``.
+    ``technology``, that of the capture, determines the type of ``decoder``. Messages name the file ``where``.
 
     Raises
     ------

@@ -156,14 +156,7 @@ def _bytes_of(path: Path) -> bytes:
 def decode_grey(data: bytes, where: str | Path, *, channel: int | None = None) -> Image:
     """Read a grey image from the bytes of a file, as :func:`read_grey` does.
 
-    Parameters
-    ----------
-    data
-        Content of the file.
-    where
-        Name of the file in messages.
-    channel
-        Number of the channel to take of a colour image (:data:`CHANNELS`).
+    ``channel`` is the number of the channel to take of a colour image (:data:`CHANNELS`). Messages name ``where``.
 
     Raises
     ------

@@ -178,14 +178,8 @@ def start(variant: str | None) -> None:
 def refuse_unused(context: typer.Context, found: str, allowed: str, *names: str) -> None:
     """Refuse options of the running command that the user gave although they have no effect.
 
-    Parameters
-    ----------
-    context
-        The context of the command.
-    found, allowed
-        Why they have no effect, such as ``no --task``, and what gives them one.
-    names
-        Names of their parameters.
+    ``found`` and ``allowed`` say why the parameters ``names`` have no effect, such as ``no --task``, and what gives
+    them one.
 
     Raises
     ------

@@ -43,14 +43,7 @@ def board_frame(
 ) -> tuple[NDArray[np.float64], float, float]:
     """Return the frame of a board (4, 4) from the sensor frame, the scale of the corners, and their rms residual [mm].
 
-    Parameters
-    ----------
-    board
-        The board.
-    cloud
-        Organised cloud that shows it.
-    image
-        (H, W) grey image on the grid of the cloud.
+    ``image`` (H, W) is grey, on the grid of the organised ``cloud`` that shows the board.
 
     Raises
     ------

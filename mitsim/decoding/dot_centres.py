@@ -57,12 +57,7 @@ _AREA_RATIOS = (0.6, 1.6)
 def dot_centres(image: NDArray[np.uint8], dark: bool = True) -> NDArray[np.float64]:
     """Find round dots of equal size in an image.
 
-    Parameters
-    ----------
-    image
-        (H, W) grey levels [DN].
-    dark
-        Whether the dots are darker than their background.
+    ``image`` (H, W) has grey levels [DN]; ``dark``: whether the dots are darker than their background.
 
     Returns
     -------

@@ -110,14 +110,7 @@ def companded(levels: NDArray[np.uint16], black_level: float, share: float) -> N
     Merged levels are those of the shortest exposure. In 8 bits the faint pixels, for which the longest is taken, would
     have a few levels. A match needs no absolute levels: both cameras have the same curve.
 
-    Parameters
-    ----------
-    levels
-        Merged images.
-    black_level
-        Level without light [merged DN].
-    share
-        Shortest over longest exposure [1].
+    ``black_level`` is the level without light [merged DN], ``share`` the shortest over the longest exposure [1].
 
     See Also
     --------

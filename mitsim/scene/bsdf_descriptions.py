@@ -46,14 +46,8 @@ def metal_bsdf(index: tuple[float, float], scatter: Scatter, reflected: float = 
     refractive index, and none is a delta function, so blending conserves energy. The parts depend on the finish, but
     not on its deviation: a part is left out only if its share is known to be nothing.
 
-    Parameters
-    ----------
-    index
-        n and k of the metal [1].
-    scatter
-        Lobes and shares of the finish.
-    reflected
-        Factor on all reflected light [1].
+    ``index`` is n and k of the metal [1], ``scatter`` has lobes and shares of the finish, ``reflected`` is a factor on
+    all reflected light [1].
     """
 
     def lobe(distribution: Distribution, alphas: tuple[float, float], factor: float) -> dict[str, Any]:

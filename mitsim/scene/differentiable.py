@@ -44,12 +44,7 @@ _MIRROR = "mirror"
 def lambertian_coupon(width: float, height: float, wavelength_nm: float) -> Scene:
     """Return a scene with one white Lambertian coupon of reflectance 1.
 
-    Parameters
-    ----------
-    width, height
-        Size along x and y [mm]. The coupon lies in the plane z = 0, centred, with normal +z.
-    wavelength_nm
-        Wavelength of the sensor [nm].
+    ``width`` and ``height`` are along x and y [mm]. The coupon lies in the plane z = 0, centred, with normal +z.
     """
     backend.activate()
     to_world = mi.ScalarTransform4f().scale([width / 2, height / 2, 1.0])

@@ -84,14 +84,7 @@ def map_in(data: bytes, where: Path, frame: int | None = None) -> NDArray[Any]:
 def map_among(arrays: dict[str, NDArray[Any]], where: Path, frame: int | None = None) -> NDArray[Any]:
     """Return the points (rows, columns, 3), or else the depths (rows, columns), among arrays.
 
-    Parameters
-    ----------
-    arrays
-        By name.
-    where
-        The file, for messages.
-    frame
-        Number of one of several images of depths, (frames, rows, columns), from 0.
+    ``frame`` is the number, from 0, of one of several images of depths, (frames, rows, columns).
 
     Raises
     ------

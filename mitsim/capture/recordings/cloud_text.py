@@ -50,13 +50,6 @@ _SAMPLE = 200
 def points_of_text(data: bytes, path: Path) -> tuple[NDArray[np.float64], str | None]:
     """Return the points (n, 3) of a text, and their unit of length if the text states one.
 
-    Parameters
-    ----------
-    data
-        Content of the file.
-    path
-        The file, for messages.
-
     Raises
     ------
     InputError

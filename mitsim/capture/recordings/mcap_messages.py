@@ -69,14 +69,7 @@ def mcap_messages(
 
     The overall checksums and the number of messages are checked after the last message.
 
-    Parameters
-    ----------
-    data
-        Content of the file.
-    where
-        Name of the file in messages.
-    expected
-        What the file should be; by default a recording of DepthAI.
+    Messages name the file ``where``, and what it should be: ``expected``, by default a recording of DepthAI.
 
     Raises
     ------

@@ -103,12 +103,7 @@ _NOT_READ = {
 def kind_of(path: str | Path, *, sensor: str | None = None, calibration: str | None = None) -> str:
     """Return the kind of a recording: by its first bytes, or for a folder by the names in it.
 
-    Parameters
-    ----------
-    path
-        File or folder.
-    sensor, calibration
-        Those that the user gives; a folder of images needs one of them.
+    ``sensor`` and ``calibration`` are those that the user gives; a folder of images needs one of them.
 
     Raises
     ------

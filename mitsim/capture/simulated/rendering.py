@@ -61,12 +61,8 @@ class Rendering:
     def smoothed(cls, samples: int, depth: int, smoothing_px: float) -> Rendering:
         """Return settings with as many paths for direct light as for interreflections, which are smoothed.
 
-        Parameters
-        ----------
-        samples, depth
-            As the attributes.
-        smoothing_px
-            Standard deviation of the filter over the interreflections on each shape [px]; 0 for no filter.
+        ``smoothing_px`` is the standard deviation of the filter over the interreflections on each shape; 0 for no
+        filter.
         """
         return cls(samples, depth, IndirectLight(samples, smoothing_px) if smoothing_px > 0 and depth > 1 else None)
 

@@ -102,16 +102,10 @@ class SimulatedSensor:
         still drawn for the pixels of this sensor's rig, because a small change does not affect its statistics. A
         projector that has no distortion in this sensor's rig keeps its irradiance for the same reason.
 
-        Parameters
-        ----------
-        rig
-            The calibration.
-        unit
-            Seed of another unit's fixed pattern; None keeps the pattern. It is this unit's pattern, shifted by random
-            rows and columns: pixels are independent, so it is as good as a new draw and faster.
-        mask
-            Dots of another unit (:func:`mitsim.sensor.pattern.another_mask`), which its captures state; None keeps
-            this unit's.
+        ``unit`` is the seed of another unit's fixed pattern; None keeps the pattern. It is this unit's pattern, shifted
+        by random rows and columns: pixels are independent, so it is as good as a new draw and faster. ``mask`` has the
+        dots of another unit (:func:`mitsim.sensor.pattern.another_mask`), which its captures state; None keeps this
+        unit's.
         """
         other = copy.copy(self)
         projector = self.sensor.projector.recalibrated(rig.projector or self.sensor.projector.optics)

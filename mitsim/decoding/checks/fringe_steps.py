@@ -78,12 +78,7 @@ def _periods(lines: CodeLines, axis: Axis) -> Iterator[tuple[list[int], Floats, 
 def contradiction(images: Floats, shifts: Floats) -> float:
     """Return how far images of one period contradict the shifts of their steps, relative to the modulation; 0 to 1.
 
-    Parameters
-    ----------
-    images
-        (N, n) of n pixels [DN].
-    shifts
-        (N,) delta of each image [rad].
+    ``images`` (N, n) are of n pixels [DN], ``shifts`` (N,) the delta of each image [rad].
     """
     model = np.stack([np.ones(len(shifts)), np.cos(shifts), np.sin(shifts)], axis=1)
     left, singular, _ = np.linalg.svd(model)

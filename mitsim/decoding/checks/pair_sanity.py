@@ -96,14 +96,7 @@ def pair_findings(images: CodedImages, rig: Rig, geometry: StereoGeometry) -> Fi
 def plain_pair_warning(images: tuple[Floats, Floats], rig: Rig, geometry: StereoGeometry) -> str:
     """Return a warning if two images (H, W) [DN] without a code contradict the calibration of their cameras, or "".
 
-    Parameters
-    ----------
-    images
-        Of the first and the second camera.
-    rig
-        The calibration.
-    geometry
-        Of its rectified pair.
+    ``geometry`` is that of the rectified pair of the calibration ``rig``.
     """
     names = " and ".join(list(rig.cameras)[:2])
     if images[0].shape == images[1].shape and np.array_equal(*images):

@@ -220,14 +220,8 @@ def both_ways_disagreement(
 ) -> NDArray[np.float32]:
     """Return the least difference [px] between a left match and the matches of the two right pixels at its position.
 
-    Parameters
-    ----------
-    disparities
-        (h, w) disparities of left pixels, less the first of the range.
-    back
-        (h, w + 2 count) disparities of right pixels.
-    count
-        Number of disparities.
+    ``disparities`` (h, w) are of left pixels, less the first of the range, ``back`` (h, w + 2 count) of right pixels;
+    ``count`` is the number of disparities.
     """
     right_column = np.arange(count, count + disparities.shape[1], dtype=np.float32) - disparities
     matched = np.isfinite(disparities)

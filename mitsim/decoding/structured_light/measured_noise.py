@@ -61,14 +61,8 @@ def measured_noise(
 ) -> MeasuredNoise | None:
     """Measure the noise of the cameras that took the images of one code.
 
-    Parameters
-    ----------
-    stacks
-        (P, H, W) images [DN] of each camera.
-    image_roles
-        Roles of the P images.
-    full_scale
-        Value of a saturated pixel [DN].
+    ``stacks`` are the (P, H, W) images [DN] of each camera, in the roles ``image_roles``; ``full_scale`` is the value
+    of a saturated pixel [DN].
 
     Returns
     -------

@@ -62,12 +62,8 @@ class Phases:
 def fit_phases(stack: NDArray[np.generic], shifts: Sequence[NDArray[np.floating]]) -> Phases:
     """Fit A + B cos(phi - delta) to the images of each period by least squares.
 
-    Parameters
-    ----------
-    stack
-        (P, H, W) images [DN], period after period.
-    shifts
-        For each period, the shift delta [rad] of each of its images.
+    ``stack`` (P, H, W) are images [DN], period after period; ``shifts`` has for each period the shift delta [rad] of
+    each of its images.
     """
     shape = stack.shape[1:]
     flat = stack.reshape(len(stack), -1)

@@ -310,12 +310,7 @@ def find_coordinates(
     The row is linear between neighbouring pixels whose coordinates change as most of the row do. They increase wherever
     camera and projector see a surface from the same side, and fall if the projector is turned by 180 degrees.
 
-    Parameters
-    ----------
-    coordinates
-        (w,) [projector px], NaN where unknown.
-    row
-        (W,) coordinates of the row's pixels [projector px].
+    ``coordinates`` (w,) are NaN where unknown, ``row`` (W,) are those of the row's pixels [projector px].
 
     Returns
     -------

@@ -61,12 +61,8 @@ class UnwrappingPath:
 def unwrapping_path(periods: tuple[float, ...], steps: tuple[int, ...], extent: float) -> UnwrappingPath:
     """Return the most robust path.
 
-    Parameters
-    ----------
-    periods, steps
-        Periods [px], and the number of steps N of each.
-    extent
-        Number of projector pixels along the code.
+    ``steps`` is the number N of steps of each of the ``periods`` [px], ``extent`` that of projector pixels along the
+    code.
 
     Raises
     ------

@@ -76,12 +76,7 @@ def read_results(folder: str | Path, task_file: str | Path | None = None) -> Run
 
     The plan is the run's set of views, if it has one, in which every view measures everything; else the stated view.
 
-    Parameters
-    ----------
-    folder
-        Folder of the run.
-    task_file
-        The task TOML; None uses the copy in the run's folder.
+    ``task_file`` is the task TOML; None uses the copy in the run's folder.
 
     Raises
     ------

@@ -61,13 +61,8 @@ class RobotFormat:
 def read_targets(folder: str | Path, views: str = "best") -> tuple[list[RobotTarget], str]:
     """Return the targets of a run's views, or of a folder of ``mitsim study score``; and the name of their tool.
 
-    Parameters
-    ----------
-    folder
-        Folder of the run, or of the scores.
-    views
-        ``best``: the run's set of views, or the best of every measurement, with the view of the statement first;
-        ``all``; or numbers, ``3,12``.
+    ``views``: ``best``, the run's set of views, or the best of every measurement, with the view of the statement first;
+    ``all``; or numbers, ``3,12``.
 
     Raises
     ------

@@ -48,12 +48,7 @@ class RunScene:
 def read_run_scene(folder: str | Path, views: str = "best") -> RunScene:
     """Read the three-dimensional content of a finished run.
 
-    Parameters
-    ----------
-    folder
-        Folder of the run.
-    views
-        ``best``: views with clouds and best views of a measurement; ``all``; or numbers, ``3,12``.
+    ``views``: ``best``, views with clouds and best views of a measurement; ``all``; or numbers, ``3,12``.
 
     Raises
     ------

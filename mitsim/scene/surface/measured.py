@@ -191,12 +191,7 @@ def height_map(heights_um: ArrayLike, spacing_um: float, name: str = "height map
 def read_height_map(path: str | Path, spacing_um: float, where: str | Path = "") -> HeightMap:
     """Read an areal map [um]: a two-dimensional .npy, or a CSV of numbers without a header, row by row.
 
-    Parameters
-    ----------
-    path, spacing_um
-        The file, and the spacing of its heights [um].
-    where
-        Place that refers to the file, for messages.
+    ``spacing_um`` is that of its heights [um]. Messages name ``where``, the place that refers to the file.
 
     See Also
     --------
