@@ -34,21 +34,13 @@ from mitsim.sensor.light_code import LightCode, roles
 class CodedImages:
     """Images of structured light that show one exposure, and their code.
 
-    Attributes
-    ----------
-    stacks
-        (P, H, W) images [DN] of the code, without an ambient image: of the first camera or, if two cameras triangulate,
-        of both.
-    code, size
-        The code, and width and height of the projector [px].
-    settings
-        Limits of the decoder.
-    full_scale
-        Value of a saturated pixel [DN].
-    noise
-        The imager, or the noise that the fringes show; None if neither is known.
-    read_out
-        Region that was read out of each camera, without cameras that were read out completely.
+    - ``stacks``: (P, H, W) images [DN] of the code, without an ambient image: of the first camera or, if two cameras
+      triangulate, of both.
+    - ``code``, ``size``: the code, and width and height of the projector [px].
+    - ``settings``: limits of the decoder.
+    - ``full_scale``: value of a saturated pixel [DN].
+    - ``noise``: the imager, or the noise that the fringes show; None if neither is known.
+    - ``read_out``: region that was read out of each camera, without cameras that were read out completely.
     """
 
     stacks: dict[str, NDArray[np.unsignedinteger[Any]]]

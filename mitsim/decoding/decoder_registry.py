@@ -69,24 +69,15 @@ Coordinates = Mapping[str, Mapping[Axis, ProjectorCoordinate]]
 class Images:
     """The images of a capture, ready to be decoded.
 
-    Attributes
-    ----------
-    capture
-        The capture.
-    stacks
-        (P, H, W) images [DN] of each camera, that of the reference camera first. Exposures of a bracket are merged.
-    full_scale
-        Value of a saturated pixel [DN].
-    imager
-        The imager, or the noise measured in the images; None if neither is known.
-    roi
-        Region of the cloud's grid to decode; None for all.
-    read_out
-        Region that was read out of each camera, without cameras that were read out completely.
-    coordinates
-        Projector coordinates that structured light was decoded to before; None if it is not decoded yet.
-    share
-        As in :class:`mitsim.decoding.image_context.ImageContext`.
+    - ``capture``: the capture.
+    - ``stacks``: (P, H, W) images [DN] of each camera, that of the reference camera first. Exposures of a bracket are
+      merged.
+    - ``full_scale``: value of a saturated pixel [DN].
+    - ``imager``: the imager, or the noise measured in the images; None if neither is known.
+    - ``roi``: region of the cloud's grid to decode; None for all.
+    - ``read_out``: region that was read out of each camera, without cameras that were read out completely.
+    - ``coordinates``: projector coordinates that structured light was decoded to before; None if it is not decoded yet.
+    - ``share``: as in :class:`mitsim.decoding.image_context.ImageContext`.
     """
 
     capture: Capture
@@ -162,18 +153,11 @@ class Images:
 class Technology:
     """How the captures of one kind of sensor become clouds.
 
-    Attributes
-    ----------
-    patterns
-        Kinds of pattern that a capture must name; empty if the decoder does not need one.
-    geometry
-        Function from rig, settings and pattern to the geometry that is prepared once.
-    decode
-        Function from images, geometry, settings and pattern to a cloud.
-    range_mm
-        Default range of depths to search [mm].
-    from_device
-        Whether the device has measured the points. Of a sensor's settings only the range is then used.
+    - ``patterns``: kinds of pattern that a capture must name; empty if the decoder does not need one.
+    - ``geometry``: function from rig, settings and pattern to the geometry that is prepared once.
+    - ``decode``: function from images, geometry, settings and pattern to a cloud.
+    - ``range_mm``: default range of depths to search [mm].
+    - ``from_device``: whether the device has measured the points. Of a sensor's settings only the range is then used.
     """
 
     patterns: tuple[type[Pattern], ...]

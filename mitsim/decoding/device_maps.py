@@ -35,14 +35,9 @@ MapName = Literal["depth", "disparity", "points"]
 class DeviceMapGeometry:
     """Geometry of a device's map.
 
-    Attributes
-    ----------
-    grid
-        Pixels of the map.
-    baseline
-        (3,) unit vector in the sensor frame.
-    rectification
-        Of a map of disparities; else None.
+    - ``grid``: pixels of the map.
+    - ``baseline``: (3,) unit vector in the sensor frame.
+    - ``rectification``: of a map of disparities; else None.
     """
 
     grid: ViewGrid

@@ -19,12 +19,8 @@ from mitsim.sensor.point_spread import kept_variance
 class MeasuredNoise:
     """Variance of grey levels as a function of the level, measured in images.
 
-    Attributes
-    ----------
-    levels
-        (n,) increasing [DN].
-    variances
-        (n,) [DN^2]; linear between the levels, and constant beyond them.
+    - ``levels``: (n,) increasing [DN].
+    - ``variances``: (n,) [DN^2]; linear between the levels, and constant beyond them.
     """
 
     levels: NDArray[np.float64]

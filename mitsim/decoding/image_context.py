@@ -13,21 +13,13 @@ from mitsim.sensor.imager import Imager
 class ImageContext:
     """Properties of the images of a capture.
 
-    Attributes
-    ----------
-    sensor, source
-        Copied into the cloud.
-    full_scale
-        Value of a saturated pixel [DN], ``2**bits - 1``.
-    imager
-        The imager, whose gain, read noise and black level give the expected noise; or noise measured in the images
-        (:mod:`mitsim.decoding.structured_light.measured_noise`). None if neither is known.
-    roi
-        Region of the cloud's grid to decode, None for all. Pixels outside are ``NO_SURFACE``.
-    read_out
-        Regions of the raw images of the first and second camera that were read out; None for a whole image.
-    share
-        Of merged exposures with linear levels: shortest exposure, to which the levels refer, over longest [1].
+    - ``sensor``, ``source``: copied into the cloud.
+    - ``full_scale``: value of a saturated pixel [DN], ``2**bits - 1``.
+    - ``imager``: the imager, whose gain, read noise and black level give the expected noise; or noise measured in the
+      images (:mod:`mitsim.decoding.structured_light.measured_noise`). None if neither is known.
+    - ``roi``: region of the cloud's grid to decode, None for all. Pixels outside are ``NO_SURFACE``.
+    - ``read_out``: regions of the raw images of the first and second camera that were read out; None for a whole image.
+    - ``share``: of merged exposures with linear levels: shortest exposure, to which the levels refer, over longest [1].
     """
 
     sensor: str

@@ -67,22 +67,13 @@ _DEPTHS = 5
 class TimeOfFlightGeometry:
     """Geometry of a camera and its light source, computed once.
 
-    Attributes
-    ----------
-    camera_name, camera
-        The camera.
-    ray
-        (H, W, 3) unit view direction of each raw pixel in the sensor frame.
-    light_source
-        (3,) position p [mm] relative to the camera's centre, in the sensor frame.
-    projection
-        (H, W) [mm] d.p, the projection of p on each ray.
-    cosine
-        (H, W) cosine of the angle between ray and camera axis.
-    seen
-        (H, W) whether the light source reaches the ray between near and far.
-    grid, baseline
-        Pixels of the cloud, and unit vector (3,) from the camera to the light source.
+    - ``camera_name``, ``camera``: the camera.
+    - ``ray``: (H, W, 3) unit view direction of each raw pixel in the sensor frame.
+    - ``light_source``: (3,) position p [mm] relative to the camera's centre, in the sensor frame.
+    - ``projection``: (H, W) [mm] d.p, the projection of p on each ray.
+    - ``cosine``: (H, W) cosine of the angle between ray and camera axis.
+    - ``seen``: (H, W) whether the light source reaches the ray between near and far.
+    - ``grid``, ``baseline``: pixels of the cloud, and unit vector (3,) from the camera to the light source.
     """
 
     camera_name: str

@@ -34,24 +34,15 @@ from mitsim.sensor.transforms import Transform
 class LightOnImagers:
     """Light on the imagers from one pose: all inputs of a capture except the noise of the imagers.
 
-    Attributes
-    ----------
-    radiance
-        (P, h, w) of each camera in its region [W / (mm^2 sr)].
-    rois
-        Region of each camera's image.
-    exposures
-        Exposure times [s].
-    noise
-        The sources of noise that are on.
-    world_from_sensor
-        Pose of the sensor.
-    rendered
-        Settings of the rendering: scene, samples_per_pixel, light_path_depth, and indirect_light if it is rendered
-        separately.
-    other
-        (h, w) of each camera, the part of every image's radiance that is not the projector's: of a scene with emitters,
-        or a sensor in a known room.
+    - ``radiance``: (P, h, w) of each camera in its region [W / (mm^2 sr)].
+    - ``rois``: region of each camera's image.
+    - ``exposures``: exposure times [s].
+    - ``noise``: the sources of noise that are on.
+    - ``world_from_sensor``: pose of the sensor.
+    - ``rendered``: settings of the rendering: scene, samples_per_pixel, light_path_depth, and indirect_light if it is
+      rendered separately.
+    - ``other``: (h, w) of each camera, the part of every image's radiance that is not the projector's: of a scene with
+      emitters, or a sensor in a known room.
     """
 
     radiance: dict[str, NDArray[np.float32]]

@@ -46,14 +46,10 @@ class RenderResidual:
 
     All are NaN if nothing is lit.
 
-    Attributes
-    ----------
-    noise, quadrature
-        Noise of one rendering, and error of its samples per pixel: 68.3 % of the pixels are below, which is one
-        standard deviation of a normal distribution. Interreflections on metal, and pixels at edges, have far heavier
-        tails.
-    outliers
-        Share of pixels whose noise or error exceeds the sensor's noise.
+    - ``noise``, ``quadrature``: noise of one rendering, and error of its samples per pixel: 68.3 % of the pixels are
+      below, which is one standard deviation of a normal distribution. Interreflections on metal, and pixels at edges,
+      have far heavier tails.
+    - ``outliers``: share of pixels whose noise or error exceeds the sensor's noise.
     """
 
     noise: float

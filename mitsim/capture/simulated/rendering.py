@@ -16,16 +16,10 @@ from mitsim.capture.simulated.indirect_light import IndirectLight, KeptSettings
 class IndirectImages:
     """Interreflections that ``SimulatedSensor.indirect_radiance`` rendered before, for each camera.
 
-    Attributes
-    ----------
-    images
-        (P, h, w) of each camera in its region, before the lens [W / (mm^2 sr)].
-    rois
-        Region of each camera's image.
-    settings
-        Settings with which they were rendered.
-    depth
-        Largest number of surfaces on a light path.
+    - ``images``: (P, h, w) of each camera in its region, before the lens [W / (mm^2 sr)].
+    - ``rois``: region of each camera's image.
+    - ``settings``: settings with which they were rendered.
+    - ``depth``: largest number of surfaces on a light path.
     """
 
     images: dict[str, NDArray[np.float32]]
@@ -38,18 +32,12 @@ class IndirectImages:
 class Rendering:
     """Light paths of a capture.
 
-    Attributes
-    ----------
-    samples
-        Number per pixel.
-    depth
-        Largest number of surfaces on a path.
-    indirect
-        None: interreflections are rendered together with direct light. :class:`IndirectLight`: they are rendered
-        separately and smoothed. :class:`IndirectImages`: they were rendered before, of the same scene from a near pose;
-        their regions and depth apply.
-    kept
-        Numbers of paths of interreflections that are traced once and serve any finish; None for none.
+    - ``samples``: number per pixel.
+    - ``depth``: largest number of surfaces on a path.
+    - ``indirect``: none: interreflections are rendered together with direct light. :class:`IndirectLight`: they are
+      rendered separately and smoothed. :class:`IndirectImages`: they were rendered before, of the same scene from a
+      near pose; their regions and depth apply.
+    - ``kept``: numbers of paths of interreflections that are traced once and serve any finish; None for none.
     """
 
     samples: int = 16

@@ -66,18 +66,11 @@ _DEFAULT = Rendering()
 class SimulatedSensor:
     """A sensor on the device, ready for any number of captures of any scene.
 
-    Attributes
-    ----------
-    sensor
-        The sensor.
-    rays
-        Of each camera: rays for light paths, with the true calibration.
-    patterns
-        The projector and its codes.
-    units
-        Fixed patterns of each camera's imager.
-    corner_loss
-        Illumination (H, W) of each camera's image relative to its centre; None without loss.
+    - ``sensor``: the sensor.
+    - ``rays``: of each camera: rays for light paths, with the true calibration.
+    - ``patterns``: the projector and its codes.
+    - ``units``: fixed patterns of each camera's imager.
+    - ``corner_loss``: illumination (H, W) of each camera's image relative to its centre; None without loss.
     """
 
     def __init__(self, sensor: Sensor) -> None:

@@ -238,17 +238,11 @@ def _add_paths(total: Costs, cost: Costs, directions: tuple[int, ...], penalties
 class _Least:
     """Least sums (h, count, w) of left pixels and right columns.
 
-    Attributes
-    ----------
-    best
-        (h, w) disparity of the least sum of each left pixel, the first of equal ones.
-    sums
-        (3, h, w) sums at one disparity less, at the best one, and at one more.
-    second
-        (h, w) least sum of the other disparities.
-    of_right
-        (h, w + count) disparity of the least sum of each right column; left column i sees i + count - k at k. NaN for
-        columns that no left column sees.
+    - ``best``: (h, w) disparity of the least sum of each left pixel, the first of equal ones.
+    - ``sums``: (3, h, w) sums at one disparity less, at the best one, and at one more.
+    - ``second``: (h, w) least sum of the other disparities.
+    - ``of_right``: (h, w + count) disparity of the least sum of each right column; left column i sees i + count - k at
+      k. NaN for columns that no left column sees.
     """
 
     best: NDArray[np.intp]

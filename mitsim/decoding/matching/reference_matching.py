@@ -53,20 +53,12 @@ _REFERENCE_LEVEL = 0.9
 class ReferenceGeometry:
     """A camera and its reference image, computed once.
 
-    Attributes
-    ----------
-    pair
-        The rectified camera, and the reference in place of the right camera.
-    reference
-        (H, W) 0..1 on the rectified grid.
-    pattern
-        The mask of dots in the reference.
-    samples
-        (n, 2, H * W) projector rows and columns [px] that are averaged in each pixel of the reference.
-    projector_size
-        Width and height of the projector [px].
-    blur_px
-        Standard deviation of the blur of the reference by the camera's lens [px].
+    - ``pair``: the rectified camera, and the reference in place of the right camera.
+    - ``reference``: (H, W) 0..1 on the rectified grid.
+    - ``pattern``: the mask of dots in the reference.
+    - ``samples``: (n, 2, H * W) projector rows and columns [px] that are averaged in each pixel of the reference.
+    - ``projector_size``: width and height of the projector [px].
+    - ``blur_px``: standard deviation of the blur of the reference by the camera's lens [px].
     """
 
     pair: StereoGeometry

@@ -40,15 +40,10 @@ class Matches:
     A pixel without a match from the right image is hidden from the right camera. This is Hirschmueller's way to
     distinguish occlusions from mismatches.
 
-    Attributes
-    ----------
-    disparity
-        x_left - x_right [px], NaN without a unique match.
-    disagreement
-        Difference [px] from the disparity that the right image has at the matched position. NaN if it has none, or the
-        position is outside the image.
-    matched_back
-        Whether the best match of a right pixel is this pixel or one beside it.
+    - ``disparity``: x_left - x_right [px], NaN without a unique match.
+    - ``disagreement``: difference [px] from the disparity that the right image has at the matched position. NaN if it
+      has none, or the position is outside the image.
+    - ``matched_back``: whether the best match of a right pixel is this pixel or one beside it.
     """
 
     disparity: NDArray[np.float32]

@@ -61,18 +61,11 @@ ROI_MARGIN_PX = 16
 class StereoGeometry:
     """Geometry of a rectified pair, computed once.
 
-    Attributes
-    ----------
-    rectification
-        Matrices and rotations of the rectified pair.
-    map_left, map_right
-        (2, H, W) float32: raw column and row [px] of each rectified pixel.
-    seen_left, seen_right
-        (H, W) whether this raw pixel exists.
-    raw_size
-        (H, W) of the raw left and right images.
-    grid, baseline
-        Pixels of the cloud, and unit vector (3,) from the left to the right camera.
+    - ``rectification``: matrices and rotations of the rectified pair.
+    - ``map_left``, ``map_right``: (2, H, W) float32: raw column and row [px] of each rectified pixel.
+    - ``seen_left``, ``seen_right``: (H, W) whether this raw pixel exists.
+    - ``raw_size``: (H, W) of the raw left and right images.
+    - ``grid``, ``baseline``: pixels of the cloud, and unit vector (3,) from the left to the right camera.
     """
 
     rectification: Rectification
@@ -168,7 +161,7 @@ def decode_stereo(
         - ``LOW_MODULATION``: too little contrast, in either image
         - ``OUT_OF_RANGE``: the depth is not between near and far
         - ``HIDDEN``: no match from the right image, or a contradicting one
-        - ``AMBIGUOUS``: none of these, so there is no unique match
+        - ``AMBIGUOUS``: None of these, so there is no unique match
 
     Raises
     ------

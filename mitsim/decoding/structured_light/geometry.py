@@ -64,28 +64,17 @@ MINIMUM_CHANGE_PX = 0.5
 class StructuredLightGeometry:
     """Geometry of a camera and a projector, computed once.
 
-    Attributes
-    ----------
-    camera_name, camera, projector
-        The camera of the rig, and the projector.
-    axis
-        Axis of the coordinate.
-    near, far
-        Range of depths along the camera's axis [mm].
-    ray
-        (H, W, 3) view ray of each raw pixel in the sensor frame, scaled to a depth of 1.
-    nodes
-        (K, H, W) coordinates u_k [projector px], which include both ends of the range.
-    differences
-        (K, H, W) divided differences of w(u) [1/mm/px^k].
-    seen
-        (H, W) whether the projector reaches the ray between near and far, and its coordinate determines the depth.
-    undetermined
-        (H, W) whether the lens distortion gives the pixel no ray, or several depths for one coordinate.
-    exact
-        Whether the polynomial is only the start of :func:`exact_inverse_depth`.
-    grid, baseline
-        Pixels of the cloud, and unit vector (3,) from the camera to the projector.
+    - ``camera_name``, ``camera``, ``projector``: the camera of the rig, and the projector.
+    - ``axis``: axis of the coordinate.
+    - ``near``, ``far``: range of depths along the camera's axis [mm].
+    - ``ray``: (H, W, 3) view ray of each raw pixel in the sensor frame, scaled to a depth of 1.
+    - ``nodes``: (K, H, W) coordinates u_k [projector px], which include both ends of the range.
+    - ``differences``: (K, H, W) divided differences of w(u) [1/mm/px^k].
+    - ``seen``: (H, W) whether the projector reaches the ray between near and far, and its coordinate determines the
+      depth.
+    - ``undetermined``: (H, W) whether the lens distortion gives the pixel no ray, or several depths for one coordinate.
+    - ``exact``: whether the polynomial is only the start of :func:`exact_inverse_depth`.
+    - ``grid``, ``baseline``: pixels of the cloud, and unit vector (3,) from the camera to the projector.
     """
 
     camera_name: str

@@ -44,14 +44,9 @@ _VECTOR = 64
 class Phases:
     """Fitted parameters of the fringes, float32.
 
-    Attributes
-    ----------
-    phase
-        (n, H, W) [rad] of each period, 0 to 2 pi.
-    modulation
-        (n, H, W) amplitude B [DN].
-    offset
-        (H, W) level A [DN], the mean over all periods.
+    - ``phase``: (n, H, W) [rad] of each period, 0 to 2 pi.
+    - ``modulation``: (n, H, W) amplitude B [DN].
+    - ``offset``: (H, W) level A [DN], the mean over all periods.
     """
 
     phase: NDArray[np.float32]
@@ -104,14 +99,9 @@ def fit_phases(stack: NDArray[np.generic], shifts: Sequence[NDArray[np.floating]
 class Fringes:
     """Fringes along one axis.
 
-    Attributes
-    ----------
-    periods
-        Decreasing [px].
-    shifts
-        Shifts delta [rad] of the images of each period.
-    mean, contrast
-        Of the projected cosine [1].
+    - ``periods``: decreasing [px].
+    - ``shifts``: shifts delta [rad] of the images of each period.
+    - ``mean``, ``contrast``: of the projected cosine [1].
     """
 
     periods: tuple[float, ...]

@@ -14,17 +14,11 @@ from characterisation.point_cloud import Status
 class ProjectorCoordinate:
     """Projector column or row seen by each pixel of a camera, (H, W).
 
-    Attributes
-    ----------
-    value
-        Coordinate [projector px], float64, with pixel centres at integers; NaN if rejected.
-    sigma
-        Standard deviation by noise, or by the width of a stripe [projector px], float32; NaN if unknown.
-    modulation
-        Half of white minus black, or the amplitude of the weakest fringe [DN], float32.
-    status
-        uint8 of :class:`~characterisation.point_cloud.Status`: VALID, SATURATED, LOW_MODULATION, PHASE_INCONSISTENT, or
-        AMBIGUOUS after interpolation between stripes.
+    - ``value``: coordinate [projector px], float64, with pixel centres at integers; NaN if rejected.
+    - ``sigma``: standard deviation by noise, or by the width of a stripe [projector px], float32; NaN if unknown.
+    - ``modulation``: half of white minus black, or the amplitude of the weakest fringe [DN], float32.
+    - ``status``: uint8 of :class:`~characterisation.point_cloud.Status`: VALID, SATURATED, LOW_MODULATION,
+      PHASE_INCONSISTENT, or AMBIGUOUS after interpolation between stripes.
     """
 
     value: NDArray[np.float64]

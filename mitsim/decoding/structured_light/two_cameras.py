@@ -211,18 +211,11 @@ def cloud_of_pair(
 class _CameraCoordinates:
     """Decoded coordinates of one camera at rectified pixels (h, w).
 
-    Attributes
-    ----------
-    coordinate
-        [projector px], NaN unless all four raw pixels have one.
-    sigma
-        Of a raw pixel there [projector px].
-    status
-        Of the nearest raw pixel.
-    seen
-        Whether the pixels were read out.
-    positions
-        (2, h, w) raw column and row [px].
+    - ``coordinate``: [projector px], NaN unless all four raw pixels have one.
+    - ``sigma``: of a raw pixel there [projector px].
+    - ``status``: of the nearest raw pixel.
+    - ``seen``: whether the pixels were read out.
+    - ``positions``: (2, h, w) raw column and row [px].
     """
 
     coordinate: NDArray[np.float64]

@@ -43,14 +43,9 @@ class Beat:
 class UnwrappingPath:
     """Beats from the longest to the finest, and the gain of noise at each step between them.
 
-    Attributes
-    ----------
-    beats
-        From the longest to the finest.
-    noise
-        (steps,) standard deviation of the residual f_b x_a - psi_b [cycles] per unit of sigma_I / B.
-    systematic
-        (steps,) the same per radian of an independent error of all phases.
+    - ``beats``: from the longest to the finest.
+    - ``noise``: (steps,) standard deviation of the residual f_b x_a - psi_b [cycles] per unit of sigma_I / B.
+    - ``systematic``: (steps,) the same per radian of an independent error of all phases.
     """
 
     beats: tuple[Beat, ...]

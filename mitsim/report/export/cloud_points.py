@@ -39,20 +39,12 @@ FIELDS: dict[str, str] = {
 class CloudPoints:
     """The n valid points of a cloud, in row order of their pixels.
 
-    Parameters
-    ----------
-    points
-        (n, 3), in ``frame`` and in ``unit``.
-    sigma
-        (n,) standard deviation along the view ray, in ``unit``; NaN where unknown.
-    rays
-        (n, 3) unit view rays, in ``frame``.
-    row, col, feature
-        (n,) position in the sensor's grid; index into ``feature_names``, -1 for none.
-    frame, unit
-        Name of the frame; ``mm`` or ``m``.
-    sensor, source
-        As of the cloud.
+    - ``points``: (n, 3), in ``frame`` and in ``unit``.
+    - ``sigma``: (n,) standard deviation along the view ray, in ``unit``; NaN where unknown.
+    - ``rays``: (n, 3) unit view rays, in ``frame``.
+    - ``row``, ``col``, ``feature``: (n,) position in the sensor's grid; index into ``feature_names``, -1 for none.
+    - ``frame``, ``unit``: name of the frame; ``mm`` or ``m``.
+    - ``sensor``, ``source``: as of the cloud.
     """
 
     points: Floats
