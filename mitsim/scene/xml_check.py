@@ -86,16 +86,11 @@ def check_rotations(path: Path, trees: Sequence[ElementTree.Element], parameters
             raise InputError(path, "rotate", f"an axis of length {length:.6g}", f"a unit vector: {unit}")
 
 
-def scene_files(path: Path, parameters: Mapping[str, str]) -> list[Path]:
+def _scene_files(path: Path, parameters: Mapping[str, str]) -> list[Path]:
     """Return every file that determines a scene: its XML first, then includes, meshes, textures and spectra.
 
     ``parameters`` replace the values of ``<default>`` elements. Names are relative to the folder of the scene or to a
     ``<path>`` of it, else to the working folder, as for Mitsuba. A missing file is left out, since Mitsuba reports it.
-
-    Raises
-    ------
-    InputError
-        As :func:`checked_trees`.
     """
     trees = _with_includes(path, dict(parameters))
     elements = [element for _, root in trees for element in root.iter()]
@@ -111,12 +106,12 @@ def scene_files(path: Path, parameters: Mapping[str, str]) -> list[Path]:
 
 
 def named_digests(path: Path, parameters: Mapping[str, str]) -> list[str]:
-    """Return the SHA-256 of every file that a scene names (:func:`scene_files`), without the XML itself.
+    """Return the SHA-256 of every file that a scene names, without the XML itself.
 
     A mesh may change while the text of the scene stays the same.
     """
     digests = []
-    for file in scene_files(path, parameters)[1:]:
+    for file in _scene_files(path, parameters)[1:]:
         with file.open("rb") as stream:
             digests.append(hashlib.file_digest(stream, "sha256").hexdigest())
     return digests

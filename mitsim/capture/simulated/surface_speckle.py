@@ -66,28 +66,10 @@ def shift_angle(sensor: Sensor, camera: Camera) -> float:
     return lateral_shift_std(1.0, sensor.wavelength_nm, 1.0) * 2.0 / sensor.pupil_mm(camera)
 
 
-def contrast_map(
+def _contrasts(
     scene: Scene, sensor: Sensor, camera: Camera, rays: PixelRays, world_from_sensor: Transform
 ) -> float | NDArray[np.float32]:
-    """Return C of each pixel (H, W), or one number if the whole scene has the same.
-
-    Parameters
-    ----------
-    scene
-        Scene with the finishes.
-    sensor
-        Sensor with its wavelength and imager.
-    camera
-        Camera that sees the speckle.
-    rays
-        View rays of its pixels, or of a region of them.
-    world_from_sensor
-        Pose of the sensor.
-
-    See Also
-    --------
-    draw_speckle : a realisation of speckle with this contrast
-    """
+    """Return C of each pixel (H, W), or one number if the whole scene has the same."""
     values = [finish_contrast(finish, sensor, camera) for finish in scene.finishes]
     if len(set(values)) == 1:
         return values[0]
@@ -124,12 +106,8 @@ def draw_speckle(
         Region of the image.
     rng
         Generator of the draws.
-
-    See Also
-    --------
-    contrast_map : the contrast of the speckle
     """
-    values = contrast_map(scene, sensor, camera, rays.within(roi), world_from_sensor)
+    values = _contrasts(scene, sensor, camera, rays.within(roi), world_from_sensor)
     if not np.any(values):
         return None
     imager = sensor.imager

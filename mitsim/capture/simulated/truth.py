@@ -10,7 +10,7 @@ An average of labels or depths over a pixel is no truth, so the geometry is neve
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -63,17 +63,12 @@ class Truth:
     indirect: NDArray[np.float32]
 
 
-def true_image(
-    simulated: SimulatedSensor,
-    scene: Scene,
-    world_from_sensor: Transform,
-    camera: str,
-    *,
-    samples: int = 16,
-    depth: int = 3,
-    seed: int = 1,
-) -> Truth:
-    """Return the ground truth of one camera of a simulated sensor.
+def true_images(
+    simulated: SimulatedSensor, scene: Scene, world_from_sensor: Transform, *, samples: int, depth: int, seed: int
+) -> dict[str, Truth]:
+    """Return the ground truth of every camera by name.
+
+    The share of indirect light follows paths of at least three surfaces, also where a capture has direct light alone.
 
     Parameters
     ----------
@@ -83,15 +78,19 @@ def true_image(
         Scene that it sees.
     world_from_sensor
         Pose of the sensor.
-    camera
-        Name of the camera.
     samples, depth, seed
         Light paths per pixel, surfaces on a light path, and seed, for the share of indirect light.
-
-    See Also
-    --------
-    true_images : all cameras
     """
+    paths = LightPaths(samples=samples, seed=seed, depth=max(depth, 3), with_ambient=True)
+    return {
+        name: _true_image(simulated, scene, world_from_sensor, name, paths) for name in simulated.sensor.rig.cameras
+    }
+
+
+def _true_image(
+    simulated: SimulatedSensor, scene: Scene, world_from_sensor: Transform, camera: str, paths: LightPaths
+) -> Truth:
+    """Return the ground truth of one camera; ``paths`` are for the share of indirect light."""
     # the camera as it is, not as its calibration says: these are the rays that the image shows
     eye, projector = simulated.sensor.true_rig.cameras[camera], simulated.sensor.projector
     directions = eye.pixel_directions()
@@ -114,11 +113,11 @@ def true_image(
             simulated.rays[camera],
             white,
             world_from_sensor,
-            LightPaths(samples=samples, seed=seed, depth=surfaces_on_path, with_ambient=True),
+            replace(paths, depth=surfaces_on_path),
         )
         return np.asarray(lit - ambient)
 
-    direct, total = light(1), light(depth)
+    direct, total = light(1), light(paths.depth)
     with np.errstate(invalid="ignore", divide="ignore"):
         indirect = np.where(total > 0, 1.0 - direct / total, np.nan)
     return Truth(
@@ -131,34 +130,6 @@ def true_image(
         lit=surfaces.seen[0] & inside,
         indirect=np.clip(indirect, 0.0, 1.0).astype(np.float32),
     )
-
-
-def true_images(
-    simulated: SimulatedSensor, scene: Scene, world_from_sensor: Transform, *, samples: int, depth: int, seed: int
-) -> dict[str, Truth]:
-    """Return the ground truth of every camera by name.
-
-    The share of indirect light follows paths of at least three surfaces, also where a capture has direct light alone.
-
-    Parameters
-    ----------
-    simulated
-        Sensor, prepared.
-    scene
-        Scene that it sees.
-    world_from_sensor
-        Pose of the sensor.
-    samples, depth, seed
-        As for :func:`true_image`.
-
-    See Also
-    --------
-    true_image : a single camera
-    """
-    return {
-        name: true_image(simulated, scene, world_from_sensor, name, samples=samples, depth=max(depth, 3), seed=seed)
-        for name in simulated.sensor.rig.cameras
-    }
 
 
 def encode_exr(truth: Truth) -> bytes:

@@ -62,7 +62,7 @@ def wave_in_words(lines: CodeLines, axis: Axis) -> str:
         stated = tried(lines)
         if stated.faults < _BETTER:
             return ""
-        variants = {change: replace(lines, code=with_change(code, size, axis, change)) for change in CHANGES}
+        variants = {change: replace(lines, code=_with_change(code, size, axis, change)) for change in CHANGES}
         trials = {change: tried(variant) for change, variant in variants.items()}
     except InputError:
         return ""
@@ -127,20 +127,8 @@ def has_jump(values: Floats, lit: NDArray[np.bool_], extent: int) -> NDArray[np.
     return np.asarray(jump.any(axis=1))
 
 
-def with_change(code: LightCode, size: tuple[int, int], axis: Axis, change: FringeChange) -> ImageSequence:
-    """Return the code as a sequence in which the fringes of an axis have another description.
-
-    Parameters
-    ----------
-    code
-        Code with fringes along the axis.
-    size
-        (width, height) of the projector [px].
-    axis
-        Axis of the projector.
-    change
-        Change of the shifts of the fringes.
-    """
+def _with_change(code: LightCode, size: tuple[int, int], axis: Axis, change: FringeChange) -> ImageSequence:
+    """Return the code as a sequence in which the fringes of an axis have another description."""
     every = described(code, roles(code, *size), axis)
     changed = [
         FringeImages(

@@ -148,28 +148,6 @@ def harmonic_ratio(gamma: float, mean: float, contrast: float) -> float:
     return float((light @ np.cos(2 * phi)) / (light @ np.cos(phi)))
 
 
-def phase_error(gamma: float, steps: int, mean: float, contrast: float) -> NDArray[np.float64]:
-    """Return the error of the N-step phase [rad] by gamma, at ``_SAMPLES`` equidistant true phases from 0 on.
-
-    Parameters
-    ----------
-    gamma
-        Exponent of the projector.
-    steps
-        Number N of equidistant steps.
-    mean, contrast
-        Of the projected cosine [1].
-
-    See Also
-    --------
-    correct_phase : phases without this error
-    """
-    phi = 2 * np.pi * np.arange(_SAMPLES) / _SAMPLES
-    delta = 2 * np.pi * np.arange(steps) / steps
-    light = np.maximum(mean + contrast * np.cos(phi[:, None] - delta), 0) ** gamma
-    return np.asarray(np.angle((light @ np.exp(1j * delta)) * np.exp(-1j * phi)))
-
-
 def correct_phase(
     phase: NDArray[np.float32], gamma: float, steps: int, mean: float, contrast: float
 ) -> NDArray[np.float32]:
@@ -185,12 +163,10 @@ def correct_phase(
         Number of equidistant steps.
     mean, contrast
         Of the projected cosine [1].
-
-    See Also
-    --------
-    phase_error : the error
     """
     true = 2 * np.pi * np.arange(_SAMPLES) / _SAMPLES
-    error = phase_error(gamma, steps, mean, contrast)
+    delta = 2 * np.pi * np.arange(steps) / steps
+    light = np.maximum(mean + contrast * np.cos(true[:, None] - delta), 0) ** gamma
+    error = np.angle((light @ np.exp(1j * delta)) * np.exp(-1j * true))
     # interpolated over the measured phase, not over the true one
     return np.asarray(phase - np.interp(phase, true + error, error, period=2 * np.pi)).astype(np.float32)

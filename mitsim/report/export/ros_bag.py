@@ -57,22 +57,12 @@ def write_mcap(clouds: Sequence[Stamped], path: str | Path) -> None:
                 transforms = [_transform(store, name, pose) for name, pose in poses.items()]
                 write("/tf_static", _message(store, "tf2_msgs/msg/TFMessage", transforms), 1, _latched(interfaces))
             for second, cloud in enumerate(clouds, 1):
-                write(cloud.topic, cloud_message(store, cloud.points.in_metres(), cloud.frame, second), second)
+                write(cloud.topic, _cloud_message(store, cloud.points.in_metres(), cloud.frame, second), second)
         (bag / f"{bag.name}.mcap").replace(file)
 
 
-def cloud_message(store: Any, points: CloudPoints, frame: str, second: int) -> Any:
-    """Return ``sensor_msgs/PointCloud2`` of points in metres: unordered, dense.
-
-    Parameters
-    ----------
-    store
-        Types of messages, a ``Typestore`` of rosbags.
-    points, frame
-        Points [m], and the name of their frame.
-    second
-        Time of the message [s].
-    """
+def _cloud_message(store: Any, points: CloudPoints, frame: str, second: int) -> Any:
+    """Return ``sensor_msgs/PointCloud2`` of points in metres: unordered, dense."""
     table = points.table()
     dtype = table.dtype
     fields = [

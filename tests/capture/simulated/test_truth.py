@@ -13,7 +13,7 @@ import mitsim as ms
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.capture.simulated.truth import encode_exr, read_truth, true_image
+from mitsim.capture.simulated.truth import encode_exr, read_truth, true_images
 from mitsim.decoding.matching.stereo import stereo_geometry
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
@@ -39,7 +39,7 @@ def ball_on_a_floor():
 @pytest.fixture(scope="module")
 def ball(n10):
     """Seen by the N10's distorted left camera."""
-    return true_image(SimulatedSensor(n10), ball_on_a_floor(), POSE, "left", samples=16)
+    return true_images(SimulatedSensor(n10), ball_on_a_floor(), POSE, samples=16, depth=3, seed=1)["left"]
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +133,7 @@ def test_truth_is_of_the_camera_as_it_is_and_not_as_it_was_calibrated(n10):
     }
     scene = scene_from_dict({"floor": floor}, 850)
     turned = replace(n10, misalignment=MisalignmentTable(row_mrad=5.0))
-    seen = true_image(SimulatedSensor(turned), scene, POSE, "right", samples=1)
+    seen = true_images(SimulatedSensor(turned), scene, POSE, samples=1, depth=3, seed=1)["right"]
     eye = turned.true_rig.cameras["right"]
     directions = POSE.directions(eye.pixel_directions().reshape(-1, 3)).reshape(*seen.distance.shape, 3)
     distance = -POSE.points(eye.centre)[2] / directions[..., 2]
