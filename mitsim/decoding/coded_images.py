@@ -7,6 +7,7 @@ camera that measures. :func:`mitsim.decoding.cloud.capture_cloud` goes on to the
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -21,13 +22,13 @@ from mitsim.capture.decoding import Settings
 from mitsim.decoding.cloud import capture_cloud
 from mitsim.decoding.decoder_registry import Coordinates, Geometry, projector_size
 from mitsim.decoding.grey_levels import MeasuredNoise
-from mitsim.decoding.noise import fringe_noise
 from mitsim.decoding.structured_light.decoder import decode_coordinates
+from mitsim.decoding.structured_light.measured_noise import measured_noise
 from mitsim.decoding.structured_light.projector_coordinate import ProjectorCoordinate
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis
 from mitsim.sensor.imager import Imager
-from mitsim.sensor.light_code import LightCode, roles
+from mitsim.sensor.light_code import GrayCode, LightCode, roles
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ class CodedImages:
         stacks = {name: stack[:count] for name, stack in list(capture.images.items())[:cameras]}
         if len(stacks) < cameras or any(len(stack) < count for stack in stacks.values()):
             return None
-        noise = fringe_noise(capture.images, code, size, full_scale) if imager is None else imager
+        noise = _fringe_noise(capture.images, code, size, full_scale) if imager is None else imager
         return cls(stacks, code, size, settings, full_scale, noise, stated.read_out)
 
     @cached_property
@@ -129,3 +130,14 @@ def decoded_once(
         return capture_cloud(capture, settings, geometry, imager=imager), None, imager
     cloud = capture_cloud(capture, settings, geometry, imager=images.noise, coordinates=images.coordinates)
     return cloud, images, images.noise
+
+
+def _fringe_noise(
+    images: Mapping[str, NDArray[np.unsignedinteger[Any]]], code: LightCode, size: tuple[int, int], full_scale: float
+) -> MeasuredNoise | None:
+    """Return the noise that the images of each camera show, None if it cannot be measured."""
+    if isinstance(code, GrayCode):
+        return None
+    image_roles = roles(code, *size)
+    stacks = [stack[: len(image_roles)] for stack in images.values() if len(stack) >= len(image_roles)]
+    return measured_noise(stacks, image_roles, full_scale) if stacks else None

@@ -1,4 +1,4 @@
-"""Determine the noise of a capture's grey levels, and describe where the sigma of its points comes from.
+"""Describe where the sigma of the points of structured light comes from.
 
 With a complete ``[imager]``, sigma follows from its gain and read noise. Without one, fringes show their noise
 themselves (:mod:`mitsim.decoding.structured_light.measured_noise`). A Gray code has the error of a stripe's width.
@@ -6,41 +6,13 @@ themselves (:mod:`mitsim.decoding.structured_light.measured_noise`). A Gray code
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.decoding.grey_levels import MeasuredNoise
-from mitsim.decoding.structured_light.measured_noise import measured_noise
 from mitsim.sensor.imager import Imager
-from mitsim.sensor.light_code import GrayCode, LightCode, axes, has_fringes, roles
-
-
-def fringe_noise(
-    images: Mapping[str, NDArray[np.unsignedinteger[Any]]], code: LightCode, size: tuple[int, int], full_scale: float
-) -> MeasuredNoise | None:
-    """Return the noise that the images of each camera show, None if it cannot be measured.
-
-    Parameters
-    ----------
-    images
-        (P, H, W) [DN] by camera.
-    code
-        Code of the images.
-    size
-        (width, height) of the projector [px].
-    full_scale
-        Value of a saturated pixel [DN].
-    """
-    if isinstance(code, GrayCode):
-        return None
-    image_roles = roles(code, *size)
-    stacks = [stack[: len(image_roles)] for stack in images.values() if len(stack) >= len(image_roles)]
-    return measured_noise(stacks, image_roles, full_scale) if stacks else None
+from mitsim.sensor.light_code import LightCode, axes, has_fringes
 
 
 def sigma_source(capture: Capture, cloud: PointCloud, noise: Imager | MeasuredNoise | None) -> str:

@@ -21,11 +21,10 @@ from characterisation.region_of_interest import Roi
 from mitsim.capture.simulated.indirect_light import Smoothing
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.scene.light_transport.ambient import has_emitters
 from mitsim.scene.light_transport.kept_paths import CandidatePaths, KeptPaths, broad, mattering
 from mitsim.scene.light_transport.kept_tracing import camera_paths, photon_paths
 from mitsim.scene.light_transport.kept_walks import Tracing
-from mitsim.scene.light_transport.plain_scene import distinct_bsdfs
+from mitsim.scene.light_transport.plain_scene import distinct_bsdfs, has_emitters
 from mitsim.scene.load import Scene, bsdf_of
 from mitsim.scene.ray_casting.raycast import shapes_met
 from mitsim.scene.turned_lay import is_turned

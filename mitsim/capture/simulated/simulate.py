@@ -38,9 +38,8 @@ from mitsim.capture.simulated.lens_blur import blur_by_lens
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.room_image import room_image
 from mitsim.capture.simulated.surface_speckle import draw_speckle
-from mitsim.scene.light_transport.ambient import has_emitters
 from mitsim.scene.light_transport.light_paths import LightPaths
-from mitsim.scene.light_transport.plain_scene import single_plane
+from mitsim.scene.light_transport.plain_scene import has_emitters, single_plane
 from mitsim.scene.light_transport.projector_light import ModulatedLight, ProjectedLight, ProjectedPatterns
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import Scene

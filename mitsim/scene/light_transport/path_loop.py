@@ -10,6 +10,11 @@ bounces use the same loop: a lane whose path has ended starts its next sample.
 Direct light from the projector is free of noise, which could be mistaken for the sensor's. The positions inside a pixel
 form a raster, and those in the two apertures are a fixed set. The remaining error is that of a quadrature rule, the
 same in every capture of a pose.
+
+Light from the emitters that the author of a scene added (lamps, windows, a sky) is the same in all images of a capture,
+whatever the projector shows. Two methods estimate it: sampling an emitter, and following the BSDF until it meets one.
+The balance heuristic (Veach and Guibas, SIGGRAPH 1995) weights them. Without it, either a small lamp over a matt face
+or a large window in a glossy one would be noisy.
 """
 
 from __future__ import annotations
@@ -24,17 +29,25 @@ from numpy.typing import NDArray
 from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import opaque, opaque_index, to_device
-from mitsim.scene.light_transport.ambient import ALONE, has_emitters, hit_emitter_light, sampled_emitter_light
 from mitsim.scene.light_transport.aperture_samples import aperture_samples
 from mitsim.scene.light_transport.kept_walks import density_to_camera
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.low_discrepancy import r3_point, z_order
-from mitsim.scene.light_transport.plain_scene import SceneBsdfs, intersect_plane, single_bsdf, single_plane
+from mitsim.scene.light_transport.plain_scene import (
+    SceneBsdfs,
+    has_emitters,
+    intersect_plane,
+    single_bsdf,
+    single_plane,
+)
 from mitsim.scene.light_transport.projector_light import ProjectedLight, ProjectorLight
 from mitsim.scene.load import Scene, bounds_of
 from mitsim.scene.ray_casting.camera_rays import CameraRays, bilinear, pixel_area
 from mitsim.scene.ray_casting.eye import Eye
 from mitsim.sensor.transforms import Transform
+
+#: in place of a density, of a ray whose direction no other estimate finds: from the camera, or mirrored
+_ALONE = -1.0
 
 #: largest ratio of densities, so that it stays finite
 _LARGEST_RATIO = 1e30
@@ -134,7 +147,7 @@ def launch(
         ray = mi.Ray3f(origin, direction)
         surface = scene.mitsuba.ray_intersect(ray) if plane is None else intersect_plane(plane, ray)
         if has_ambient:
-            ambient = weight * hit_emitter_light(scene, surface, origin, dr.select(at_first, ALONE, pdf))
+            ambient = weight * _hit_emitter_light(scene, surface, origin, dr.select(at_first, _ALONE, pdf))
             if paths.indirect_only:  # an emitter behind the first surface is its direct light
                 ambient = dr.select(bounce > 1, ambient, 0.0)
         hit = surface.is_valid() & (bounce < surfaces)
@@ -162,7 +175,7 @@ def launch(
         added = [dr.select(radiance > 0, radiance * value, 0.0) for value in values]
         if has_ambient:
             ambient += dr.select(
-                contributes, weight * sampled_emitter_light(scene, surface, bsdf, random, contributes), 0.0
+                contributes, weight * _sampled_emitter_light(scene, surface, bsdf, random, contributes), 0.0
             )
         sums = [s + a for s, a in zip(sums, [*added, ambient if has_ambient else 0.0], strict=True)]
 
@@ -177,7 +190,7 @@ def launch(
         continues &= bsdf_weight[0] > 0
         is_delta = mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Delta)
         # no other estimate finds an emitter that a mirror shows
-        direction_pdf = dr.select(is_delta, ALONE, sampled.pdf) if has_ambient else sampled.pdf
+        direction_pdf = dr.select(is_delta, _ALONE, sampled.pdf) if has_ambient else sampled.pdf
         next_ray = surface.spawn_ray(surface.to_world(sampled.wo))
         if photons:  # photons end at a delta lobe
             reverse_density = dr.select(
@@ -217,7 +230,7 @@ class _PathState:
     origin: Any
     direction: Any
     weight: Any  # of the light of the next ray
-    pdf: Any  # density of its direction [1/sr]; with emitters, ALONE after a delta lobe
+    pdf: Any  # density of its direction [1/sr]; with emitters, _ALONE after a delta lobe
     length: Any  # optical length so far [mm]
     ratio: Any  # n_L p_L / (n_C p_C) so far, of photons over camera paths
     random: Any
@@ -250,3 +263,30 @@ def _displacement(shift: NDArray[np.floating], camera: Eye, index: Any) -> Any:
     along = to_device(np.ravel(shift))
     below = index + opaque_index(shift[0].size)
     return camera.axes[0] * dr.gather(mi.Float, along, index) + camera.axes[1] * dr.gather(mi.Float, along, below)
+
+
+def _sampled_emitter_light(scene: Scene, surface: Any, bsdf: Any, random: Any, active: Any) -> Any:
+    """Return the reflected radiance of one emitter, chosen at random [W / (mm^2 sr)]."""
+    point = mi.Point2f(random.next_float32(), random.next_float32())
+    sample, weight = scene.mitsuba.sample_emitter_direction(surface, point, True, active)
+    usable = active & (sample.pdf != 0.0)
+    toward = surface.to_local(sample.d)
+    reflected, pdf = bsdf.eval_pdf(mi.BSDFContext(), surface, toward, usable)
+    heuristic = dr.select(sample.delta, 1.0, sample.pdf / (sample.pdf + pdf))
+    return dr.select(usable, reflected[0] * weight[0] * heuristic, 0.0)
+
+
+def _hit_emitter_light(scene: Scene, surface: Any, origin: Any, pdf: Any) -> Any:
+    """Return the weighted radiance of an emitter that a ray meets [W / (mm^2 sr)].
+
+    ``pdf`` is the density of the ray's direction at its ``origin`` [1/sr], or :data:`_ALONE` for the weight 1.
+    """
+    emitter = surface.emitter(scene.mitsuba)
+    emitted = emitter.eval(surface)[0]
+    reference = dr.zeros(mi.Interaction3f)
+    reference.p = origin
+    sample = mi.DirectionSample3f(scene.mitsuba, surface, reference)
+    alone = pdf < 0
+    emitter_pdf = scene.mitsuba.pdf_emitter_direction(reference, sample, ~alone)
+    heuristic = dr.select(alone, 1.0, pdf / (pdf + emitter_pdf))
+    return dr.select(emitted > 0, emitted * heuristic, 0.0)

@@ -18,8 +18,12 @@ from typing import Any
 import numpy as np
 
 from mitsim.scene.backend import dr, mi
-from mitsim.scene.light_transport.ambient import has_emitters
 from mitsim.scene.load import Scene
+
+
+def has_emitters(scene: Scene) -> bool:
+    """Whether the scene has emitters of its own."""
+    return len(scene.mitsuba.emitters()) > 0
 
 
 def single_plane(scene: Scene) -> Any | None:

@@ -7,7 +7,7 @@ code on the camera's paths (:mod:`mitsim.scene.light_transport.path_loop`) -> im
 The code of an image is a function of (u, v) or of the optical length L
 (:mod:`mitsim.scene.light_transport.projector_light`). All images of a capture are therefore evaluated on the same
 paths. Photons from the projector carry a part of their light, on paths that are rarely found from the camera. Emitters
-of the scene add the same light to all images (:mod:`mitsim.scene.light_transport.ambient`). ``jitter`` draws the
+of the scene add the same light to all images (:mod:`mitsim.scene.light_transport.path_loop`). ``jitter`` draws the
 positions in pixels and lenses at random, for comparison with other renderers.
 
 Radiometry: code value x plane irradiance E_1 [W] -> radiance [W / (mm^2 sr)], see :mod:`mitsim.sensor.projector`.

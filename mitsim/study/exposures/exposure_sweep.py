@@ -32,7 +32,7 @@ from characterisation.features.surfaces import GRAZING_COSINE, Surface
 from characterisation.files.arrays import Floats
 from characterisation.point_cloud import PointCloud, Status
 from characterisation.tasks.task_file import Task
-from mitsim.scene.light_transport.ambient import has_emitters
+from mitsim.scene.light_transport.plain_scene import has_emitters
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import MINIMUM_POINTS
 from mitsim.study.virtual.rendered import RenderedMeasurements

@@ -24,7 +24,7 @@ from mitsim.capture.calibration import calibration_table
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
 from mitsim.scene.coupons import CouponRecipe, load_sample
-from mitsim.scene.light_transport.ambient import has_emitters
+from mitsim.scene.light_transport.plain_scene import has_emitters
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.sensor import Sensor
 from mitsim.twin.finish.dots import Dots, compare_dots
