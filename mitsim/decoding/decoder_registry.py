@@ -256,8 +256,8 @@ def _structured_light_cloud(
     roi, any_read_out = images.raw_region()
     if not any_read_out:
         return empty_cloud(geometry, images.capture.sensor, images.capture.source)
-    name = images.reference[0]
-    return decode_structured_light(stack, geometry, name, code, settings, images.context(roi), coordinates.get(name))
+    decoded = coordinates.get(images.reference[0])
+    return decode_structured_light(stack, geometry, code, settings, images.context(roi), decoded)
 
 
 def _time_of_flight_geometry(

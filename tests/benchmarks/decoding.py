@@ -119,11 +119,11 @@ def main() -> None:
             lambda: decode_coordinates(deep, PHASE, PROJECTOR, SETTINGS, full_scale=4095),
             1,
         ),
-        "24 phase images, cloud": (lambda: decode_structured_light(phase, geometry, "eye", PHASE, SETTINGS, about), 1),
+        "24 phase images, cloud": (lambda: decode_structured_light(phase, geometry, PHASE, SETTINGS, about), 1),
         "24 phase images, plain numpy, coordinate": (lambda: naive_phase(phase), 1),
         "3 phase images, OpenCV, spatially unwrapped": (opencv_phase(phase), 1),
         "22 Gray images, coordinate": (lambda: decode_coordinates(gray, GRAY, PROJECTOR, SETTINGS, full_scale=255), 1),
-        "22 Gray images, cloud": (lambda: decode_structured_light(gray, geometry, "eye", GRAY, SETTINGS, about), 1),
+        "22 Gray images, cloud": (lambda: decode_structured_light(gray, geometry, GRAY, SETTINGS, about), 1),
         "22 Gray images, plain numpy, coordinate": (lambda: naive_gray(gray), 1),
         "20 Gray images, OpenCV getProjPixel": (opencv_gray_pixels(gray), SHARE**2 / 2),
         "geometry, once for a rig": (

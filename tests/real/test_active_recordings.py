@@ -46,7 +46,7 @@ def rectified_rig(matrix, baseline: float, size, matrix_right=None) -> Rig:
 
 
 def decoded(left, right, rig, settings):
-    return decode_stereo(left, right, rig, settings, ImageContext("recorded", "device", 255))
+    return decode_stereo(left, right, stereo_geometry(rig), settings, ImageContext("recorded", "device", 255))
 
 
 MATCHERS = pytest.mark.parametrize(
@@ -157,7 +157,7 @@ def sheet_cloud(capture, rig):
     settings = MatcherSettings(near_mm=292.3, far_mm=530.3)
     roi = Roi.between(COLUMNS[0], ROWS[0], COLUMNS[1], ROWS[1])
     left, right = capture.images["left"][0], capture.images["right"][0]
-    return decode_stereo(left, right, rig, settings, ImageContext("n35", "device", 255, roi=roi))
+    return decode_stereo(left, right, stereo_geometry(rig), settings, ImageContext("n35", "device", 255, roi=roi))
 
 
 def sheet_sigma(cloud) -> float:

@@ -44,7 +44,7 @@ def sheet(real_data, tmp_path_factory):
     return decode_stereo(
         left,
         right,
-        capture.rig,
+        stereo_geometry(capture.rig),
         settings,
         ImageContext(capture.sensor, capture.source, 2**capture.bits - 1, roi=roi),
     )

@@ -19,7 +19,7 @@ from mitsim.decoding.checks.pair_sanity import row_error_warnings
 from mitsim.decoding.checks.sanity import pair_row_error
 from mitsim.decoding.cloud import capture_cloud, decoder_settings
 from mitsim.decoding.image_context import ImageContext
-from mitsim.decoding.matching.stereo import decode_stereo
+from mitsim.decoding.matching.stereo import decode_stereo, stereo_geometry
 from tests.capture.recordings.test_depthai_files import against_the_package
 
 pytestmark = pytest.mark.real
@@ -165,7 +165,7 @@ def test_an_imported_ensenso_is_the_recording(real_data, tmp_path):
     cloud = capture_cloud(capture, settings, roi=roi)
     left, right = (capture.images[side][0] for side in ("left", "right"))
     context = ImageContext(capture.sensor, "device", 255, roi=roi)
-    expected = decode_stereo(left, right, capture.rig, settings, context)
+    expected = decode_stereo(left, right, stereo_geometry(capture.rig), settings, context)
     np.testing.assert_array_equal(cloud.points, expected.points)
     assert cloud.valid[400:440, 500:560].mean() > 0.99
     assert {file.suffix for file in (tmp_path / "capture" / "vendor").iterdir()} == {".png", ".json"}

@@ -128,7 +128,7 @@ def stereo_geometry(rig: Rig) -> StereoGeometry:
 def decode_stereo(
     left: Raw,
     right: Raw,
-    rig: Rig | StereoGeometry,
+    geometry: StereoGeometry,
     settings: MatcherSettings,
     context: ImageContext,
     *,
@@ -141,8 +141,8 @@ def decode_stereo(
     left, right
         (H, W) or (F, H, W) raw images [DN], uint8 or uint16, of the first and second camera of the rig. Several frames
         show the same scene with different patterns.
-    rig
-        The calibration, or the :func:`stereo_geometry` made from it, which saves computing the maps for each pair.
+    geometry
+        From :func:`stereo_geometry`.
     settings
         Search range and limits of the matcher.
     context
@@ -173,7 +173,6 @@ def decode_stereo(
     --------
     mitsim.decoding.matching.reference_matching.decode_reference : one camera and its projector
     """
-    geometry = rig if isinstance(rig, StereoGeometry) else stereo_geometry(rig)
     grid, rectification = geometry.grid, geometry.rectification
     full_scale, roi, read_out = context.full_scale, context.roi, context.read_out
     left, right = (image[None] if image.ndim == 2 else image for image in (left, right))

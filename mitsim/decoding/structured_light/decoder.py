@@ -28,7 +28,6 @@ from mitsim.decoding.image_context import ImageContext
 from mitsim.decoding.structured_light.geometry import (
     StructuredLightGeometry,
     exact_inverse_depth,
-    structured_light_geometry,
 )
 from mitsim.decoding.structured_light.gray_code import (
     STRIPE_IMAGES,
@@ -41,7 +40,7 @@ from mitsim.decoding.structured_light.gray_code import (
 from mitsim.decoding.structured_light.newton_polynomial import evaluate
 from mitsim.decoding.structured_light.phase_shift import Fringes, decode_fringes
 from mitsim.decoding.structured_light.projector_coordinate import ProjectorCoordinate
-from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.camera import Camera
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis
 from mitsim.sensor.imager import Imager
@@ -136,8 +135,7 @@ def decode_coordinates(  # noqa: PLR0913 - options, all by name
 
 def decode_structured_light(
     stack: NDArray[np.generic],
-    rig: Rig | StructuredLightGeometry,
-    camera_name: str,
+    geometry: StructuredLightGeometry,
     code: LightCode,
     settings: DecoderSettings,
     context: ImageContext,
@@ -149,11 +147,8 @@ def decode_structured_light(
     ----------
     stack
         (P, H, W) raw images [DN], uint8, uint16 or floats, in the order of :func:`mitsim.sensor.light_code.roles`.
-    rig
-        The calibration, or the :func:`structured_light_geometry` made from it, which saves preparing it for each
-        capture.
-    camera_name
-        Name of the camera in the rig.
+    geometry
+        From :func:`structured_light_geometry`.
     code
         The code of the images.
     settings
@@ -184,21 +179,15 @@ def decode_structured_light(
     --------
     mitsim.decoding.structured_light.two_cameras.decode_structured_light_stereo : two cameras
     """
-    if isinstance(rig, StructuredLightGeometry):
-        geometry = rig
-        if camera_name != geometry.camera_name or geometry.axis not in axes(code):
-            requested = f"camera {camera_name!r}, code along {', '.join(axes(code))}"
-            raise InputError("structured-light geometry", "", requested, f"{geometry.camera_name!r}, {geometry.axis}")
-        if not (geometry.near <= settings.near_mm and settings.far_mm <= geometry.far):
-            requested = f"{settings.near_mm:g} to {settings.far_mm:g} mm"
-            raise InputError(
-                "decoder settings", "near_mm, far_mm", requested, f"{geometry.near:g} to {geometry.far:g} mm"
-            )
-    else:
-        geometry = structured_light_geometry(rig, camera_name, code, settings.near_mm, settings.far_mm)
+    if geometry.axis not in axes(code):
+        raise InputError("structured-light geometry", "", f"code along {', '.join(axes(code))}", geometry.axis)
+    if not (geometry.near <= settings.near_mm and settings.far_mm <= geometry.far):
+        requested = f"{settings.near_mm:g} to {settings.far_mm:g} mm"
+        raise InputError("decoder settings", "near_mm, far_mm", requested, f"{geometry.near:g} to {geometry.far:g} mm")
     camera, projector = geometry.camera, geometry.projector
     if stack.shape[1:] != (camera.height, camera.width):
-        raise InputError(f"images of {camera_name}", "shape", stack.shape, f"(images, {camera.height}, {camera.width})")
+        allowed = f"(images, {camera.height}, {camera.width})"
+        raise InputError(f"images of {geometry.camera_name}", "shape", stack.shape, allowed)
     roi = checked_roi(context.roi, camera.width, camera.height, "decode_structured_light")
     region = roi.slices
     if decoded_before is not None:

@@ -37,10 +37,9 @@ from characterisation.region_of_interest import Roi, checked_roi
 from mitsim.decoding.grid_cloud import cloud_on_grid
 from mitsim.decoding.image_context import ImageContext
 from mitsim.decoding.interpolated import needed_region, was_read_out
-from mitsim.decoding.matching.stereo import StereoGeometry, rectified_roi, stereo_geometry
+from mitsim.decoding.matching.stereo import StereoGeometry, rectified_roi
 from mitsim.decoding.structured_light.decoder import decode_coordinates
 from mitsim.decoding.structured_light.projector_coordinate import ProjectorCoordinate
-from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.light_code import LightCode, axes, has_fringes
 
@@ -55,7 +54,7 @@ LARGEST_STEP = 4.0
 def decode_structured_light_stereo(
     left: NDArray[np.generic],
     right: NDArray[np.generic],
-    rig: Rig | StereoGeometry,
+    geometry: StereoGeometry,
     code: LightCode,
     settings: DecoderSettings,
     projector_size: tuple[int, int],
@@ -68,9 +67,8 @@ def decode_structured_light_stereo(
     left, right
         (P, H, W) raw images [DN] of the first and second camera of the rig, in the order of
         :func:`mitsim.sensor.light_code.roles`.
-    rig
-        The calibration of the cameras, or the geometry made from it by
-        :func:`mitsim.decoding.matching.stereo.stereo_geometry`.
+    geometry
+        From :func:`mitsim.decoding.matching.stereo.stereo_geometry`.
     code, settings
         The code, and range and limits.
     projector_size
@@ -100,7 +98,6 @@ def decode_structured_light_stereo(
     --------
     mitsim.decoding.structured_light.decoder.decode_structured_light : one camera
     """
-    geometry = rig if isinstance(rig, StereoGeometry) else stereo_geometry(rig)
     for name, stack, size in zip(("left", "right"), (left, right), geometry.raw_size, strict=True):
         if stack.shape[1:] != size:
             raise InputError(f"{name} images", "shape", stack.shape, f"(images, {size[0]}, {size[1]})")

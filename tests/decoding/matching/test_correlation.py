@@ -125,7 +125,9 @@ def rig() -> Rig:
 
 def decoded(frames, settings=SETTINGS, **options):
     left, right = (np.rint(each).clip(1, 254).astype(np.uint8) for each in frames)
-    return decode_stereo(left, right, rig(), settings, ImageContext("drawn", "simulated", 255, **options))
+    return decode_stereo(
+        left, right, stereo_geometry(rig()), settings, ImageContext("drawn", "simulated", 255, **options)
+    )
 
 
 def test_a_window_is_a_part_of_the_whole():
@@ -170,9 +172,9 @@ def test_frames_that_do_not_go_together_are_refused():
     left, right = (each.astype(np.uint8) for each in drawn(3, 20.0))
     with pytest.raises(InputError, match="one pair"):
         settings = SETTINGS.model_copy(update={"method": "sgbm"})
-        decode_stereo(left, right, rig(), settings, ImageContext("", "device", 255))
+        decode_stereo(left, right, stereo_geometry(rig()), settings, ImageContext("", "device", 255))
     with pytest.raises(InputError, match="3 left and 2 right"):
-        decode_stereo(left, right[:2], rig(), SETTINGS, ImageContext("", "device", 255))
+        decode_stereo(left, right[:2], stereo_geometry(rig()), SETTINGS, ImageContext("", "device", 255))
 
 
 def test_a_lens_that_bends_so_much_that_opencv_loses_the_middle_is_rectified_all_the_same():

@@ -95,7 +95,8 @@ def pair(rig: Rig, surface: tuple[np.ndarray, float], paint=texture) -> tuple[np
 
 
 def decode(rig, images, settings=SETTINGS, **options):
-    return decode_stereo(*images, rig, settings, ImageContext("drawn", "simulated", 255, **options))
+    geometry = stereo_geometry(rig) if isinstance(rig, Rig) else rig
+    return decode_stereo(*images, geometry, settings, ImageContext("drawn", "simulated", 255, **options))
 
 
 def disparity_error(cloud, rig: Rig, surface: tuple[np.ndarray, float]) -> np.ndarray:
@@ -184,7 +185,7 @@ def test_twelve_bits_give_the_same_disparity_as_eight():
     images = pair(rig, surface)
     deep = [np.rint(image * (4095 / 255)).astype(np.uint16) for image in images]
     a = decode(rig, images)
-    b = decode_stereo(*deep, rig, SETTINGS, ImageContext("drawn", "simulated", 4095))
+    b = decode_stereo(*deep, stereo_geometry(rig), SETTINGS, ImageContext("drawn", "simulated", 4095))
     both = a.valid & b.valid
     assert both.sum() > 0.99 * a.valid.sum()
     assert np.mean(a.points[both] == b.points[both]) > 0.99
@@ -352,7 +353,7 @@ def test_images_of_another_camera_are_refused():
     with pytest.raises(InputError, match="left image: dtype"):
         decode(rig, (left.astype(np.float32), right))
     with pytest.raises(InputError, match="full_scale"):
-        decode_stereo(left, right, rig, SETTINGS, ImageContext("", "simulated", 1023))
+        decode_stereo(left, right, stereo_geometry(rig), SETTINGS, ImageContext("", "simulated", 1023))
 
 
 def test_a_rig_that_is_no_stereo_pair_is_refused():

@@ -18,6 +18,7 @@ from mitsim.capture.decoding import Decoding
 from mitsim.decoding.cloud import capture_cloud
 from mitsim.decoding.grey_levels import MeasuredNoise
 from mitsim.decoding.image_context import ImageContext
+from mitsim.decoding.matching.stereo import stereo_geometry
 from mitsim.decoding.structured_light.decoder import decode_structured_light
 from mitsim.decoding.structured_light.geometry import structured_light_geometry
 from mitsim.decoding.structured_light.two_cameras import decode_structured_light_stereo, find_coordinates
@@ -101,9 +102,15 @@ def draw(rig, points, code, bright=200.0):
 
 
 def decode(stack, rig, code=PHASE, settings=SETTINGS, full_scale=255, **options):
+    """Decode images of a rig, or of a geometry that was made from it."""
+    geometry = geometry_of(rig, code, settings) if isinstance(rig, Rig) else rig
     return decode_structured_light(
-        stack, rig, "eye", code, settings, ImageContext("drawn", "simulated", full_scale, **options)
+        stack, geometry, code, settings, ImageContext("drawn", "simulated", full_scale, **options)
     )
+
+
+def geometry_of(rig, code, settings):
+    return structured_light_geometry(rig, "eye", code, settings.near_mm, settings.far_mm)
 
 
 def sphere_through(points):
@@ -273,20 +280,18 @@ DISTORTED_GRID = structured_light_geometry(distorted_rig(), "eye", PHASE, 400, 9
     [
         ({"stack": np.zeros((24, 5, 5), np.uint8)}, "images of eye"),
         ({"stack": np.zeros((23, HEIGHT, WIDTH), np.uint8)}, "image stack"),
-        ({"camera_name": "eyes"}, "did you mean 'eye'"),
-        ({"rig": replace(distorted_rig(), projector=None)}, "projector"),
         ({"context": ImageContext("drawn", "simulated", 0)}, "full_scale"),
         (
             {
                 "settings": DecoderSettings(near_mm=300, far_mm=900),
-                "rig": structured_light_geometry(distorted_rig(), "eye", PHASE, 400, 900),
+                "geometry": structured_light_geometry(distorted_rig(), "eye", PHASE, 400, 900),
             },
             "near_mm",
         ),
         (
             {
                 "code": PhaseShift(periods_px=[340, 60, 12], steps=8, axis="rows"),
-                "rig": structured_light_geometry(distorted_rig(), "eye", PHASE, 400, 900),
+                "geometry": structured_light_geometry(distorted_rig(), "eye", PHASE, 400, 900),
             },
             "code along rows",
         ),
@@ -296,14 +301,20 @@ DISTORTED_GRID = structured_light_geometry(distorted_rig(), "eye", PHASE, 400, 9
 def test_what_does_not_fit_together_is_refused(change, message):
     given = {
         "stack": np.zeros((24, HEIGHT, WIDTH), np.uint8),
-        "rig": distorted_rig(),
-        "camera_name": "eye",
+        "geometry": geometry_of(distorted_rig(), PHASE, SETTINGS),
         "code": PHASE,
         "settings": SETTINGS,
         "context": ImageContext("drawn", "simulated", 255),
     } | change
     with pytest.raises(InputError, match=message):
         decode_structured_light(**given)
+
+
+def test_a_rig_without_the_camera_or_a_projector_is_refused():
+    with pytest.raises(InputError, match="did you mean 'eye'"):
+        structured_light_geometry(distorted_rig(), "eyes", PHASE, 400, 900)
+    with pytest.raises(InputError, match="projector"):
+        structured_light_geometry(replace(distorted_rig(), projector=None), "eye", PHASE, 400, 900)
 
 
 def test_a_code_that_runs_across_the_baseline_is_refused():
@@ -340,7 +351,7 @@ def test_two_cameras_measure_without_the_projectors_calibration(code):
     stacks = both_stacks(rig, see_plane, code)
     cloud = decode_structured_light_stereo(
         *stacks,
-        replace(rig, projector=None),
+        stereo_geometry(replace(rig, projector=None)),
         code,
         SETTINGS,
         (320, 200),
@@ -434,7 +445,7 @@ def test_two_cameras_measure_a_sphere_but_for_the_chords_of_linear_interpolation
     for each in (rig, replace(rig, cameras={name: finer(eye) for name, eye in rig.cameras.items()})):
         cloud = decode_structured_light_stereo(
             *both_stacks(each, see_sphere, PHASE),
-            each,
+            stereo_geometry(each),
             PHASE,
             SETTINGS,
             (320, 200),
@@ -456,7 +467,7 @@ def test_what_the_right_camera_does_not_see_is_hidden():
     cloud = decode_structured_light_stereo(
         left,
         right,
-        rig,
+        stereo_geometry(rig),
         PHASE,
         SETTINGS,
         (320, 200),
@@ -472,7 +483,7 @@ def test_a_code_along_the_rows_is_no_use_to_cameras_side_by_side():
         decode_structured_light_stereo(
             np.zeros((24, HEIGHT, WIDTH)),
             np.zeros((24, HEIGHT, WIDTH)),
-            rig,
+            stereo_geometry(rig),
             code,
             SETTINGS,
             (320, 200),
@@ -495,7 +506,7 @@ def test_a_strongly_distorted_projector_is_decoded_where_its_rays_are_unique(bea
     stack = images_seen(code, eye, lit, points, noise=0.3)
     settings = DecoderSettings(near_mm=range_mm[0], far_mm=range_mm[1])
     context = ImageContext(full_scale=255, sensor="rig", source="device", imager=None)
-    cloud = decode_structured_light(stack, Rig({"eye": eye}, lit), "eye", code, settings, context)
+    cloud = decode_structured_light(stack, geometry_of(Rig({"eye": eye}, lit), code, settings), code, settings, context)
     off = np.linalg.norm(cloud.points - points, axis=-1)[cloud.valid]
     place = lit.project(points)
     with np.errstate(invalid="ignore"):
@@ -522,7 +533,7 @@ def test_pixels_beyond_the_fold_of_the_camera_are_left_out_with_their_reason():
     stack = images_seen(code, eye, lit, shown, noise=0.3)
     context = ImageContext(full_scale=255, sensor="rig", source="device", imager=None)
     settings = DecoderSettings(near_mm=300, far_mm=800)
-    cloud = decode_structured_light(stack, Rig({"eye": eye}, lit), "eye", code, settings, context)
+    cloud = decode_structured_light(stack, geometry_of(Rig({"eye": eye}, lit), code, settings), code, settings, context)
     assert (cloud.status[radius > 98] == Status.UNCALIBRATED).all()
     assert not (cloud.status[radius < 97] == Status.UNCALIBRATED).any()
     assert not cloud.valid[radius > 98].any()
