@@ -302,14 +302,19 @@ def _other_orders(image_roles: list[Role], axis: Axis) -> Iterator[tuple[str, li
     bits = [index for kind, index in indices if kind == "gray"]
     inverse = ("gray_inverse", 0) in indices
 
-    def exchanged(reverse: bool, complement: bool) -> list[int]:
+    def moved(places: Iterable[int], sources: Iterable[int]) -> list[int]:
         order = list(plain)
-        for (kind, index), at in indices.items():
-            if kind == "phase":
-                continue
-            other: Kind = ("gray_inverse" if kind == "gray" else "gray") if complement else kind
-            order[at] = indices[other, len(bits) - 1 - index if reverse else index]
+        for at, source in zip(places, sources, strict=True):
+            order[at] = source
         return order
+
+    def exchanged(reverse: bool, complement: bool) -> list[int]:
+        sources = {}
+        for (kind, index), at in indices.items():
+            if kind != "phase":
+                other: Kind = ("gray_inverse" if kind == "gray" else "gray") if complement else kind
+                sources[at] = indices[other, len(bits) - 1 - index if reverse else index]
+        return moved(sources, sources.values())
 
     if bits:
         yield (
@@ -325,26 +330,15 @@ def _other_orders(image_roles: list[Role], axis: Axis) -> Iterator[tuple[str, li
         grays = sorted(at for (kind, _), at in indices.items() if kind != "phase")
         half = len(grays) // 2
         interleaved = [at for pair in zip(grays[:half], grays[half:], strict=True) for at in pair]
-        apart = list(plain)
-        for at, source in zip(grays, interleaved, strict=True):
-            apart[at] = source
-        yield 'the complements are in another order: change inverse between "each" and "all"', apart
-        back = list(plain)
-        for at, source in zip(grays, grays[::2] + grays[1::2], strict=True):
-            back[at] = source
-        yield 'the complements are in another order: change inverse between "each" and "all"', back
-    phases = [
-        (index, at)
-        for at, role in enumerate(image_roles)
-        if role.kind == "phase" and role.axis == axis
-        for index in [role.index]
-    ]
+        for sources in (interleaved, grays[::2] + grays[1::2]):
+            yield 'the complements are in another order: change inverse between "each" and "all"', moved(grays, sources)
+    phases: dict[int, list[int]] = {}
+    for at, role in enumerate(image_roles):
+        if role.kind == "phase" and role.axis == axis:
+            phases.setdefault(role.index, []).append(at)
     if phases:
-        turned = list(plain)
-        for index in {index for index, _ in phases}:
-            positions = [at for number, at in phases if number == index]
-            for at, source in zip(positions, positions[::-1], strict=True):
-                turned[at] = source
+        places = [at for same in phases.values() for at in same]
+        turned = moved(places, [at for same in phases.values() for at in same[::-1]])
         yield "the fringes move in the other direction: reverse the shifts", turned
     yield "the first image is not listed in [pattern]", [*plain[1:], plain[0]]
     yield "the first image of [pattern] is missing", [plain[-1], *plain[:-1]]
