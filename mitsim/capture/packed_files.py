@@ -45,12 +45,8 @@ def packed(
 
     Parameters
     ----------
-    capture
-        Capture to write.
-    folder
-        Folder that messages name.
-    vendor
-        The maker's files by name.
+    capture, folder, vendor
+        Capture to write, folder that messages name, and the maker's files by name.
     truth
         OpenEXR images by camera.
 
@@ -146,12 +142,8 @@ def check_image(
     ----------
     image
         (H, W) [DN].
-    frames
-        Earlier images of the camera.
-    bits
-        Bits of a grey level.
-    where
-        File that messages name.
+    frames, bits, where
+        Earlier images of the camera, bits of a grey level, and file that messages name.
 
     Raises
     ------

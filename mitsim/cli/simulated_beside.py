@@ -44,12 +44,8 @@ def beside_simulated(
 
     Parameters
     ----------
-    input_cloud
-        The recorded cloud.
-    targets
-        Planes and spheres by name.
-    sensor
-        Preset or sensor file to simulate.
+    input_cloud, targets, sensor
+        The recorded cloud, planes and spheres by name, and preset or sensor file to simulate.
     figures
         Function that states the figures of a target.
     seed

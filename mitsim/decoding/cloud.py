@@ -148,10 +148,8 @@ def settings_in_words(
 
     Parameters
     ----------
-    capture
-        Capture to decode.
-    settings
-        Settings of its decoder.
+    capture, settings
+        Capture to decode, and settings of its decoder.
     sensor
         Sensor that the user names, as for :func:`decoder_settings`.
     range_mm

@@ -157,10 +157,8 @@ def roi_of_other_grid(grid: ViewGrid, other: ViewGrid, roi: Roi, near_mm: float,
 
     Parameters
     ----------
-    grid
-        Grid of the region.
-    other
-        Grid of the result.
+    grid, other
+        Grid of the region, and grid of the result.
     roi
         Region of ``grid``.
     near_mm, far_mm

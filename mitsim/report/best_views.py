@@ -33,12 +33,8 @@ def best_views(scores: xr.Dataset, measurement: str, count: int, shapes: Sequenc
 
     Parameters
     ----------
-    scores
-        Scores of all views.
-    measurement
-        Name of the measurement.
-    count
-        Largest number of views.
+    scores, measurement, count
+        Scores of all views, name of the measurement, and largest number of views.
     shapes
         Names of the shapes that the measurement depends on.
     """

@@ -107,10 +107,8 @@ def colour_scale(figure: Figure, shown: Any, axes: Any, label: str, **options: A
     ----------
     figure, axes
         The figure, and the axes beside which the scale lies.
-    shown
-        Image or other artist with the colours.
-    label
-        Quantity and unit.
+    shown, label
+        Image or other artist with the colours, and quantity and unit.
     options
         Further arguments of :meth:`matplotlib.figure.Figure.colorbar`.
     """

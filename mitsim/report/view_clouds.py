@@ -110,10 +110,8 @@ def shown_cloud(cloud: PointCloud, part_from_sensor: Floats, features: Sequence[
     ----------
     cloud, part_from_sensor
         The cloud, and the pose of its sensor, (4, 4) [mm].
-    features
-        Names of the features of the task.
-    most
-        Largest number of points.
+    features, most
+        Names of the features of the task, and largest number of points.
 
     See Also
     --------

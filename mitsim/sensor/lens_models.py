@@ -79,12 +79,8 @@ def lens_model(
 
     Parameters
     ----------
-    table
-        Table of the calibration file.
-    where
-        File that messages name.
-    model
-        Model that the sensor file gives.
+    table, where, model
+        Table of the calibration file, file that messages name, and model that the sensor file gives.
     straight
         Whether all coefficients are zero, so that the distortion model does not matter.
 

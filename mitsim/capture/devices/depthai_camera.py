@@ -224,10 +224,8 @@ def aligned(
         Queues of frames by name.
     timeout_s
         Longest time to wait [s].
-    where
-        Name of the camera in messages.
-    first
-        Least sequence number.
+    where, first
+        Name of the camera in messages, and least sequence number.
     now
         Returns the time [s].
 
@@ -266,10 +264,8 @@ def fault_of(error: BaseException, dai: Any, where: str, operation: str) -> Base
         Caught error.
     dai
         The package ``depthai``.
-    where
-        Name of the camera in messages.
-    operation
-        Operation that failed.
+    where, operation
+        Name of the camera in messages, and operation that failed.
     """
     if isinstance(error, DeviceError) or not isinstance(error, RuntimeError):
         return error

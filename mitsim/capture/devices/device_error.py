@@ -38,10 +38,8 @@ def check_open(where: str, operation: str, closed: bool, fault: str, again: str 
 
     Parameters
     ----------
-    where
-        Name of the device in messages.
-    operation
-        Operation that is requested.
+    where, operation
+        Name of the device in messages, and operation that is requested.
     closed
         Whether the device was closed.
     fault

@@ -92,10 +92,8 @@ def fault_of(error: BaseException, nxlib: Any, where: str, operation: str, seria
         Caught error.
     nxlib
         The package ``ensenso_nxlib``.
-    where
-        Name of the camera in messages.
-    operation
-        Operation that failed.
+    where, operation
+        Name of the camera in messages, and operation that failed.
     serials
         Serial numbers of the cameras that NxLib lists.
     """

@@ -22,10 +22,8 @@ def parsed_json(
 
     Parameters
     ----------
-    data
-        The text.
-    where
-        File that messages name.
+    data, where
+        The text, and file that messages name.
     expected
         What it should be, for messages.
     constant

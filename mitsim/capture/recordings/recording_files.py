@@ -166,10 +166,8 @@ def chosen_frame(frame: int | None, count: int, where: Path, label: str) -> int:
     ----------
     frame
         Number of the frame, None if none was chosen.
-    count
-        Number of frames.
-    where
-        File that messages name.
+    count, where
+        Number of frames, and file that messages name.
     label
         Name of the frames in messages, in the plural.
 

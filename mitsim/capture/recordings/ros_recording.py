@@ -219,10 +219,8 @@ def read_ros_pair(
         Number of the left message, from 0; required if there are several.
     calibration
         Of both cameras; by default the ``camera_info`` of both topics.
-    channel
-        Channel of colour images.
-    sensor
-        Name of the sensor.
+    channel, sensor
+        Channel of colour images, and name of the sensor.
 
     Raises
     ------

@@ -139,10 +139,8 @@ def pair_capture(
         Images (H, W) [DN] by name of their camera, the left one first.
     places
         File or topic of each, for messages.
-    calibrated
-        The cameras.
-    settings
-        Records of the import.
+    calibrated, settings
+        The cameras, and records of the import.
     sensor
         Name of the sensor; by default that of the calibration, or ``stereo-pair``.
 

@@ -150,12 +150,8 @@ def expose_camera(
         Sensor with the imager and the pattern.
     light
         Light on the imagers, with exposures and the sources of noise that are on.
-    camera
-        Name of the camera.
-    patterns
-        Fixed patterns of the camera's imager.
-    stream
-        Seed of the noise.
+    camera, patterns, stream
+        Name of the camera, fixed patterns of the camera's imager, and seed of the noise.
 
     See Also
     --------

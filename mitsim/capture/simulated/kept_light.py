@@ -79,10 +79,8 @@ def keep_light(
     ----------
     simulated, scene, world_from_sensor
         The sensor, the scene in its best estimates, and the pose.
-    rois
-        Region of each camera's image.
-    rendering
-        Numbers of paths and surfaces.
+    rois, rendering
+        Region of each camera's image, and numbers of paths and surfaces.
     finishes
         Finishes that may be drawn, each as the BSDFs of the scene in the order of
         :func:`~mitsim.scene.light_transport.plain_scene.distinct_bsdfs`. Paths are kept by their light in these.

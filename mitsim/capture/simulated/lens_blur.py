@@ -42,10 +42,8 @@ def blur_by_lens(image: NDArray[np.float32], imager: Imager, camera: Camera, roi
         (h, w) radiance of the region.
     imager
         Its blur at the centre and in the corner of the image.
-    camera
-        Camera whose image has the region.
-    roi
-        Region of the camera's image.
+    camera, roi
+        Camera whose image has the region, and region of the camera's image.
     """
     centre, corner = imager.blur_px, imager.corner_blur_px
     if corner is None or corner == centre:

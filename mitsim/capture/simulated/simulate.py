@@ -131,16 +131,10 @@ class SimulatedSensor:
 
         Parameters
         ----------
-        scene
-            Scene to render.
-        world_from_sensor
-            Pose of the sensor.
-        camera
-            Name of the camera.
-        indirect
-            Samples and smoothing of the interreflections.
-        seed
-            Seed of the light paths.
+        scene, world_from_sensor, camera
+            Scene to render, pose of the sensor, and name of the camera.
+        indirect, seed
+            Samples and smoothing of the interreflections, and seed of the light paths.
         depth
             Largest number of surfaces on a light path.
         roi
@@ -177,12 +171,8 @@ class SimulatedSensor:
 
         Parameters
         ----------
-        scene
-            Scene to render.
-        world_from_sensor
-            Pose of the sensor.
-        camera
-            Name of the camera.
+        scene, world_from_sensor, camera
+            Scene to render, pose of the sensor, and name of the camera.
         rendering
             Light paths, and interreflections that are rendered already.
         seed

@@ -92,20 +92,10 @@ def draw_speckle(
 
     Parameters
     ----------
-    scene
-        Scene with the finishes.
-    sensor
-        Sensor with its wavelength and imager.
-    camera
-        Camera that sees the speckle.
-    rays
-        View rays of all its pixels.
-    world_from_sensor
-        Pose of the sensor.
-    roi
-        Region of the image.
-    rng
-        Generator of the draws.
+    scene, sensor, camera
+        Scene with the finishes, sensor with its wavelength and imager, and camera that sees the speckle.
+    rays, world_from_sensor, roi, rng
+        View rays of all its pixels, pose of the sensor, region of the image, and generator of the draws.
     """
     values = _contrasts(scene, sensor, camera, rays.within(roi), world_from_sensor)
     if not np.any(values):

@@ -74,10 +74,8 @@ def true_images(
     ----------
     simulated
         Sensor, prepared.
-    scene
-        Scene that it sees.
-    world_from_sensor
-        Pose of the sensor.
+    scene, world_from_sensor
+        Scene that it sees, and pose of the sensor.
     samples, depth, seed
         Light paths per pixel, surfaces on a light path, and seed, for the share of indirect light.
     """

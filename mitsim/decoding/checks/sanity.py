@@ -103,12 +103,8 @@ def row_error_in_words(capture: Capture, settings: Settings, findings: Findings,
 
     Parameters
     ----------
-    capture
-        Capture that is decoded.
-    settings
-        Settings of its decoder.
-    findings
-        Findings of the checks.
+    capture, settings, findings
+        Capture that is decoded, settings of its decoder, and findings of the checks.
     matched
         Row error of a pair decoded by a matcher, from :func:`pair_row_error` [px].
 

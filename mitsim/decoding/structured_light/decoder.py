@@ -149,10 +149,8 @@ def decode_structured_light(
         (P, H, W) raw images [DN], uint8, uint16 or floats, in the order of :func:`mitsim.sensor.light_code.roles`.
     geometry
         From :func:`structured_light_geometry`.
-    code
-        The code of the images.
-    settings
-        Range and limits.
+    code, settings
+        The code of the images, and range and limits.
     context
         Of the images. Its ``roi`` is a region of the image; ``read_out`` is not used.
     decoded_before

@@ -144,16 +144,12 @@ def interpolated_columns(
 
     Parameters
     ----------
-    coordinate
-        Columns at the centres of their stripes.
-    decoded
-        Stripes of the columns.
+    coordinate, decoded
+        Columns at the centres of their stripes, and stripes of the columns.
     stack
         (P, H, W) images [DN].
-    image_roles
-        Role of each image.
-    coded
-        Code of the columns.
+    image_roles, coded
+        Role of each image, and code of the columns.
 
     See Also
     --------
@@ -185,10 +181,8 @@ def stripe_coordinate(
 
     Parameters
     ----------
-    decoded
-        Stripes of the axis.
-    coded
-        Code of the axis.
+    decoded, coded
+        Stripes of the axis, and code of the axis.
     saturated
         (H, W) whether the pixel is saturated in any image of the code.
     settings

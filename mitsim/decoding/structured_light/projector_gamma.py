@@ -157,10 +157,8 @@ def correct_phase(
     ----------
     phase
         (...) measured phases [rad].
-    gamma
-        Exponent of the projector.
-    steps
-        Number of equidistant steps.
+    gamma, steps
+        Exponent of the projector, and number of equidistant steps.
     mean, contrast
         Of the projected cosine [1].
     """

@@ -73,10 +73,8 @@ def write_dcc(run_results: RunResults, declared: Declaration, issuer: Issuer, pa
     ----------
     run_results, declared
         Results of a run, and their declaration.
-    issuer
-        Who issues the certificate.
-    path
-        File to write.
+    issuer, path
+        Who issues the certificate, and file to write.
 
     See Also
     --------

@@ -145,10 +145,8 @@ def expected_result(name: str, asked: Measurement, stated: StatedMeasurement, vi
     ----------
     name, asked
         The measurement, from the task.
-    stated
-        Its statement.
-    view
-        Number of the stated view.
+    stated, view
+        Its statement, and number of the stated view.
     """
     value = _part_value(asked, stated.errors_of)
     expected, low, high = (

@@ -200,10 +200,8 @@ def mattering(
         Candidates in several parts; whole numbers of surfaces may differ.
     finishes
         For each finish that may be drawn, the BSDFs of the drawn materials.
-    roi
-        Region of the pixels.
-    count
-        Expected number of paths.
+    roi, count
+        Region of the pixels, and expected number of paths.
     seed
         Of the choice.
     """

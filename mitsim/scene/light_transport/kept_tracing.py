@@ -195,10 +195,8 @@ def photon_paths(
     ----------
     scene, rays, projector, pose
         The scene, the camera's rays, the projector, and the pose of the sensor.
-    roi
-        Region of the image that records must reach.
-    tracing
-        Numbers of paths and surfaces.
+    roi, tracing
+        Region of the image that records must reach, and numbers of paths and surfaces.
 
     See Also
     --------

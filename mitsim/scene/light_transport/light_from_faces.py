@@ -73,10 +73,8 @@ def light_from_faces(
         The scene.
     camera, projector
         Camera, of few large pixels, and projector of the sensor.
-    world_from_sensor
-        Pose of the sensor.
-    samples
-        Paths per pixel.
+    world_from_sensor, samples
+        Pose of the sensor, and paths per pixel.
     seed
         Of the paths.
     roi
