@@ -21,17 +21,16 @@ from __future__ import annotations
 import itertools
 import math
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from characterisation.files.errors import InputError
+from characterisation.files.errors import InputError, nearest
 from characterisation.maps.light import Light
 from mitsim.scene.bsdf_descriptions import diffuse_bsdf, gloss_paint_bsdf, metal_bsdf, powder_coat_bsdf
-from mitsim.scene.bsdf_properties import choice, number_within, only_known
 from mitsim.scene.surface.machined import MachinedFace, machined
 from mitsim.scene.surface.measured import HeightMap, Profile, read_height_map, read_profile
 from mitsim.scene.surface.metals import CONSTANTS, refractive_index
@@ -138,14 +137,14 @@ _METAL_KEYS = (
 
 def _machined_metal(props: Any) -> Any:
     where = _where(props)
-    only_known(props, where, _METAL_KEYS.split())
+    _only_known(props, where, _METAL_KEYS.split())
 
     def number(key: str, low: float, high: float, unit: str) -> float | None:
-        return number_within(props, where, key, None, low, high, unit) if key in props else None
+        return _number_within(props, where, key, None, low, high, unit) if key in props else None
 
     face = MachinedFace(
-        metal=choice(props, where, "metal", "aluminium", list(CONSTANTS)),
-        process=choice(props, where, "process", "ground", list(PROCESSES)) if "process" in props else None,
+        metal=_choice(props, where, "metal", "aluminium", list(CONSTANTS)),
+        process=_choice(props, where, "process", "ground", list(PROCESSES)) if "process" in props else None,
         Ra=number("Ra", 0.005, 10.0, "um"),
         Rq=number("Rq", 0.005, 20.0, "um"),
         Rdq=number("Rdq", 0.001, 1.0, ""),
@@ -157,12 +156,12 @@ def _machined_metal(props: Any) -> Any:
         alpha=number("alpha", 0.002, 0.5, ""),
         alpha_u=number("alpha_u", 0.002, 0.5, ""),
         alpha_v=number("alpha_v", 0.002, 0.5, ""),
-        lay=choice(props, where, "lay", "none", ["u", "v", "none"]) if "lay" in props else None,  # type: ignore[arg-type]
+        lay=_choice(props, where, "lay", "none", ["u", "v", "none"]) if "lay" in props else None,  # type: ignore[arg-type]
         nose_radius=number("nose_radius_mm", 0.05, 10.0, "mm"),
-        feed_marks=choice(props, where, "feed_marks", "blurred", ["blurred", "resolved"])
+        feed_marks=_choice(props, where, "feed_marks", "blurred", ["blurred", "resolved"])
         if "feed_marks" in props
         else None,
-        alpha_factor=number_within(props, where, "alpha_factor", 1.0, 0.1, 10.0, ""),
+        alpha_factor=_number_within(props, where, "alpha_factor", 1.0, 0.1, 10.0, ""),
         wide_angle=number("wide_angle_share", 0.0, 1.0, ""),
     )
     return _make_bsdf(props, partial(_metal_finish, face, where, _current.wavelength_nm))
@@ -180,8 +179,8 @@ def _metal_finish(face: MachinedFace, where: str, wavelength_nm: float, deviatio
 
 def _matt_white(props: Any) -> Any:
     where = _where(props)
-    only_known(props, where, ("reflectance",))
-    reflectance = number_within(props, where, "reflectance", USUAL_REFLECTANCE["matt_white"], 0.01, 0.99, "")
+    _only_known(props, where, ("reflectance",))
+    reflectance = _number_within(props, where, "reflectance", USUAL_REFLECTANCE["matt_white"], 0.01, 0.99, "")
     return _make_bsdf(props, partial(_white_finish, reflectance, _current.wavelength_nm))
 
 
@@ -195,10 +194,10 @@ def _white_finish(reflectance: float, wavelength_nm: float, deviation: Deviation
 def _paint(kind: str, greatest: float, describe: Callable[[float, Scatter], dict[str, Any]]) -> Callable[[Any], Any]:
     def make(props: Any) -> Any:
         where = _where(props)
-        only_known(props, where, ("reflectance", "gloss", "alpha"))
-        reflectance = number_within(props, where, "reflectance", USUAL_REFLECTANCE[kind], 0.01, greatest, "")
-        gloss = number_within(props, where, "gloss", None, 0.5, 100.0, "GU") if "gloss" in props else None
-        alpha = number_within(props, where, "alpha", None, *ALPHA_RANGE[kind], "") if "alpha" in props else None
+        _only_known(props, where, ("reflectance", "gloss", "alpha"))
+        reflectance = _number_within(props, where, "reflectance", USUAL_REFLECTANCE[kind], 0.01, greatest, "")
+        gloss = _number_within(props, where, "gloss", None, 0.5, 100.0, "GU") if "gloss" in props else None
+        alpha = _number_within(props, where, "alpha", None, *ALPHA_RANGE[kind], "") if "alpha" in props else None
         wavelength_nm = _current.wavelength_nm
 
         def finish(deviation: Deviation) -> Finish:
@@ -275,7 +274,7 @@ def _height_map(props: Any, where: str) -> HeightMap | None:
         if "spacing_um" in props:
             raise InputError(where, "spacing_um", "spacing_um without height_map", "both or neither")
         return None
-    spacing = number_within(props, where, "spacing_um", None, 0.01, 50.0, "um")
+    spacing = _number_within(props, where, "spacing_um", None, 0.01, 50.0, "um")
     return read_height_map(path, spacing, where)
 
 
@@ -286,3 +285,36 @@ def _path(props: Any, where: str, key: str, allowed: str) -> Path | None:
     if not isinstance(value, str) or not value:
         raise InputError(where, key, repr(value), allowed, f'write <string name="{key}" value="..."/>')
     return _current.folder / value
+
+
+def _only_known(props: Any, where: str, names: Sequence[str]) -> None:
+    """Raise :class:`InputError` if a BSDF has a property that is not ``names``."""
+    for key in props.keys():  # noqa: SIM118 - not a dict
+        if key not in names:
+            raise InputError(where, str(key), "an unknown property", ", ".join(names), nearest(str(key), list(names)))
+
+
+def _choice(props: Any, where: str, key: str, default: str, choices: list[str]) -> str:
+    """Return a text property of a BSDF; raise :class:`InputError` if it is not one of ``choices``."""
+    value = props.get(key, default)
+    if value not in choices:
+        raise InputError(where, key, repr(value), ", ".join(choices), nearest(str(value), choices))
+    return str(value)
+
+
+def _number_within(
+    props: Any, where: str, key: str, default: float | None, low: float, high: float, unit: str
+) -> float:
+    """Return a numeric property of a BSDF; raise :class:`InputError` if it is not within the limits, ``unit`` in words.
+
+    ``default`` is for a BSDF without the property; None if it is required.
+    """
+    allowed = f"a number from {low:g} to {high:g} {unit}".rstrip()
+    value = props.get(key, default)
+    if value is None:
+        raise InputError(where, key, "nothing", allowed)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(where, key, repr(value), allowed, f'write <float name="{key}" value="..."/>')
+    if not low <= value <= high:
+        raise InputError(where, key, f"{value:g}", allowed)
+    return float(value)
