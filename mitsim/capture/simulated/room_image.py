@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.region_of_interest import Roi
-from mitsim.scene.light_transport.room_light import directional_albedos, room_radiance
+from mitsim.scene.light_transport.room_light import SeenSurfaces, directional_albedos
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.raycast import PixelRays
 from mitsim.sensor.sensor import Sensor
@@ -31,7 +31,7 @@ def room_image(
     roi
         Region of the image.
     """
-    relative = room_radiance(scene, directional_albedos(scene), rays, world_from_sensor)[roi.slices]
+    relative = SeenSurfaces.of(scene, rays, world_from_sensor, roi).room_radiance(directional_albedos(scene))
     eye, depth = sensor.rig.cameras[camera], float(np.mean(sensor.working_range_mm))
     pixels = np.stack(roi.pixels(), axis=-1).astype(float)
     directions = eye.sensor_from_camera.directions(eye.rays_to_fold(pixels))

@@ -66,21 +66,6 @@ class SeenSurfaces:
         return out
 
 
-def room_radiance(
-    scene: Scene, albedos: list[NDArray[np.float64]], rays: PixelRays, world_from_sensor: Transform
-) -> NDArray[np.float32]:
-    """Return the radiance (H, W) [1/sr] per unit of irradiance on a surface with a free view; 0 outside the part.
-
-    Parameters
-    ----------
-    scene, rays, world_from_sensor
-        The scene, the rays of the pixels, and the pose of the sensor.
-    albedos
-        Of the scene's shapes, from :func:`directional_albedos`.
-    """
-    return SeenSurfaces.of(scene, rays, world_from_sensor).room_radiance(albedos)
-
-
 def directional_albedos(scene: Scene) -> list[NDArray[np.float64]]:
     """Return the :func:`directional_albedo` of each shape; shapes with one BSDF share it."""
     bsdfs = [shape.bsdf() for shape in scene.shapes]
