@@ -93,7 +93,7 @@ def dot_frames(pattern: DotPattern, width: int, height: int) -> NDArray[np.float
         spots = diffraction_spots(
             width, height, pattern.cell_px, pattern.places, pattern.spot_px, pattern.tiles, pattern.seed
         )
-        return spots[None]
+        return spots[None].copy()
     arguments = (pattern.run_length_px, pattern.bright_share, pattern.blur_px, pattern.seed)
     if not pattern.shifts_px:
         return random_blobs(width, height, *arguments)[None]
@@ -136,6 +136,7 @@ def _sharp_blobs(width: int, height: int, run_length_px: float, bright_share: fl
     return np.asarray(smooth > np.quantile(smooth, 1.0 - bright_share), np.float32)
 
 
+@lru_cache(maxsize=2)  # the projector of a unit shows the mask that its decoder stores
 def diffraction_spots(
     width: int, height: int, cell_px: float, places: int, spot_px: float, tiles: tuple[int, int], seed: int
 ) -> NDArray[np.float32]:
@@ -158,13 +159,6 @@ def diffraction_spots(
     --------
     random_blobs : random dark and bright areas
     """
-    return _spots(width, height, cell_px, places, spot_px, tiles, seed).copy()
-
-
-@lru_cache(maxsize=2)  # the projector of a unit shows the mask that its decoder stores
-def _spots(
-    width: int, height: int, cell_px: float, places: int, spot_px: float, tiles: tuple[int, int], seed: int
-) -> NDArray[np.float32]:
     down, across = int(np.ceil(height / cell_px)), int(np.ceil(width / cell_px))
     tile = (int(np.ceil(down / tiles[1])), int(np.ceil(across / tiles[0])))
     order = np.random.default_rng(seed).integers(0, places, (2, *tile))
