@@ -83,13 +83,7 @@ def read_grey(path: Path, *, channel: int | None = None) -> Image:
 
 
 def read_pages(path: Path, *, channel: int | None = None) -> Iterator[Image]:
-    """Yield the grey images (H, W) of a file as :func:`read_grey` does: all pages of a TIFF, in order.
-
-    Raises
-    ------
-    InputError
-        As :func:`read_grey`, with the number of the page among several.
-    """
+    """Yield the grey images (H, W) of a file as :func:`read_grey` does: all pages of a TIFF, in order."""
     data = _bytes_of(path)
     pages = _pages(data, path)
     for page, label in zip(pages, page_labels(path, len(pages)), strict=True):
@@ -118,13 +112,7 @@ def _pages(data: bytes, where: str | Path) -> list[int]:
 
 
 def read_depths(path: Path) -> NDArray[Any]:
-    """Read a grey image (H, W) as :func:`read_grey` does, or one of signed whole numbers or of floating point.
-
-    Raises
-    ------
-    InputError
-        As :func:`read_grey`.
-    """
+    """Read a grey image (H, W) as :func:`read_grey` does, or one of signed whole numbers or of floating point."""
     data = _bytes_of(path)
     _check_scale(data, path)
     image = _decoded(data, path, None)
@@ -157,15 +145,6 @@ def decode_grey(data: bytes, where: str | Path, *, channel: int | None = None) -
     """Read a grey image from the bytes of a file, as :func:`read_grey` does.
 
     ``channel`` is the number of the channel to take of a colour image (:data:`CHANNELS`). Messages name ``where``.
-
-    Raises
-    ------
-    InputError
-        As :func:`read_grey`.
-
-    See Also
-    --------
-    read_grey : from a file
     """
     return _checked(_decoded(data, where, channel), where)
 

@@ -55,14 +55,9 @@ _AREA_RATIOS = (0.6, 1.6)
 
 
 def dot_centres(image: NDArray[np.uint8], dark: bool = True) -> NDArray[np.float64]:
-    """Find round dots of equal size in an image.
+    """Return the centres (n, 2) [px], column and row, of round dots of equal size in an image; no row without dots.
 
     ``image`` (H, W) has grey levels [DN]; ``dark``: whether the dots are darker than their background.
-
-    Returns
-    -------
-    (n, 2)
-        Centres [px] as column and row, with pixel centres at integers. No row if there are no dots.
     """
     dots_dark = image if dark else np.asarray(255 - image, np.uint8)
     scale = max(min(_UPSAMPLING, _LARGEST_UPSAMPLED_PX // max(image.shape)), 2)

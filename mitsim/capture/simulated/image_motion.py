@@ -31,6 +31,8 @@ def image_motion(
 ) -> NDArray[np.float64] | None:
     """Return the affine map (2, 3) from pixels of a region after a motion to those before it, both within the region.
 
+    It is None if too few points are in sight of both.
+
     Parameters
     ----------
     before, world_from_sensor
@@ -41,11 +43,6 @@ def image_motion(
         (n, 3) of the part [mm], world frame.
     roi
         Region of the images.
-
-    Returns
-    -------
-    (2, 3) or None
-        None if too few points are in sight of both.
 
     See Also
     --------

@@ -31,6 +31,8 @@ def row_error(
 ) -> float:
     """Return by how many rows [px] a patch lies lower in the right image than in the left one.
 
+    It is NaN if the best offset is not within ``reach``.
+
     Parameters
     ----------
     left, right
@@ -43,11 +45,6 @@ def row_error(
         (n,) of these pixels [px].
     reach
         Largest offset that is tested, up and down [rows].
-
-    Returns
-    -------
-    float
-        NaN if the best offset is not within ``reach``.
     """
     left_levels = _sampled(left, geometry.map_left[:, rows, columns])
     steps = np.arange(-reach, reach + 1.0)[:, None]

@@ -59,15 +59,10 @@ _KEPT_VARIANCE = 0.6230
 def measured_noise(
     stacks: Sequence[NDArray[np.generic]], image_roles: Sequence[Role], full_scale: float
 ) -> MeasuredNoise | None:
-    """Measure the noise of the cameras that took the images of one code.
+    """Return the noise of the cameras that took the images of one code; None if the fringes leave too few residuals.
 
     ``stacks`` are the (P, H, W) images [DN] of each camera, in the roles ``image_roles``; ``full_scale`` is the value
     of a saturated pixel [DN].
-
-    Returns
-    -------
-    MeasuredNoise or None
-        None if the fringes leave too few residuals.
     """
     with threadpool_limits(1, user_api="blas"):  # threads wait longer for one another than these products take
         residuals = [

@@ -295,19 +295,12 @@ def _shared_weight(first: NDArray[np.floating], second: NDArray[np.floating]) ->
 def find_coordinates(
     coordinates: NDArray[np.float64], row: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Find the columns of a row that have given coordinates.
+    """Return the only column (w,) [px] of a row with each coordinate, else NaN; and whether it has several (w,).
 
     The row is linear between neighbouring pixels whose coordinates change as most of the row do. They increase wherever
     camera and projector see a surface from the same side, and fall if the projector is turned by 180 degrees.
 
     ``coordinates`` (w,) are NaN where unknown, ``row`` (W,) are those of the row's pixels [projector px].
-
-    Returns
-    -------
-    columns
-        (w,) [px], NaN if there is none or more than one.
-    ambiguous
-        (w,) whether there is more than one.
     """
     columns = np.flatnonzero(np.isfinite(row[:-1]) & np.isfinite(row[1:]))
     step = row[columns + 1] - row[columns]
