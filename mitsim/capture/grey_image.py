@@ -11,6 +11,7 @@ multiples of a power of two.
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -22,11 +23,21 @@ from numpy.typing import NDArray
 
 from characterisation.files.checked_files import LARGEST_FILE, read_bounded
 from characterisation.files.errors import InputError
-from mitsim.capture.tiff_pages import TIFF_MARKS, tiff_pages
 from mitsim.sensor.png import LONGEST_SIDE_PX, PNG_SIGNATURE, check_png, decode_png, is_grey_png
 
 #: suffixes of the image files that are read
 SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".pgm")
+
+#: first bytes of a TIFF, and the byte order of its numbers
+_TIFF_MARKS = {b"II*\0": "<", b"MM\0*": ">", b"II+\0": "<", b"MM\0+": ">"}
+
+#: most pages of a file
+_MOST_PAGES = 10_000
+
+#: tag of the kind of a page
+_KIND = 254
+#: bits of the kind: a reduced copy, and a mask
+_REDUCED_OR_MASK = 0b101
 
 #: the head of a PFM, whose last number is its scale
 _PFM = re.compile(rb"P[fF]\s+\d+\s+\d+\s+(\S{1,40})\s")
@@ -104,11 +115,46 @@ def page_count(path: Path) -> int:
         If the file cannot be read, or is a damaged TIFF.
     """
     begin = read_bounded(path, first=4)
-    return len(tiff_pages(_bytes_of(path), path)) if begin in TIFF_MARKS else 1
+    return len(_tiff_pages(_bytes_of(path), path)) if begin in _TIFF_MARKS else 1
 
 
 def _pages(data: bytes, where: str | Path) -> list[int]:
-    return tiff_pages(data, where) if data[:4] in TIFF_MARKS else [0]
+    return _tiff_pages(data, where) if data[:4] in _TIFF_MARKS else [0]
+
+
+def _tiff_pages(data: bytes, where: str | Path) -> list[int]:
+    """Return the numbers of the pages with images in the content of a TIFF file, from 0; ``where`` names the file.
+
+    A TIFF is a chain of directories, each of which describes one page and states the offset of the next (TIFF 6.0;
+    BigTIFF with offsets of 8 bytes). Tag 254 states whether a page is a reduced copy of another one, or its mask.
+    """
+    order, big = _TIFF_MARKS[data[:4]], data[2:4] in (b"+\0", b"\0+")
+    count, offset, entry = (order + "Q", order + "Q", 20) if big else (order + "H", order + "I", 12)
+    images: list[int] = []
+    seen: set[int] = set()
+    try:
+        at = int(struct.unpack_from(offset, data, 8 if big else 4)[0])
+        while at:
+            if at in seen or len(seen) >= _MOST_PAGES:
+                raise InputError(where, "pages", "pages in a ring, or too many", f"up to {_MOST_PAGES} pages")
+            seen.add(at)
+            entries = int(struct.unpack_from(count, data, at)[0])
+            at += struct.calcsize(count)
+            end = at + entries * entry
+            following = int(struct.unpack_from(offset, data, end)[0])
+            kinds = [
+                int(struct.unpack_from(order + "I", data, position + entry - struct.calcsize(offset))[0])
+                for position in range(at, end, entry)
+                if struct.unpack_from(order + "H", data, position)[0] == _KIND
+            ]
+            if not any(kind & _REDUCED_OR_MASK for kind in kinds):
+                images.append(len(seen) - 1)
+            at = following
+    except (struct.error, OverflowError):
+        raise InputError(
+            where, "", f"a TIFF cut off in page {len(seen) + 1}", "a complete TIFF: copy it again"
+        ) from None
+    return images or list(range(len(seen)))
 
 
 def read_depths(path: Path) -> NDArray[Any]:
