@@ -225,10 +225,8 @@ def pose_of(position: tuple[float, float, float], target: tuple[float, float, fl
     ----------
     position, target
         Position of the reference camera, and the point that it looks at [mm].
-    roll
-        Rotation about the view axis [deg].
-    sensor
-        The sensor.
+    roll, sensor
+        Rotation about the view axis [deg], and the sensor.
     """
     import numpy as np
 

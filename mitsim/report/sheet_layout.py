@@ -70,12 +70,8 @@ def wrapped(text: str, size: float, across: float, weight: str = "normal") -> li
 
     Parameters
     ----------
-    text
-        The text.
-    size, weight
-        Size [pt] and weight of the font.
-    across
-        Largest width of a line [in].
+    text, size, weight, across
+        The text, size [pt] and weight of the font, and largest width of a line [in].
 
     See Also
     --------
@@ -133,10 +129,8 @@ class Page:
 
         Parameters
         ----------
-        left
-            Distance from the margin [in].
-        text
-            The line.
+        left, text
+            Distance from the margin [in], and the line.
         size, colour, weight
             Of the font; the size in pt.
 

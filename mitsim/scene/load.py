@@ -193,10 +193,8 @@ def scene_from_dict(description: dict[str, Any], wavelength_nm: float, where: st
 
     Parameters
     ----------
-    description
-        Shapes and emitters by name.
-    wavelength_nm
-        Wavelength at which the materials are evaluated [nm].
+    description, wavelength_nm
+        Shapes and emitters by name, and wavelength at which the materials are evaluated [nm].
     where
         Description of the scene, for messages.
 

@@ -220,10 +220,8 @@ def aligned(
 
     Parameters
     ----------
-    queues
-        Queues of frames by name.
-    timeout_s
-        Longest time to wait [s].
+    queues, timeout_s
+        Queues of frames by name, and longest time to wait [s].
     where, first
         Name of the camera in messages, and least sequence number.
     now

@@ -68,10 +68,8 @@ def decode_coordinates(  # noqa: PLR0913 - options, all by name
         (P, H, W) raw images [DN] of one camera, in the order of :func:`mitsim.sensor.light_code.roles`.
     code, settings
         The code, and the limits of the decoder.
-    size
-        Width and height of the projector [px].
-    full_scale
-        Value of a saturated pixel [DN].
+    size, full_scale
+        Width and height of the projector [px], and value of a saturated pixel [DN].
     imager
         The imager, or measured noise, from which the expected noise follows; None if neither is known.
     interpolate

@@ -185,10 +185,8 @@ def stripe_coordinate(
         Stripes of the axis, and code of the axis.
     saturated
         (H, W) whether the pixel is saturated in any image of the code.
-    settings
-        Limits of the decoder.
-    full_scale
-        Value of a saturated pixel [DN].
+    settings, full_scale
+        Limits of the decoder, and value of a saturated pixel [DN].
 
     See Also
     --------
@@ -242,10 +240,8 @@ def decode_gray_fringes(
         period after period, the longest first.
     coded_axis, fringes
         Axis and stripes of the Gray code, and periods and shifts of the fringes.
-    settings
-        Limits of the decoder.
-    full_scale
-        Value of a saturated pixel [DN].
+    settings, full_scale
+        Limits of the decoder, and value of a saturated pixel [DN].
     imager
         As for :func:`mitsim.decoding.structured_light.phase_shift.decode_phase_shift`.
 

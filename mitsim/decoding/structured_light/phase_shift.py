@@ -196,10 +196,8 @@ def gamma_corrected(
         Fitted fringes.
     stack
         (P, H, W) images of the fringes [DN], period after period.
-    fringes
-        Periods and shifts.
-    minimum_modulation
-        Least modulation of the pixels that the estimate uses [DN].
+    fringes, minimum_modulation
+        Periods and shifts, and least modulation of the pixels that the estimate uses [DN].
     full_scale
         Value of a saturated pixel [DN]; the estimate uses none that has it in any image.
     white_black
@@ -242,10 +240,8 @@ def fringe_sigma(
 
     Parameters
     ----------
-    period
-        Period of the finest fringe [projector px].
-    steps
-        Number of its images.
+    period, steps
+        Period of the finest fringe [projector px], and number of its images.
     variance
         (...) of the grey levels [DN^2].
     modulation
