@@ -43,3 +43,8 @@ def _round(centre, across, radius, grid):
         normal = (near[..., None] * rays - across @ centre) / radius
         facing = -(normal * grid.rays()).sum(-1)
         return np.where(facing > np.sin(np.deg2rad(15)), near, np.nan)
+
+
+def points_of(surfaces, grid):
+    """Points where the rays of a grid meet surfaces, (H, W, 3) [mm], sensor frame; NaN without a surface."""
+    return grid.origin + grid.rays() * surfaces.distance[..., None].astype(float)

@@ -136,8 +136,3 @@ def shapes_met(scene: Scene, rays: PixelRays, world_from_sensor: Transform) -> N
     ray = mi.Ray3f(frame.position, frame.to_world(rays.directions))
     met = scene.mitsuba.ray_intersect_preliminary(ray, active=rays.active)
     return shape_indices(scene.mitsuba, numbers_met(met, met.is_valid())).reshape(rays.size)
-
-
-def cloud_points(surfaces: Surfaces, grid: ViewGrid) -> NDArray[np.float64]:
-    """Return the points where rays meet surfaces, (H, W, 3) [mm], sensor frame; NaN without a surface."""
-    return np.asarray(grid.origin + grid.rays() * surfaces.distance[..., None].astype(float))

@@ -7,8 +7,9 @@ import numpy as np
 from characterisation.point_cloud import ViewGrid
 from mitsim.scene.backend import mi
 from mitsim.scene.load import load_scene, scene_from_dict
-from mitsim.scene.ray_casting.raycast import PixelRays, cast, cloud_points
+from mitsim.scene.ray_casting.raycast import PixelRays, cast
 from mitsim.sensor.transforms import Transform, look_at
+from tests.seen_shapes import points_of
 
 GRID = ViewGrid(300.0, 300.0, 119.5, 79.5, 240, 160)
 
@@ -18,7 +19,7 @@ def test_a_sphere_is_where_it_is():
     pose = look_at([30, -580, 120], [0, 0, 0], [0, 0, 1], 20)
     surfaces = cast(scene, PixelRays.of_grid(GRID), pose, np.array([[0.0, 0.0, 0.0]]))
     centre = pose.inverse().points(np.zeros(3))
-    points = cloud_points(surfaces, GRID)
+    points = points_of(surfaces, GRID)
     hit = surfaces.shape == 0
     rays = GRID.rays()
     # |t d - c| = r, nearer root
@@ -50,7 +51,7 @@ def test_an_obstacle_hides_a_point_from_one_eye_only():
     right = pose.inverse().points(np.array([300.0, 0.0, 500.0]))
     left = pose.inverse().points(np.array([-300.0, 0.0, 500.0]))
     surfaces = cast(scene, PixelRays.of_grid(GRID), pose, np.stack([right, left]))
-    points = pose.points(cloud_points(surfaces, GRID))
+    points = pose.points(points_of(surfaces, GRID))
     plane = surfaces.shape == 0
     # a wall 50 mm high at x = 9 to 11 hides from (300, 500) what lies behind it, by similar triangles down to
     # x0 = 9 - 50 (291 / 450) = -23.3
@@ -84,7 +85,7 @@ def test_the_grid_may_be_turned_and_moved():
     grid = ViewGrid(300.0, 310.0, 100.0, 70.0, 240, 160, turn.rotation, turn.translation)
     pose = look_at([50, 20, 500], [0, 0, 0], [0, 1, 0])
     surfaces = cast(scene, PixelRays.of_grid(grid), pose, np.empty((0, 3)))
-    points = pose.points(cloud_points(surfaces, grid))
+    points = pose.points(points_of(surfaces, grid))
     assert np.abs(points[..., 2]).max() < 2e-3
 
 

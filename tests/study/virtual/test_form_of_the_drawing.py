@@ -13,7 +13,7 @@ from characterisation.point_cloud import ViewGrid
 from characterisation.tasks.task_file import Task
 from mitsim.scene import backend
 from mitsim.scene.load import scene_from_dict
-from mitsim.scene.ray_casting.raycast import PixelRays, cast, cloud_points
+from mitsim.scene.ray_casting.raycast import PixelRays, cast
 from mitsim.sensor.transforms import look_at
 from mitsim.study import SetTable
 from mitsim.study.view_sets.joined import JoinedMeasurements
@@ -23,6 +23,7 @@ from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.stated import budget_groups
 from mitsim.study.virtual.study_unknowns import study_unknowns
 from mitsim.study.virtual.world import Trial
+from tests.seen_shapes import points_of
 from tests.smaller_sensors import coarse_sensor
 from tests.study.virtual.test_rendered import SCENES, study_of
 
@@ -169,7 +170,7 @@ def test_a_bent_sheet_rises_on_one_side_where_it_falls_on_the_other(shapes) -> N
     for z in (1000, -1000):
         pose = look_at([0, 0, z], [0, 0, 0], [0, 1, 0])
         surfaces = cast(sheet, PixelRays.of_grid(grid), pose, np.zeros((0, 3)))
-        flat = cloud_points(surfaces, grid).astype(np.float32)
+        flat = points_of(surfaces, grid).astype(np.float32)
         bent = pose.points(form_deviation(flat, SeenFaces(sheet, surfaces, pose, grid), forms, 5).astype(float))
         seen = np.isfinite(bent).all(axis=-1)
         place = np.rint(bent[seen][:, :2]).astype(int)
