@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.files.errors import InputError
 from characterisation.files.threads import in_threads
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
@@ -108,32 +107,6 @@ def brightest_images(sensor: Sensor, radiance: dict[str, NDArray[np.float32]]) -
         # the exposure rule refers to the whole image: pixels that are not read out count as dark
         flat += [image.ravel(), np.zeros(camera.width * camera.height - image.size, np.float32)]
     return np.concatenate(flat) * np.float32(sensor.electrons())
-
-
-def check_finite(sensor: Sensor, values: NDArray[np.floating], where: str, quantity: str) -> None:
-    """Reject light that is not finite, before it becomes an image of zeros.
-
-    Parameters
-    ----------
-    sensor
-        Sensor, for the message.
-    values
-        Light, of any shape.
-    where, quantity
-        Part of the sensor and name of the values, for the message.
-
-    Raises
-    ------
-    InputError
-        If a value is infinite or NaN.
-    """
-    if not np.isfinite(values.sum(dtype=np.float64)):
-        raise InputError(
-            f"sensor {sensor.name}",
-            where,
-            f"{quantity} that is infinite or not a number",
-            "finite light: check the optics, flux_w and the scene's own emitters",
-        )
 
 
 def expose_camera(

@@ -21,6 +21,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.errors import InputError
 from characterisation.files.threads import in_threads
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
@@ -29,7 +30,6 @@ from mitsim.capture.simulated.exposing import (
     UnitPatterns,
     brightest_images,
     capture_of,
-    check_finite,
     expose_camera,
     shifted_units,
 )
@@ -287,9 +287,9 @@ class SimulatedSensor:
             if apart is not None:
                 other[name] = apart
         for name, stack in light.items():
-            check_finite(sensor, stack, f"camera {name}", "radiance")
+            _check_finite(sensor, stack, f"camera {name}", "radiance")
         exposures = sensor.exposure.exposures(brightest_images(sensor, light), sensor.imager.full_well)
-        check_finite(sensor, np.array(exposures) * sensor.electrons(), "imager", "electrons per radiance")
+        _check_finite(sensor, np.array(exposures) * sensor.electrons(), "imager", "electrons per radiance")
         records = rendering.records(scene.where, scene.parameters)
         return LightOnImagers(light, rois, exposures, noise, world_from_sensor, records, other)
 
@@ -337,3 +337,11 @@ def _light(sensor: Sensor) -> ProjectedLight:
     if isinstance(sensor.pattern, AmplitudeModulation):
         return ModulatedLight(sensor.projector, *sensor.pattern.images())
     return ProjectedPatterns(sensor.patterns(), sensor.projector)
+
+
+def _check_finite(sensor: Sensor, values: NDArray[np.floating], where: str, quantity: str) -> None:
+    """Reject light that is not finite, before it becomes an image of zeros."""
+    if not np.isfinite(values.sum(dtype=np.float64)):
+        found = f"{quantity} that is infinite or not a number"
+        allowed = "finite light: check the optics, flux_w and the scene's own emitters"
+        raise InputError(f"sensor {sensor.name}", where, found, allowed)
