@@ -260,12 +260,6 @@ def _structured_light_cloud(
     return decode_structured_light(stack, geometry, code, settings, images.context(roi), decoded)
 
 
-def _time_of_flight_geometry(
-    rig: Rig, settings: TimeOfFlightSettings, code: AmplitudeModulation
-) -> TimeOfFlightGeometry:
-    return time_of_flight_geometry(rig, next(iter(rig.cameras)), settings.near_mm, settings.far_mm)
-
-
 def _time_of_flight(
     images: Images, geometry: TimeOfFlightGeometry, settings: TimeOfFlightSettings, code: AmplitudeModulation
 ) -> PointCloud:
@@ -311,7 +305,11 @@ TECHNOLOGIES: dict[str, Technology] = {
         _structured_light_geometry,
         _structured_light,
     ),
-    "time_of_flight": Technology((AmplitudeModulation,), _time_of_flight_geometry, _time_of_flight),
+    "time_of_flight": Technology(
+        (AmplitudeModulation,),
+        lambda rig, settings, code: time_of_flight_geometry(rig, settings.near_mm, settings.far_mm),
+        _time_of_flight,
+    ),
     "depth_map": _device_technology("depth", camera_map_geometry),
     "disparity_map": _device_technology("disparity", disparity_map_geometry),
     "point_map": _device_technology("points", camera_map_geometry),

@@ -87,30 +87,19 @@ class TimeOfFlightGeometry:
     baseline: NDArray[np.float64]
 
 
-def time_of_flight_geometry(rig: Rig, camera_name: str, near_mm: float, far_mm: float) -> TimeOfFlightGeometry:
-    """Prepare one camera of a rig and its light source, which takes the place of the rig's projector.
+def time_of_flight_geometry(rig: Rig, near_mm: float, far_mm: float) -> TimeOfFlightGeometry:
+    """Prepare the first camera of a rig and its light source, which takes the place of the rig's projector.
 
-    Parameters
-    ----------
-    rig, camera_name
-        The rig, and the name of its camera.
-    near_mm, far_mm
-        Range of depths along the camera's axis [mm].
+    ``near_mm`` and ``far_mm`` are depths along the camera's axis.
 
     Raises
     ------
     InputError
-        If the rig has no such camera, or no light source.
-
-    See Also
-    --------
-    decode_time_of_flight : decodes with it
+        If the rig has no light source.
     """
-    if camera_name not in rig.cameras:
-        raise InputError("rig", "cameras", repr(camera_name), ", ".join(rig.cameras))
     if rig.projector is None:
         raise InputError("rig", "projector", "none", "the light source of the time-of-flight camera")
-    camera = rig.cameras[camera_name]
+    camera_name, camera = next(iter(rig.cameras.items()))
     local_ray = camera.rays(camera.pixel_grid())
     ray = camera.sensor_from_camera.directions(local_ray)
     light_source = rig.projector.centre - camera.centre

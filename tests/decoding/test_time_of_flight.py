@@ -59,7 +59,7 @@ def rig(distortion=(-0.3, 0.1, 0.002, -0.001, 0.0), place=None, lamp=(80.0, -15.
 
 
 def geometry_of(own=None):
-    return time_of_flight_geometry(own or rig(), "depth", SETTINGS.near_mm, SETTINGS.far_mm)
+    return time_of_flight_geometry(own or rig(), SETTINGS.near_mm, SETTINGS.far_mm)
 
 
 def path_to(geometry, own, distance):
@@ -314,7 +314,7 @@ def test_any_images_decode_to_a_whole_cloud(stack):
         4,
         Transform(np.eye(3), np.array([50.0, 0, 0])),
     )
-    geometry = time_of_flight_geometry(Rig({"depth": camera}, lamp), "depth", 400, 4600)
+    geometry = time_of_flight_geometry(Rig({"depth": camera}, lamp), 400, 4600)
     cloud = decode(stack, geometry, code, imager=IMAGER)
     np.testing.assert_array_equal(cloud.valid, cloud.status == Status.VALID)
     inside = cloud.points[..., 2][cloud.valid]
@@ -333,9 +333,7 @@ def test_what_cannot_be_decoded_is_told():
     assert np.isclose(unambiguous_path(code), LIGHT_MM_S / 8e6)
     assert np.isclose(unambiguous_path(modulation((999.0, 1000.0))), 64 * LIGHT_MM_S / 1e9)
     with pytest.raises(InputError, match="the light source"):
-        time_of_flight_geometry(Rig(rig().cameras), "depth", 400, 4600)
-    with pytest.raises(InputError, match="found 'left'; allowed: depth"):
-        time_of_flight_geometry(rig(), "left", 400, 4600)
+        time_of_flight_geometry(Rig(rig().cameras), 400, 4600)
 
 
 def test_pixels_beyond_the_fold_of_the_distortion_are_left_out_with_their_reason():
