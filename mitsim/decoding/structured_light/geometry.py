@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.arrays import Floats
-from characterisation.files.errors import InputError, nearest
+from characterisation.files.errors import InputError
 from characterisation.files.threads import in_threads
 from characterisation.point_cloud import ViewGrid
 from mitsim.decoding.blocks import row_bands
@@ -113,11 +113,8 @@ def structured_light_geometry(
     Raises
     ------
     InputError
-        If the rig has no such camera or no projector, or the code's coordinate changes with depth at no pixel.
+        If the rig has no projector, or the code's coordinate changes with depth at no pixel.
     """
-    if camera_name not in rig.cameras:
-        hint = nearest(camera_name, list(rig.cameras))
-        raise InputError("rig", "cameras", repr(camera_name), ", ".join(rig.cameras), hint)
     if rig.projector is None:
         raise InputError("rig", "projector", "none", "a calibrated projector, for structured light of one camera")
     camera, projector = rig.cameras[camera_name], rig.projector

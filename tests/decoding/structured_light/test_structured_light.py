@@ -310,9 +310,7 @@ def test_what_does_not_fit_together_is_refused(change, message):
         decode_structured_light(**given)
 
 
-def test_a_rig_without_the_camera_or_a_projector_is_refused():
-    with pytest.raises(InputError, match="did you mean 'eye'"):
-        structured_light_geometry(distorted_rig(), "eyes", PHASE, 400, 900)
+def test_a_rig_without_a_projector_is_refused():
     with pytest.raises(InputError, match="projector"):
         structured_light_geometry(replace(distorted_rig(), projector=None), "eye", PHASE, 400, 900)
 
