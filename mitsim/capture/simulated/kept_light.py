@@ -23,7 +23,7 @@ from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.scene.light_transport.kept_paths import CandidatePaths, KeptPaths, broad, mattering
 from mitsim.scene.light_transport.kept_tracing import camera_paths, photon_paths
-from mitsim.scene.light_transport.kept_walks import Tracing
+from mitsim.scene.light_transport.kept_walks import Tracer, Tracing
 from mitsim.scene.light_transport.plain_scene import distinct_bsdfs, has_emitters
 from mitsim.scene.load import Scene, bsdf_of
 from mitsim.scene.ray_casting.raycast import shapes_met
@@ -114,8 +114,8 @@ def keep_light(
         rays, projector = simulated.rays[camera], simulated.patterns.projector
         candidates: list[CandidatePaths] = []
         if len(pixels):
-            candidates += camera_paths(scene, rays, projector, world_from_sensor, roi, pixels, tracing)
-            candidates += photon_paths(scene, rays, projector, world_from_sensor, roi, tracing)
+            tracer = Tracer(scene, rays, projector, world_from_sensor, roi, tracing)
+            candidates += [*camera_paths(tracer, pixels), *photon_paths(tracer)]
         paths = KeptPaths(mattering(candidates, finishes, roi, settings.kept * len(pixels), own), roi)
         out[camera] = KeptLight(paths, Smoothing.of(shape, settings.smoothing_px), simulated.sensor.ambient_image)
     return out

@@ -17,13 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import opaque, opaque_index
 from mitsim.scene.light_transport.kept_paths import CandidatePaths
 from mitsim.scene.light_transport.kept_walks import (
     Tracer,
-    Tracing,
     Walk,
     density_to_camera,
     place_of,
@@ -31,11 +29,8 @@ from mitsim.scene.light_transport.kept_walks import (
     value_and_density,
 )
 from mitsim.scene.light_transport.low_discrepancy import r3_point, z_order
-from mitsim.scene.load import Scene
-from mitsim.scene.ray_casting.camera_rays import CameraRays, bilinear, pixel_area
+from mitsim.scene.ray_casting.camera_rays import bilinear, pixel_area
 from mitsim.scene.ray_casting.eye import shadow_ray
-from mitsim.sensor.projector import Projector
-from mitsim.sensor.transforms import Transform
 
 #: number of paths that are traced together
 _AT_ONCE = 1 << 21
@@ -47,31 +42,9 @@ _LARGEST_RATIO = 1e30
 _PHOTONS_FROM = 1 << 31
 
 
-def camera_paths(
-    scene: Scene,
-    rays: CameraRays,
-    projector: Projector,
-    pose: Transform,
-    roi: Roi,
-    pixels: NDArray[np.integer],
-    tracing: Tracing,
-) -> Iterator[CandidatePaths]:
-    """Yield the records of camera paths.
-
-    Parameters
-    ----------
-    scene, rays, projector, pose
-        The scene, the camera's rays, the projector, and the pose of the sensor.
-    roi, pixels
-        Region of the image, and indices (n,) in it of the pixels through which paths begin.
-    tracing
-        Numbers of paths and surfaces.
-
-    See Also
-    --------
-    photon_paths : the other paths of the same light
-    """
-    tracer = Tracer(scene, rays, projector, pose, roi, tracing)
+def camera_paths(tracer: Tracer, pixels: NDArray[np.integer]) -> Iterator[CandidatePaths]:
+    """Yield the records of camera paths, which begin through pixels (n,) by their indices in the region."""
+    tracing = tracer.tracing
     index = mi.UInt32(np.asarray(pixels, np.uint32))
     at_once = max(1, _AT_ONCE // max(1, len(pixels)))
     for first in range(0, tracing.samples, at_once):
@@ -186,23 +159,9 @@ def _camera_step(tracer: Tracer, walk: Walk, number: int) -> tuple[Walk | None, 
     return split_walk(walk, lit, record, goes_on, follower)
 
 
-def photon_paths(
-    scene: Scene, rays: CameraRays, projector: Projector, pose: Transform, roi: Roi, tracing: Tracing
-) -> Iterator[CandidatePaths]:
-    """Yield the records of photons.
-
-    Parameters
-    ----------
-    scene, rays, projector, pose
-        The scene, the camera's rays, the projector, and the pose of the sensor.
-    roi, tracing
-        Region of the image that records must reach, and numbers of paths and surfaces.
-
-    See Also
-    --------
-    camera_paths : the other paths of the same light
-    """
-    tracer = Tracer(scene, rays, projector, pose, roi, tracing)
+def photon_paths(tracer: Tracer) -> Iterator[CandidatePaths]:
+    """Yield the records of photons that reach the region: the other paths of the same light."""
+    tracing = tracer.tracing
     for first in range(0, tracing.photons, _AT_ONCE):
         yield from _records(tracer, _photon_start(tracer, first, min(_AT_ONCE, tracing.photons - first)), _photon_step)
 

@@ -77,7 +77,10 @@ class Walk:
 
 
 class Tracer:
-    """What camera paths and photons of one launch have in common."""
+    """What camera paths and photons of one light have in common.
+
+    ``rays`` of the camera, ``pose`` of the sensor, ``roi`` of the image, and numbers of paths and surfaces.
+    """
 
     def __init__(
         self, scene: Scene, rays: CameraRays, projector: Projector, pose: Transform, roi: Roi, tracing: Tracing

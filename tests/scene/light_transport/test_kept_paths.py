@@ -10,7 +10,7 @@ from mitsim.scene.backend import mi
 from mitsim.scene.light_transport import kept_tracing
 from mitsim.scene.light_transport.kept_paths import CandidatePaths, KeptPaths, broad, light_of, mattering
 from mitsim.scene.light_transport.kept_tracing import camera_paths, photon_paths
-from mitsim.scene.light_transport.kept_walks import Tracing, Walk, split_walk
+from mitsim.scene.light_transport.kept_walks import Tracer, Tracing, Walk, split_walk
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.plain_scene import distinct_bsdfs
 from mitsim.scene.light_transport.projector_light import ModulatedLight, ProjectedPatterns
@@ -99,7 +99,8 @@ def candidates(scene, rays, light, seed, depth=3, samples=36):
     sampled = [bsdf_of(broad(known[one.id()].description)) if one.id() in known else one for one in bsdfs]
     tracing = Tracing(samples, 240**2, depth, seed, drawn, sampled, turned)
     arguments = scene, rays, light.projector, POSE, roi
-    found = [*camera_paths(*arguments, np.arange(WIDTH * HEIGHT), tracing), *photon_paths(*arguments, tracing)]
+    tracer = Tracer(*arguments, tracing)
+    found = [*camera_paths(tracer, np.arange(WIDTH * HEIGHT)), *photon_paths(tracer)]
     return CandidatePaths.joined(found, depth), roi
 
 
