@@ -32,10 +32,8 @@ from mitsim.decoding.structured_light.geometry import (
 from mitsim.decoding.structured_light.gray_code import (
     STRIPE_IMAGES,
     CodedAxis,
+    decode_gray_code,
     decode_gray_fringes,
-    decode_stripes,
-    interpolated_columns,
-    stripe_coordinate,
 )
 from mitsim.decoding.structured_light.newton_polynomial import evaluate
 from mitsim.decoding.structured_light.phase_shift import Fringes, decode_fringes
@@ -105,11 +103,16 @@ def decode_coordinates(  # noqa: PLR0913 - options, all by name
         coded_axis = CodedAxis(axis, extent, min(role.period for role in gray), gray[0].offset) if gray else None
         if isinstance(code, GrayCode) or not phases:
             assert coded_axis is not None
-            decoded = decode_stripes(images, axis_roles, axis, settings.bit_share)
             saturated = (stack if isinstance(code, GrayCode) else images).max(axis=0) >= full_scale
-            coordinates[axis] = stripe_coordinate(decoded, coded_axis, saturated, settings, full_scale)
-            if interpolate and axis == "columns":
-                coordinates[axis] = interpolated_columns(coordinates[axis], decoded, images, axis_roles, coded_axis)
+            coordinates[axis] = decode_gray_code(
+                images,
+                axis_roles,
+                coded_axis,
+                settings,
+                full_scale=full_scale,
+                saturated=saturated,
+                interpolate=interpolate,
+            )
             continue
         fringes = Fringes.of([image_roles[i] for i in phases], code.mean, code.contrast)
         if coded_axis is not None:

@@ -133,29 +133,34 @@ def decode_stripes(
     return DecodedStripes(number, neighbour, multiple | (np.abs(number_change) > 1), contrast)
 
 
-def interpolated_columns(
-    coordinate: ProjectorCoordinate,
-    decoded: DecodedStripes,
-    stack: NDArray[np.generic],
+def decode_gray_code(
+    images: NDArray[np.generic],
     image_roles: list[Role],
     coded: CodedAxis,
+    settings: DecoderSettings,
+    *,
+    full_scale: float,
+    saturated: NDArray[np.bool_],
+    interpolate: bool,
 ) -> ProjectorCoordinate:
-    """Return columns that are interpolated between the edges of their stripes, instead of the stripes' centres.
+    """Return the projector coordinate of a Gray code of one axis. Stripes beyond the projector are rejected.
 
     Parameters
     ----------
-    coordinate, decoded
-        Columns at the centres of their stripes, and stripes of the columns.
-    stack
-        (P, H, W) images [DN].
-    image_roles, coded
-        Role of each image, and code of the columns.
-
-    See Also
-    --------
-    stripe_coordinate : the stripes' centres
+    images, image_roles
+        (P, H, W) images [DN] and their roles.
+    coded, settings
+        The code, and limits of the decoder.
+    full_scale, saturated
+        Value of a saturated pixel [DN], and (H, W) whether the pixel is saturated in any image of the code.
+    interpolate
+        Whether columns are interpolated between the edges of their stripes, instead of the stripes' centres.
     """
-    image_of = {(role.kind, role.axis, role.index): image for role, image in zip(image_roles, stack, strict=True)}
+    decoded = decode_stripes(images, image_roles, coded.axis, settings.bit_share)
+    coordinate = _stripe_coordinate(decoded, coded, saturated, settings.minimum_modulation_dn * full_scale / 255)
+    if not interpolate or coded.axis != "columns":
+        return coordinate
+    image_of = {(role.kind, role.axis, role.index): image for role, image in zip(image_roles, images, strict=True)}
     bits = sorted((role.index for role in image_roles if role.kind == "gray" and role.axis == "columns"), reverse=True)
 
     def signed(bit: int) -> NDArray[np.floating]:
@@ -170,31 +175,13 @@ def interpolated_columns(
     return replace(coordinate, value=value - coded.offset, status=status_without_edges(coordinate.status, located))
 
 
-def stripe_coordinate(
-    decoded: DecodedStripes,
-    coded: CodedAxis,
-    saturated: NDArray[np.bool_],
-    settings: DecoderSettings,
-    full_scale: float,
+def _stripe_coordinate(
+    decoded: DecodedStripes, coded: CodedAxis, saturated: NDArray[np.bool_], least_modulation: float
 ) -> ProjectorCoordinate:
-    """Return the projector coordinate of decoded stripes of an axis. Stripes beyond the projector are rejected.
-
-    Parameters
-    ----------
-    decoded, coded
-        Stripes of the axis, and code of the axis.
-    saturated
-        (H, W) whether the pixel is saturated in any image of the code.
-    settings, full_scale
-        Limits of the decoder, and value of a saturated pixel [DN].
-
-    See Also
-    --------
-    interpolated_columns : between the edges of the stripes
-    """
+    """Return the projector coordinate of the centres of stripes, with a least modulation [DN]."""
     modulation = np.asarray(decoded.contrast / 2, np.float32)
-    low_modulation = modulation < settings.minimum_modulation_dn * full_scale / 255
-    outside = stripes_outside(decoded.number, coded)
+    low_modulation = modulation < least_modulation
+    outside = _stripes_outside(decoded.number, coded)
     rejected = decoded.undecided | outside
     status = rejection_status(saturated & (low_modulation | rejected), low_modulation, rejected)
     # less what a stripe that is cut has beyond the projector's edges; edges between stripes lie inside
@@ -206,7 +193,7 @@ def stripe_coordinate(
     return ProjectorCoordinate(value, sigma, modulation, status)
 
 
-def stripes_outside(number: NDArray[np.unsignedinteger], coded: CodedAxis) -> NDArray[np.bool_]:
+def _stripes_outside(number: NDArray[np.unsignedinteger], coded: CodedAxis) -> NDArray[np.bool_]:
     """Return whether stripes (...), by their numbers, lie beyond the projector's first or last pixel."""
     start = number * coded.stripe - coded.offset  # from the projector's edge
     return np.asarray((start >= coded.extent) | (start + coded.stripe <= 0))
