@@ -40,7 +40,7 @@ from mitsim.decoding.structured_light.decoder import decode_structured_light
 from mitsim.decoding.structured_light.geometry import StructuredLightGeometry, structured_light_geometry
 from mitsim.decoding.structured_light.projector_coordinate import ProjectorCoordinate
 from mitsim.decoding.structured_light.smoothing import smoothed_along_rays
-from mitsim.decoding.structured_light.two_cameras import cloud_of_pair, decode_structured_light_stereo
+from mitsim.decoding.structured_light.two_cameras import decode_structured_light_stereo
 from mitsim.decoding.time_of_flight import TimeOfFlightGeometry, decode_time_of_flight, time_of_flight_geometry
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
@@ -242,16 +242,9 @@ def _structured_light_cloud(
     count = len(roles(code, *size))
     if isinstance(geometry, StereoGeometry):
         names, context = images.pair(), images.context(images.roi)
-        if coordinates:
-            return cloud_of_pair(
-                lambda camera, region: coordinates[names[camera]]["columns"].part(region.slices),
-                geometry,
-                code,
-                settings,
-                context,
-            )
-        left, right = (images.first_images(count, name) for name in names)
-        return decode_structured_light_stereo(left, right, geometry, code, settings, size, context)
+        first, second = (images.first_images(count, name) for name in names)
+        before = [coordinates[name] for name in names] if coordinates else None
+        return decode_structured_light_stereo((first, second), geometry, code, settings, size, context, before)
     stack = images.first_images(count)
     roi, any_read_out = images.raw_region()
     if not any_read_out:

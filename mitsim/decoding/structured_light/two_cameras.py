@@ -24,7 +24,7 @@ since a coordinate that occurs twice in a row is ambiguous.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,6 +41,7 @@ from mitsim.decoding.matching.stereo import StereoGeometry, rectified_roi
 from mitsim.decoding.structured_light.decoder import decode_coordinates
 from mitsim.decoding.structured_light.projector_coordinate import ProjectorCoordinate
 from mitsim.sensor.decoder_settings import DecoderSettings
+from mitsim.sensor.image_role import Axis
 from mitsim.sensor.light_code import LightCode, axes, has_fringes
 
 #: largest difference of the coordinates of neighbouring pixels on one surface [projector px], chosen; larger in rows
@@ -52,20 +53,20 @@ LARGEST_STEP = 4.0
 
 
 def decode_structured_light_stereo(
-    left: NDArray[np.generic],
-    right: NDArray[np.generic],
+    stacks: tuple[NDArray[np.generic], NDArray[np.generic]],
     geometry: StereoGeometry,
     code: LightCode,
     settings: DecoderSettings,
     projector_size: tuple[int, int],
     context: ImageContext,
+    decoded_before: Sequence[Mapping[Axis, ProjectorCoordinate]] | None = None,
 ) -> PointCloud:
     """Decode the images of one code by two cameras.
 
     Parameters
     ----------
-    left, right
-        (P, H, W) raw images [DN] of the first and second camera of the rig, in the order of
+    stacks
+        (P, H, W) raw images [DN] of the first and of the second camera of the rig, in the order of
         :func:`mitsim.sensor.light_code.roles`.
     geometry
         From :func:`mitsim.decoding.matching.stereo.stereo_geometry`.
@@ -75,6 +76,9 @@ def decode_structured_light_stereo(
         Width and height of the pattern [px].
     context
         Of the images. Its ``roi`` is a region of the rectified left grid.
+    decoded_before
+        Coordinates (H, W) of each camera's whole images, with ``interpolate`` of
+        :func:`~mitsim.decoding.structured_light.decoder.decode_coordinates`. None if they are not decoded yet.
 
     Returns
     -------
@@ -98,12 +102,14 @@ def decode_structured_light_stereo(
     --------
     mitsim.decoding.structured_light.decoder.decode_structured_light : one camera
     """
-    for name, stack, size in zip(("left", "right"), (left, right), geometry.raw_size, strict=True):
+    for name, stack, size in zip(("left", "right"), stacks, geometry.raw_size, strict=True):
         if stack.shape[1:] != size:
             raise InputError(f"{name} images", "shape", stack.shape, f"(images, {size[0]}, {size[1]})")
 
     def decoded(camera: int, region: Roi) -> ProjectorCoordinate:
-        stack = (left, right)[camera]
+        if decoded_before is not None:
+            return decoded_before[camera]["columns"].part(region.slices)
+        stack = stacks[camera]
         shown = context.read_out[camera] or Roi.whole(stack.shape[2], stack.shape[1])
         # the stripes at the edge of a region are cut: without a region of interest, no stripe of the image is
         used = shown if context.roi is None else region
@@ -119,40 +125,19 @@ def decode_structured_light_stereo(
         top, left_edge = region.top - used.top, region.left - used.left
         return columns.part((slice(top, top + region.height), slice(left_edge, left_edge + region.width)))
 
-    return cloud_of_pair(decoded, geometry, code, settings, context)
+    return _cloud_of_pair(decoded, geometry, code, settings, context)
 
 
-def cloud_of_pair(
+def _cloud_of_pair(
     decoded: Callable[[int, Roi], ProjectorCoordinate],
     geometry: StereoGeometry,
     code: LightCode,
     settings: DecoderSettings,
     context: ImageContext,
 ) -> PointCloud:
-    """Return the cloud of two cameras whose images are decoded: see :func:`decode_structured_light_stereo`.
+    """Return the cloud of two cameras.
 
-    Parameters
-    ----------
-    decoded
-        Function from the camera, 0 or 1, and a region of its raw image to the columns in this region, with
-        ``interpolate`` of :func:`~mitsim.decoding.structured_light.decoder.decode_coordinates`.
-    geometry
-        Rectified geometry of the pair.
-    code
-        Code of the images; it must have columns.
-    settings
-        Limits of the decoder.
-    context
-        Regions of interest and read-out, and what else is known about the images.
-
-    Raises
-    ------
-    InputError
-        If the code has no columns, or the region of interest does not lie in the grid.
-
-    See Also
-    --------
-    decode_structured_light_stereo : from images
+    ``decoded`` returns the columns in a region of the raw image of a camera, 0 or 1.
     """
     if "columns" not in axes(code):
         raise InputError(

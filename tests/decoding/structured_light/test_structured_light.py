@@ -348,7 +348,7 @@ def test_two_cameras_measure_without_the_projectors_calibration(code):
     rig = two_cameras()
     stacks = both_stacks(rig, see_plane, code)
     cloud = decode_structured_light_stereo(
-        *stacks,
+        stacks,
         stereo_geometry(replace(rig, projector=None)),
         code,
         SETTINGS,
@@ -442,7 +442,7 @@ def test_two_cameras_measure_a_sphere_but_for_the_chords_of_linear_interpolation
     rig, missing = two_cameras(), []
     for each in (rig, replace(rig, cameras={name: finer(eye) for name, eye in rig.cameras.items()})):
         cloud = decode_structured_light_stereo(
-            *both_stacks(each, see_sphere, PHASE),
+            both_stacks(each, see_sphere, PHASE),
             stereo_geometry(each),
             PHASE,
             SETTINGS,
@@ -463,8 +463,7 @@ def test_what_the_right_camera_does_not_see_is_hidden():
     left, right = both_stacks(rig, see_plane, PHASE)
     right[:, 50:60] = 20
     cloud = decode_structured_light_stereo(
-        left,
-        right,
+        (left, right),
         stereo_geometry(rig),
         PHASE,
         SETTINGS,
@@ -479,8 +478,7 @@ def test_a_code_along_the_rows_is_no_use_to_cameras_side_by_side():
     rig, code = two_cameras(), PHASE.model_copy(update={"axis": "rows"})
     with pytest.raises(InputError, match="side by side"):
         decode_structured_light_stereo(
-            np.zeros((24, HEIGHT, WIDTH)),
-            np.zeros((24, HEIGHT, WIDTH)),
+            (np.zeros((24, HEIGHT, WIDTH)), np.zeros((24, HEIGHT, WIDTH))),
             stereo_geometry(rig),
             code,
             SETTINGS,

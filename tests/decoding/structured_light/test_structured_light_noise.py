@@ -58,7 +58,7 @@ def mean_levels(eye: Camera, lamp: Camera, code: PhaseShift | GrayCode) -> np.nd
 
 def decoded(stacks, code, **options):
     return decode_structured_light_stereo(
-        *stacks,
+        stacks,
         stereo_geometry(rig()),
         code,
         SETTINGS,
