@@ -215,23 +215,9 @@ def _read_ros(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, byte
     if chosen.content == "cloud":
         capture = _organised(ros_recording.read_ros_cloud(chosen, frame), options)
     elif chosen.content == "pair":
-        capture, numbers = ros_recording.read_ros_pair(
-            chosen,
-            frame,
-            calibration=options.cameras,
-            channel=channel_of(options.channel),
-            sensor=options.named,
-        )
+        capture, numbers = ros_recording.read_ros_pair(chosen, frame, options)
     else:
-        capture = ros_recording.read_ros_depth(
-            chosen,
-            frame,
-            calibration=options.cameras,
-            scale_mm=options.scale_mm,
-            invalid=options.invalid,
-            camera=options.camera,
-            sensor=options.named,
-        )
+        capture = ros_recording.read_ros_depth(chosen, frame, options)
     kept = {
         f"{plain_name(topic.name.strip('/').replace('/', '_'))}_{number}.msg": bag.message(topic.name, number)
         for topic, number in zip(chosen.topics, numbers, strict=True)

@@ -15,12 +15,13 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from characterisation.files.errors import InputError, nearest
 from mitsim.capture.capture import Capture
+from mitsim.capture.grey_image import channel_of
 from mitsim.capture.recordings.calibration_file import Calibrated, calibrated_by, read_calibration
 from mitsim.capture.recordings.cloud_numbers import leave_out_marks
 from mitsim.capture.recordings.depth_image import depth_capture, missing_depths
@@ -43,6 +44,9 @@ from mitsim.capture.recordings.ros_messages import (
     unit_of_depths,
 )
 from mitsim.capture.recordings.stereo_pair import names_of_pair, pair_capture
+
+if TYPE_CHECKING:
+    from mitsim.capture.recordings.any_recording import ReadOptions
 
 
 @dataclass(frozen=True)
@@ -141,32 +145,12 @@ def read_ros_cloud(chosen: Chosen, frame: int | None) -> StoredCloud:
     return StoredCloud(bag.path, points, (width, height), records, camera, note=note)
 
 
-def read_ros_depth(
-    chosen: Chosen,
-    frame: int | None,
-    *,
-    calibration: str | Path | None = None,
-    scale_mm: float | None = None,
-    invalid: int | None = None,
-    camera: str | None = None,
-    sensor: str | None = None,
-) -> Capture:
+def read_ros_depth(chosen: Chosen, frame: int | None, options: ReadOptions) -> Capture:
     """Read one depth image of a bag.
 
-    Parameters
-    ----------
-    chosen
-        The topic of depth images.
-    frame
-        Number of the message, from 0; required if there are several.
-    calibration
-        The camera; by default the ``camera_info`` of the topic.
-    scale_mm
-        Depth of one level [mm]; by default that of the encoding, or the one that RealSense's viewer recorded.
-    invalid
-        Level of missing depths; by default 0.
-    camera, sensor
-        As of :func:`~mitsim.capture.recordings.depth_image.read_depth_image`.
+    ``frame`` is the number of the message, from 0; required if there are several. By default the camera is the
+    ``camera_info`` of the topic, and the depth of one level that of the encoding, or the one that RealSense's viewer
+    recorded.
 
     Raises
     ------
@@ -186,41 +170,25 @@ def read_ros_depth(
     if levels.dtype == np.uint8:
         raise InputError(where, "depth", "8 bits", "16 bits or floating point")
     recorded = unit_of_depths(bag, topic) if levels.dtype == np.uint16 else None
-    scale = scale_mm or recorded or unit
-    missing, warnings = missing_depths(levels, invalid or 0)
+    scale = options.scale_mm or recorded or unit
+    missing, warnings = missing_depths(levels, options.invalid or 0)
     with np.errstate(over="ignore"):
         depth = levels.astype(np.float32) * np.float32(scale)
     depth[missing] = np.nan
     size = (depth.shape[1], depth.shape[0])
-    calibrated = _calibrated(chosen, size, calibration)
+    calibrated = _calibrated(chosen, size, options.cameras)
     settings: dict[str, Any] = {"imported_from": bag.path.name, "topic": topic.name, "depth_scale_mm": float(scale)}
     if warnings:
         settings["warnings"] = warnings
-    return depth_capture(depth, calibrated, Path(where), settings | _stamp(message), camera=camera, sensor=sensor)
+    settings |= _stamp(message)
+    return depth_capture(depth, calibrated, Path(where), settings, camera=options.camera, sensor=options.named)
 
 
-def read_ros_pair(
-    chosen: Chosen,
-    frame: int | None,
-    *,
-    calibration: str | Path | None = None,
-    channel: int = 1,
-    sensor: str | None = None,
-) -> tuple[Capture, tuple[int, int]]:
+def read_ros_pair(chosen: Chosen, frame: int | None, options: ReadOptions) -> tuple[Capture, tuple[int, int]]:
     """Read one stereo pair of a bag: the left image by its number, and the right image that is nearest in time.
 
-    Returned with the numbers of both messages.
-
-    Parameters
-    ----------
-    chosen
-        The topics of the left and the right images.
-    frame
-        Number of the left message, from 0; required if there are several.
-    calibration
-        Of both cameras; by default the ``camera_info`` of both topics.
-    channel, sensor
-        Channel of colour images, and name of the sensor.
+    Returned with the numbers of both messages. ``frame`` is that of the left one, from 0; required if there are
+    several. By default the cameras are the ``camera_info`` of both topics.
 
     Raises
     ------
@@ -236,13 +204,14 @@ def read_ros_pair(
     first = read_message(bag, left, number)
     second, other = _of_same_time(bag, right, first, number)
     places = [label_of(topic, bag.path) for topic in chosen.topics]
+    channel = channel_of(options.channel)
     images = [grey_of(message, place, channel) for message, place in zip((first, second), places, strict=True)]
     size = (images[0].shape[1], images[0].shape[0])
-    calibrated = _calibrated(chosen, size, calibration)
-    names = names_of_pair(calibrated, calibration or bag.path)
+    calibrated = _calibrated(chosen, size, options.cameras)
+    names = names_of_pair(calibrated, options.cameras or bag.path)
     settings: dict[str, Any] = {"imported_from": bag.path.name, "topic": [left.name, right.name]} | _stamp(first)
     levels, labels = dict(zip(names, images, strict=True)), dict(zip(names, places, strict=True))
-    return pair_capture(levels, labels, calibrated, settings, sensor), (number, other)
+    return pair_capture(levels, labels, calibrated, settings, options.named), (number, other)
 
 
 def _of_same_time(bag: RosBag, topic: Topic, first: Any, number: int) -> tuple[Any, int]:
