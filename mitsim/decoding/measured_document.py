@@ -39,25 +39,19 @@ def result_table(results: Sequence[Result]) -> str:
 def repeatability_table(repeatabilities: Sequence[Repeatability]) -> str:
     """Return the table of the repeatability over several clouds, one line for each measurement."""
     nominal = any(math.isfinite(repeatability.nominal) for repeatability in repeatabilities)
-    rows = [
-        ["measurement", "n", "mean", "standard deviation", "unit", "u (rms of fits)", *(["error"] if nominal else [])]
-    ]
+    head = ["measurement", "n", "mean", "standard deviation", "unit", "u (rms of fits)"]
+    rows = [head + ["error"] * nominal]
     for repeatability in repeatabilities:
-        rows.append(
-            [
-                repeatability.name,
-                f"{repeatability.count}/{repeatability.cloud_count}",
-                number_with_decimals(repeatability.mean, repeatability.deviation),
-                uncertainty_text(repeatability.deviation),
-                repeatability.unit,
-                uncertainty_text(repeatability.uncertainty),
-                *(
-                    [number_with_decimals(repeatability.mean - repeatability.nominal, repeatability.deviation)]
-                    if nominal
-                    else []
-                ),
-            ]
-        )
+        error = number_with_decimals(repeatability.mean - repeatability.nominal, repeatability.deviation)
+        row = [
+            repeatability.name,
+            f"{repeatability.count}/{repeatability.cloud_count}",
+            number_with_decimals(repeatability.mean, repeatability.deviation),
+            uncertainty_text(repeatability.deviation),
+            repeatability.unit,
+            uncertainty_text(repeatability.uncertainty),
+        ]
+        rows.append(row + [error] * nominal)
     return "\n".join(aligned(rows))
 
 
