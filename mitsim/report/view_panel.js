@@ -34,7 +34,7 @@ function percent(share) {
 const cell = (text, className) => element('td', { class: className }, text);
 const rowHead = (...content) => element('th', { scope: 'row' }, ...content);
 
-// Replace the rows of a table and label their cells by its heads, as mitsim.report.card_tables does for the page's own.
+// Replace the rows of a table and label their cells by its heads, as mitsim.report.templates does for the page's own.
 function replaceRows(body, rows) {
   const heads = [...body.closest('table').tHead.rows[0].cells].map((one) => {
     const copy = one.cloneNode(true);
