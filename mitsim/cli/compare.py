@@ -80,7 +80,8 @@ def compare(
 def _imported(recording: Path, folder: Path, frame: int | None, calibration: Path | None) -> Path:
     """Import a recording into a capture folder."""
     from mitsim.capture.folder import write_capture
-    from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
+    from mitsim.capture.recordings.any_recording import read_recording
+    from mitsim.capture.recordings.read_options import ReadOptions
 
     reading = ReadOptions(frame=frame, calibration=None if calibration is None else str(calibration))
     imported = read_recording(recording, reading)

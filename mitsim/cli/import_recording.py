@@ -140,7 +140,8 @@ def import_(
     """
     arguments = locals()  # by the names of the fields of ReadOptions
     from mitsim.capture.folder import is_written, write_capture
-    from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
+    from mitsim.capture.recordings.any_recording import read_recording
+    from mitsim.capture.recordings.read_options import ReadOptions
     from mitsim.capture.recordings.recognise import NAMES
     from mitsim.capture.recordings.recording_files import plain_name
     from mitsim.decoding.checks.sanity import with_warnings

@@ -18,8 +18,9 @@ from characterisation.point_cloud import PointCloud
 from characterisation.words.progress import say
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
-from mitsim.capture.recordings.any_recording import KINDS, ReadOptions, read_recording
+from mitsim.capture.recordings.any_recording import KINDS, read_recording
 from mitsim.capture.recordings.organised_cloud import NoGridError, read_organised_cloud, read_stored_cloud
+from mitsim.capture.recordings.read_options import ReadOptions
 from mitsim.capture.recordings.recognise import kind_of
 from mitsim.decoding.cloud import Settings, decoder_settings
 from mitsim.decoding.coded_images import decoded_once

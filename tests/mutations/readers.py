@@ -654,27 +654,31 @@ def _read_points(path):
 
 
 def _read_any(path):
-    from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
+    from mitsim.capture.recordings.any_recording import read_recording
+    from mitsim.capture.recordings.read_options import ReadOptions
 
     read_recording(path, ReadOptions())
 
 
 def _read_depths(path):
-    from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
+    from mitsim.capture.recordings.any_recording import read_recording
+    from mitsim.capture.recordings.read_options import ReadOptions
 
     read_recording(path, ReadOptions(sensor="realsense-d435"))
 
 
 def _read_bag(path):
     """Both topics, of which one may be damaged alone."""
-    from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
+    from mitsim.capture.recordings.any_recording import read_recording
+    from mitsim.capture.recordings.read_options import ReadOptions
 
     read_recording(path, ReadOptions(topic=("/points",), frame="0"))
     read_recording(path, ReadOptions(topic=("/camera/depth/image_rect_raw",), frame="0"))
 
 
 def _read_recording(path):
-    from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
+    from mitsim.capture.recordings.any_recording import read_recording
+    from mitsim.capture.recordings.read_options import ReadOptions
 
     read_recording(path.parent if path.suffix == ".json" else path, ReadOptions())
 

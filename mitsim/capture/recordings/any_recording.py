@@ -25,12 +25,13 @@ from mitsim.capture.recordings.ensenso import ensenso_originals, image_sets, rea
 from mitsim.capture.recordings.image_folder import at_size_of_images, read_image_folder
 from mitsim.capture.recordings.organised_cloud import Axes, StoredCloud, read_organised_cloud
 from mitsim.capture.recordings.pose_file import read_pose, unit_note
+from mitsim.capture.recordings.read_options import ReadOptions
 from mitsim.capture.recordings.recognise import NAMES, kind_of
 from mitsim.capture.recordings.recording_files import frame_of, needs_recordings, plain_name
 from mitsim.capture.recordings.robi import read_robi
 from mitsim.capture.recordings.stereo_pair import read_stereo_pair
 from mitsim.sensor.calibration_qualifiers import LENGTHS_MM
-from mitsim.sensor.preset import load_sensor, named_sensor
+from mitsim.sensor.preset import load_sensor
 
 AXES: tuple[Axes, ...] = ("opencv", "opengl")
 
@@ -39,55 +40,6 @@ ALONG = ("axis", "ray")
 
 #: options for recordings of every kind
 FOR_ALL = ("range_mm", "exposure_s", "pose", "sample", "projector")
-
-
-@dataclass(frozen=True)
-class ReadOptions:
-    """Options for reading a recording; None if not given.
-
-    - ``sensor``: a preset or sensor file.
-    - ``calibration``: see :mod:`mitsim.capture.recordings.calibration_file`; ``camera`` of it.
-    - ``frame``: which of several.
-    - ``range_mm``: depths to decode.
-    - ``scale_mm`` of a depth image's grey level, its ``invalid`` level, and ``along`` the ``axis`` or the ``ray``.
-    - ``unit`` and ``axes`` of a cloud; ``link``: an Ensenso's node that transformed it.
-    - ``subpixel_bits`` of disparities.
-    - ``topic`` of a bag of ROS: one, or those of a left and a right camera.
-    - ``images``: a pattern of file names for each camera; ``channel`` of colour images.
-
-    All kinds use ``exposure_s``; ``pose``, a file with ``world_from_sensor``; ``sample`` of a coupon; ``projector``,
-    ``on`` or ``off``.
-    """
-
-    sensor: str | None = None
-    calibration: str | None = None
-    camera: str | None = None
-    frame: int | str | None = None
-    range_mm: tuple[float, float] | None = None
-    scale_mm: float | None = None
-    invalid: int | None = None
-    along: str | None = None
-    unit: str | None = None
-    axes: str | None = None
-    link: str | None = None
-    subpixel_bits: int | None = None
-    topic: tuple[str, ...] | None = None
-    images: dict[str, str] | None = None
-    channel: str | None = None
-    exposure_s: float | None = None
-    pose: str | None = None
-    sample: str | None = None
-    projector: str | None = None
-
-    @property
-    def named(self) -> str | None:
-        """Return the name of the sensor, if one is given."""
-        return None if self.sensor is None else named_sensor(self.sensor)[0]
-
-    @property
-    def cameras(self) -> str | None:
-        """Return the source of the cameras: the calibration, else the sensor."""
-        return self.calibration or self.sensor
 
 
 @dataclass(frozen=True)

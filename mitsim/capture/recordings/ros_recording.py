@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from mitsim.capture.recordings.calibration_file import Calibrated, calibrated_by
 from mitsim.capture.recordings.cloud_numbers import leave_out_marks
 from mitsim.capture.recordings.depth_image import depth_capture, missing_depths
 from mitsim.capture.recordings.organised_cloud import StoredCloud
+from mitsim.capture.recordings.read_options import ReadOptions
 from mitsim.capture.recordings.recording_files import chosen_frame
 from mitsim.capture.recordings.ros_bag import RosBag, Topic
 from mitsim.capture.recordings.ros_messages import (
@@ -44,9 +45,6 @@ from mitsim.capture.recordings.ros_messages import (
     unit_of_depths,
 )
 from mitsim.capture.recordings.stereo_pair import names_of_pair, pair_capture
-
-if TYPE_CHECKING:
-    from mitsim.capture.recordings.any_recording import ReadOptions
 
 
 @dataclass(frozen=True)
