@@ -12,8 +12,8 @@ from jinja2 import Environment, FileSystemLoader
 from matplotlib import colormaps
 
 from characterisation.files.atomic_io import write_netcdf
+from characterisation.words import numbers
 from mitsim.report.view_sphere import view_sphere
-from mitsim.running import numbers
 from mitsim.study.run_folder import read_run
 from tests.report.chromium import BROWSER
 from tests.report.conftest import FEATURES, MEASUREMENTS
