@@ -253,11 +253,16 @@ def verify(
 def _stated_rig(sensor: Sensor, rig: Rig, covariance: RigCovariance) -> tuple[Rig, tuple[str, ...]]:
     """Return the rig that the covariance of a sensor moves, and the names of all parameters of the covariance in it.
 
-    A capture may name its cameras otherwise: then they follow in the order of the sensor's. A capture that lacks an eye
-    or a parameter, such as a device's own cloud, is described by the calibration of the sensor.
+    A capture may name its cameras otherwise: those that the sensor does not name then follow in the order of those that
+    the capture does not name. A capture that lacks an eye or a parameter, such as a device's own cloud, is described by
+    the calibration of the sensor.
     """
     same = set(sensor.measuring_rig.cameras) <= set(rig.cameras)
-    eyes = {} if same else dict(zip(sensor.rig.cameras, rig.cameras, strict=False))
+    own, others = (
+        [name for name in names if name not in shown]
+        for names, shown in ((sensor.rig.cameras, rig.cameras), (rig.cameras, sensor.rig.cameras))
+    )
+    eyes = {} if same else dict(zip(own, others, strict=False))
     split = [name.partition(".") for name in covariance.names]
     names = tuple(f"{eyes.get(eye, eye)}.{parameter}" for eye, _, parameter in split)
     if set(names) <= {*parameter_names(rig), *PATH_NAMES}:

@@ -23,7 +23,7 @@ from mitsim.sensor.transforms import Transform
 from mitsim.sensor.unknowns import CalibrationUnknowns, TemperatureUnknowns
 from mitsim.study.calibration.accuracy import triangulated
 from mitsim.study.calibration.board import Board
-from mitsim.study.calibration.verification import KnownPoints, corners_of_board, verify
+from mitsim.study.calibration.verification import KnownPoints, _stated_rig, corners_of_board, verify
 from mitsim.study.virtual.study_unknowns import calibration_covariance, with_temperature
 from mitsim.twin.sensor.run import sensor_path
 from tests.shell import mitsim_here
@@ -105,6 +105,17 @@ def test_rigs_drawn_from_the_covariance_are_usable(n10, good):
     drawn = [moved(n10.rig, covariance.names, covariance.draw(rng)) for _ in range(10)]
     found = [verify(seen_through(n10, true, base), n10, n10.rig, covariance).usable for true in drawn]
     assert found.count(False) <= 4
+
+
+def test_errors_of_a_camera_go_to_no_other_that_a_capture_names(n10):
+    """Before, those of the left camera went to the first of the capture, its right one."""
+    left, right = n10.rig.cameras.values()
+    covariance = preset_covariance(n10)
+    other = replace(n10.rig, cameras={"right": right, "aux": left})
+    assert _stated_rig(n10, other, covariance) == (n10.rig, covariance.names)  # whose first camera is no right one
+    shown, names = _stated_rig(n10, replace(n10.rig, cameras={"left": left, "aux": right}), covariance)
+    assert shown.cameras["aux"] is right
+    assert names == tuple(name.replace("right.", "aux.") for name in covariance.names)
 
 
 def test_the_names_of_cameras_do_not_matter(n10, good, turned):
