@@ -190,16 +190,16 @@ def _without_statement(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
     verdicts = face_verdicts(
         {name: (measurement.shapes, "not decided") for name, measurement in about.measurements.items()}
     )
-    made = how_many(about.race_trials, "virtual measurement")
+    made = f"and {how_many(about.race_trials, 'virtual measurement')}" if about.race_trials else "alone"
     return FirstScreen(
-        [Reason(f"View {leader} leads so far, by {made}; no uncertainty is stated yet")],
+        [Reason(f"View {leader} leads so far, by the performance map {made}; no uncertainty is stated yet")],
         "warn",
         rows,
         _picture(geometry, poses, verdicts, _caption(run, leader)),
         poses,
         verdicts,
         about.race_trials,
-        doubts=(f"Standard uncertainties are expected by the performance map and {made}, and include the bias",),
+        doubts=(f"Standard uncertainties are expected by the performance map {made}, and include the bias",),
     )
 
 

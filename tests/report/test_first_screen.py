@@ -234,7 +234,12 @@ def test_a_run_without_a_statement_shows_the_leading_view_so_far(run_folder, tmp
     assert f"view {view}" in first.picture.caption and len(first.rows) == len(MEASUREMENTS)
     with without_pictures():
         page = write_report(folder).read_text()
-    assert "No view can make the measurements" not in page
+    assert "No view can make the measurements" not in page and "by virtual measurements" in page
+    (folder / "run.json").write_text(json.dumps(about | {"race_trials": 0}))
+    first = of_run(read_run(folder), read_scene_geometry(folder))
+    assert first.words().startswith(f"View {view} leads so far, by the performance map alone; ")
+    with without_pictures():
+        assert "It made no virtual measurement." in write_report(folder).read_text()
     (folder / "run.json").write_text(json.dumps(about | {"leaders": {}}))
     with without_pictures():
         assert "No view can make the measurements" in write_report(folder).read_text()
