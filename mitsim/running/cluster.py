@@ -25,7 +25,6 @@ from characterisation.files.errors import InputError, MissingEnvironmentError
 from characterisation.words.progress import say
 from mitsim.running.build import differences, own_build
 from mitsim.running.executor import finished_orders, never
-from mitsim.running.time_limit import OutOfTimeError
 
 Item = TypeVar("Item")
 Plain = TypeVar("Plain")
@@ -92,13 +91,6 @@ class Cluster:
         build = own_build()
         _compare_builds(self.client, self.address, build)
         executor = self.client.get_executor(pure=False)
-        watch = _Watch(self.client, self.address)
-
-        def idle() -> None:
-            if self.given_up():
-                raise OutOfTimeError
-            watch.check()
-
         try:
             running: dict[Any, Item] = {}
             yield from finished_orders(
@@ -106,11 +98,10 @@ class Cluster:
                 running,
                 lambda item: executor.submit(_of_same_build, self.address, build, work, order(item)),
                 lambda: 0 if len(running) < AHEAD * max(sum(self.client.ncores().values()), 1) else None,
-                idle,
+                self.given_up,
                 _POLL_S,
+                _Watch(self.client, self.address).check,
             )
-        except OutOfTimeError:
-            return
         except (InputError, MissingEnvironmentError):
             raise
         except Exception as error:  # any error of a worker or the network

@@ -28,7 +28,6 @@ from typing import Protocol, TypeVar
 from characterisation.files.errors import InputError, MissingEnvironmentError
 from characterisation.files.threads import keep_blas_to_one_thread, usable_cores
 from characterisation.words.progress import say, track
-from mitsim.running.time_limit import OutOfTimeError
 
 Item = TypeVar("Item")
 Plain = TypeVar("Plain")
@@ -43,7 +42,7 @@ AHEAD = 2
 #: number of processes that may die in a row without any finished order
 DEATHS = 5
 
-#: time between questions whether to give up the orders in work [s]
+#: time between questions whether to give up the orders in work [s]; chosen
 _POLL_S = 0.2
 
 #: where Linux tells the memory of a container: limit, use and its parts, and the name of cached files, of versions 2, 1
@@ -136,20 +135,21 @@ def finished_orders(
     running: dict[Future[Result], Item],
     submit: Callable[[Item], Future[Result]],
     next_of: Callable[[], int | None],
+    given_up: Callable[[], bool],
+    idle_s: float,
     idle: Callable[[], None] = lambda: None,
-    idle_s: float | None = None,
 ) -> Iterator[tuple[Item, Result]]:
     """Submit waiting items while there is room, and yield each with its result as it is finished.
 
     Parameters
     ----------
     waiting, running
-        Items that wait, and those in work by their futures; both are changed. After an error, ``running`` has the items
-        without a result. Their futures are cancelled.
+        Items that wait, and those in work by their futures; both are changed. After an error, or when given up,
+        ``running`` has the items without a result. Their futures are cancelled.
     submit, next_of
         Start the work on an item; return the index of the next among those that wait, None without room.
-    idle, idle_s
-        Called when no item was finished for ``idle_s`` [s].
+    given_up, idle_s, idle
+        When no item was finished for ``idle_s`` [s], ends if given up, and else calls ``idle``.
 
     See Also
     --------
@@ -163,6 +163,8 @@ def finished_orders(
                 del waiting[index]
             done = wait(running, idle_s, FIRST_COMPLETED).done
             if not done:
+                if given_up():
+                    return
                 idle()
             for future in done:
                 result = future.result()
@@ -214,9 +216,9 @@ class Pool:
             return future
 
         try:
-            while waiting or running:
+            while (waiting or running) and not self.given_up():
                 try:
-                    for finished in finished_orders(waiting, running, submit, next_of, self._check, _POLL_S):
+                    for finished in finished_orders(waiting, running, submit, next_of, self.given_up, _POLL_S):
                         deaths = 0
                         yield finished
                 except BrokenProcessPool:
@@ -230,15 +232,9 @@ class Pool:
                             "finished work is kept: use fewer, and run the same command again"
                         ) from None
                     say("a worker process died; its work is repeated")
-        except OutOfTimeError:
-            return
         finally:
             if self.given_up() and any(not future.done() for future in running):
                 self._end()
-
-    def _check(self) -> None:
-        if self.given_up():
-            raise OutOfTimeError
 
     def _end(self) -> None:
         """End the processes at once, and lose the results of their orders."""
