@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import xarray as xr
@@ -16,6 +17,7 @@ from mitsim.study.run_record import draw_clouds, write_record
 from mitsim.study.scoring import write_raced
 from mitsim.study.session import Session
 from mitsim.study.statement_document import statement_document
+from mitsim.study.time_plan import TimePlan
 from mitsim.study.virtual.race import ALL, Raced
 from mitsim.study.virtual.stated import StatedView
 
@@ -39,7 +41,7 @@ class StepTimes:
 class Answers:
     """Answers before the end of a run: its folder and report, first after a minute and then as they improve.
 
-    ``longest_s``: the longest time [s] that one has taken so far.
+    ``plan`` has the longest time that one has taken so far as its ``page_s``.
     """
 
     def __init__(
@@ -47,15 +49,15 @@ class Answers:
         session: Session,
         performance_map: PerformanceMap,
         scores: xr.Dataset,
+        plan: TimePlan,
         limit: TimeLimit,
         clock: StepTimes,
         report: Callable[[], object] | None,
     ) -> None:
         self.session, self.map, self.scores = session, performance_map, scores
-        self.limit, self.clock, self.report = limit, clock, report
+        self.plan, self.limit, self.clock, self.report = plan, limit, clock, report
         self.next_s = FIRST_ANSWER_S
         self.drawn: set[int] = set()
-        self.longest_s = 0.0
 
     def improve(self, raced: Raced, stated: StatedView | None = None) -> None:
         """Write the answer so far, if it is time for one, and the last one is not due when this is ready.
@@ -63,7 +65,7 @@ class Answers:
         Each takes at most a tenth of the time since the last.
         """
         due = self.report is not None and self.limit.elapsed >= self.next_s
-        if not due or self.limit.over() or self.limit.left < 2 * self.longest_s:
+        if not due or self.limit.over() or self.limit.left < 2 * self.plan.page_s:
             return
         assert self.report is not None
         began = time.monotonic()
@@ -82,5 +84,5 @@ class Answers:
         first = self.next_s == FIRST_ANSWER_S
         say(f"{'first answer' if first else 'answer'} after {self.limit.elapsed:.0f} s: view {leader}, report.html")
         took = time.monotonic() - began
-        self.longest_s = max(self.longest_s, took)
+        self.plan = replace(self.plan, page_s=max(self.plan.page_s, took))
         self.next_s = self.limit.elapsed + max(FIRST_ANSWER_S, 10 * took)

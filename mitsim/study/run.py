@@ -46,7 +46,7 @@ from mitsim.study.run_record import draw_clouds, lacking, write_record
 from mitsim.study.scoring import score_study, write_raced
 from mitsim.study.session import Session
 from mitsim.study.statement_document import statement_document
-from mitsim.study.time_plan import TimePlan, busyness, time_plan
+from mitsim.study.time_plan import busyness, time_plan
 from mitsim.study.view_sets.confirmed_set import (
     Search,
     TriedSet,
@@ -138,11 +138,11 @@ def run_within(
     scores, chosen, search = score_study(session, performance_map, plan.screening_limit(limit))
     clock.lap("score")
     plan = replace(plan, busy=busyness(limit.elapsed))
-    answers = Answers(session, performance_map, scores, limit, clock, report)
-    with giving_up(workers, lambda: replace(plan, page_s=answers.longest_s).closing(limit)):
-        measured = _measure(answers, plan, chosen, search)
+    answers = Answers(session, performance_map, scores, plan, limit, clock, report)
+    with giving_up(workers, lambda: answers.plan.closing(limit)):
+        measured = _measure(answers, chosen, search)
     scores, leaders, stated = measured.scores, measured.leaders, measured.stated
-    pictured = replace(plan, page_s=answers.longest_s).last_limit(limit)
+    pictured = answers.plan.last_limit(limit)
     first = dict.fromkeys([*leaders, *(measured.chosen.views if measured.chosen else ()), *_best(scores)])
     drawn = sorted(draw_clouds(session, performance_map, list(first), pictured))
     renderer = session.renderer
@@ -198,18 +198,18 @@ class _Measured:
         return list(dict.fromkeys(self.raced.leaders().values()))
 
 
-def _measure(answers: Answers, plan: TimePlan, chosen: ViewSet | None, search: Search) -> _Measured:
+def _measure(answers: Answers, chosen: ViewSet | None, search: Search) -> _Measured:
     """Race the views of a scored study, state the best, look for changes that fit, and measure a set of views."""
     session, limit, clock = answers.session, answers.limit, answers.clock
     study, scores = session.study, answers.scores
     minutes_of_race = study.file.race.minutes
     race_limit = TimeLimit(minutes_of_race and 60 * minutes_of_race)
     if limit.end is not None:
-        race_limit = min(race_limit, plan.race_limit(limit), key=lambda each: each.left)
+        race_limit = min(race_limit, answers.plan.race_limit(limit), key=lambda each: each.left)
     raced = session.race(scores, None, race_limit, answers.improve)
     scores = write_raced(session, scores, raced)
     clock.lap("race")
-    plan = replace(plan, page_s=answers.longest_s)
+    plan = answers.plan
     leader = raced.leader(ALL) if len(raced.views) else None
     stated, rest_limit = None, plan.rest_limit(limit)
     if leader is not None and (not plan.closing(limit) or session.trials.known(leader)):  # a trial may take minutes
