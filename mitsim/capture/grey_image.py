@@ -31,10 +31,10 @@ SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".pgm")
 #: first bytes of a TIFF, and the byte order of its numbers
 _TIFF_MARKS = {b"II*\0": "<", b"MM\0*": ">", b"II+\0": "<", b"MM\0+": ">"}
 
-#: most pages of a file
+#: most pages of a file; chosen
 _MOST_PAGES = 10_000
 
-#: tag of the kind of a page
+#: tag of the kind of a page (TIFF 6.0, NewSubfileType)
 _KIND = 254
 #: bits of the kind: a reduced copy, and a mask
 _REDUCED_OR_MASK = 0b101
@@ -45,7 +45,7 @@ _PFM = re.compile(rb"P[fF]\s+\d+\s+\d+\s+(\S{1,40})\s")
 Image = NDArray[np.unsignedinteger[Any]]
 
 
-#: fewest lower bits that are empty in all levels of images whose levels are in the upper bits
+#: fewest lower bits that are empty in all levels of images whose levels are in the upper bits; chosen
 _LEAST_EMPTY = 2
 
 #: channels of a colour image, in the order of OpenCV

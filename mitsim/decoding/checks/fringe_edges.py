@@ -22,7 +22,7 @@ from mitsim.sensor.light_code import GrayCode
 ENOUGH = 30
 
 #: least share of the changes of a stripe's number that are by one: along a surface one bit changes at a time, and of
-#: bits in another order or exchanged with complements at most two thirds of the changes are
+#: bits in another order or exchanged with complements at most two thirds of the changes are; chosen between
 _BY_ONE = 0.75
 
 
