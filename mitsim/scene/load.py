@@ -25,7 +25,7 @@ from mitsim.scene.materials import Finish, loading, register
 from mitsim.scene.mirrored import face_normals_side
 from mitsim.scene.scene_errors import explain_error
 from mitsim.scene.surface.scatter import NOMINAL, Deviation
-from mitsim.scene.xml_check import check_rotations, checked_trees
+from mitsim.scene.xml_check import check_rotations, check_spectra, checked_trees
 from mitsim.sensor.poses import as_pose
 from mitsim.sensor.transforms import Transform
 
@@ -177,7 +177,7 @@ def load_scene(
     """
     path = Path(path)
     parameters = parameters or {}
-    _check_xml(path, parameters)
+    _check_xml(path, parameters, wavelength_nm)
     _prepare()
     with loading(wavelength_nm, str(path), path.parent, deviation, sprayed) as state:
         try:
@@ -317,7 +317,7 @@ def _check_round(where: str, name: str, shape: Any) -> None:
         raise InputError(where, f"shape {name}", found, "a circular section", "mesh other forms: mitsim part")
 
 
-def _check_xml(path: Path, parameters: dict[str, str]) -> None:
+def _check_xml(path: Path, parameters: dict[str, str], wavelength_nm: float) -> None:
     root, *_ = trees = checked_trees(path, parameters)
     if root.tag != "scene":
         raise InputError(path, "", f"the root element <{root.tag}>", "<scene version='3.0.0'>")
@@ -327,6 +327,7 @@ def _check_xml(path: Path, parameters: dict[str, str]) -> None:
             allowed = ", ".join(names) or "none: the scene has no <default>"
             raise InputError(path, name, "a parameter that the scene does not have", allowed, nearest(name, names))
     check_rotations(path, trees, parameters)
+    check_spectra(path, trees, parameters, wavelength_nm)
 
 
 def _one_line(error: Exception) -> str:

@@ -6,6 +6,7 @@ a pipe waits forever.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import math
 import re
@@ -14,6 +15,8 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from characterisation.files.checked_files import is_file, read_bounded
 from characterisation.files.errors import InputError, nearest
@@ -38,6 +41,9 @@ LARGEST_NAME = 4096
 
 #: plugins that read a file; not all of them check that it exists
 _FILE_PLUGINS = {"bitmap", "envmap", "gridvolume", "measured", "ply", "obj", "serialized"}
+
+#: plugins of spectra that Mitsuba cannot evaluate with one wavelength
+_OF_WAVELENGTHS = {"irregular", "regular", "blackbody", "discrete"}
 
 #: deepest chain of includes; a longer one is taken for a cycle
 _MOST_INCLUDES = 16
@@ -70,8 +76,7 @@ def check_rotations(path: Path, trees: Sequence[ElementTree.Element], parameters
     InputError
         For the first that is not, with the unit vector.
     """
-    elements = [element for root in trees for element in root.iter()]
-    values = {str(e.get("name")): str(e.get("value")) for e in elements if e.tag == "default"} | dict(parameters)
+    elements, values = _elements(trees, parameters)
     for element in elements:
         if element.tag != "rotate":
             continue
@@ -86,6 +91,54 @@ def check_rotations(path: Path, trees: Sequence[ElementTree.Element], parameters
             raise InputError(path, "rotate", f"an axis of length {length:.6g}", f"a unit vector: {unit}")
 
 
+def check_spectra(
+    path: Path, trees: Sequence[ElementTree.Element], parameters: Mapping[str, str], wavelength_nm: float
+) -> None:
+    """Check that every spectrum is one number: with one wavelength Mitsuba takes the luminance of other spectra.
+
+    Parameters
+    ----------
+    path, trees, parameters
+        The scene, from :func:`checked_trees`, and the values of its parameters.
+    wavelength_nm
+        Of the sensor.
+
+    Raises
+    ------
+    InputError
+        For the first that is not, with its value at the wavelength if the scene states it.
+
+    See Also
+    --------
+    mitsim.scene.load.load_scene : load the scene
+    """
+    elements, values = _elements(trees, parameters)
+    for element in elements:
+        text, name = _filled_in(element.get("value", ""), values), element.get("name", "")
+        if element.tag == "string" and name == "material" and text != "none":
+            allowed = f"none, with the spectra eta and k at {wavelength_nm:g} nm; or a machined_metal"
+            raise InputError(path, "material", repr(text), allowed)
+        found = element.get("filename") or (element.get("type") if element.get("type") in _OF_WAVELENGTHS else "")
+        if element.tag != "spectrum" or not (found or ":" in text):
+            continue
+        allowed = f"one number, its value at the sensor's wavelength, {wavelength_nm:g} nm"
+        with contextlib.suppress(ValueError):
+            pairs = np.array([pair.split(":") for pair in text.replace(",", " ").split()], float)
+            if pairs.size and pairs[0, 0] <= wavelength_nm <= pairs[-1, 0]:
+                allowed += f': value="{np.interp(wavelength_nm, *pairs.T):.6g}"'
+        raise InputError(path, f"spectrum {name}".strip(), repr(found or text), allowed)
+
+
+def _elements(
+    trees: Sequence[ElementTree.Element], parameters: Mapping[str, str]
+) -> tuple[list[ElementTree.Element], dict[str, str]]:
+    """Return all elements of some trees, and the values of their parameters."""
+    elements = [element for root in trees for element in root.iter()]
+    return elements, {str(e.get("name")): str(e.get("value")) for e in elements if e.tag == "default"} | dict(
+        parameters
+    )
+
+
 def _scene_files(path: Path, parameters: Mapping[str, str]) -> list[Path]:
     """Return every file that determines a scene: its XML first, then includes, meshes, textures and spectra.
 
@@ -93,8 +146,7 @@ def _scene_files(path: Path, parameters: Mapping[str, str]) -> list[Path]:
     ``<path>`` of it, else to the working folder, as for Mitsuba. A missing file is left out, since Mitsuba reports it.
     """
     trees = _with_includes(path, dict(parameters))
-    elements = [element for _, root in trees for element in root.iter()]
-    values = {str(e.get("name")): str(e.get("value")) for e in elements if e.tag == "default"} | dict(parameters)
+    elements, values = _elements([root for _, root in trees], parameters)
     folders = [path.parent]
     folders += [path.parent / _filled_in(str(e.get("value")), values) for e in elements if e.tag == "path"]
     files = dict.fromkeys(file for file, _ in trees)

@@ -160,3 +160,43 @@ def test_finishes_without_an_id_have_the_same_names_in_each_loading_and_deviate_
         for one, other in zip(plain.finishes, deviated.finishes, strict=True)
     )
     assert first == 1.0 and second > 1.05
+
+
+@pytest.mark.parametrize(
+    ("element", "told"),
+    [
+        # half way between 800 and 900 nm; Mitsuba takes 0.261, the luminance
+        (
+            '<spectrum name="reflectance" value="400:0.1, 800:0.6, 900:0.8"/>',
+            r'spectrum reflectance.*850 nm: value="0.7"',
+        ),
+        ('<spectrum name="reflectance" value="400:$low 700:0.6"/>', "'400:0.1 700:0.6'; allowed: one number.*850 nm$"),
+        ('<spectrum name="reflectance" filename="paint.spd"/>', "'paint.spd'; allowed: one number"),
+        ('<spectrum name="reflectance" type="blackbody"/>', "'blackbody'; allowed: one number"),
+    ],
+)
+def test_a_spectrum_is_its_value_at_the_sensors_wavelength(tmp_path, element, told):
+    """Of a function of the wavelength Mitsuba took the luminance, as the eye sees it: a lamp was off by factors."""
+    text = '<scene version="3.0.0"><default name="low" value="0.1"/><shape type="disk"><bsdf type="diffuse">{}</bsdf>'
+    (tmp_path / "scene.xml").write_text(
+        text.format(element) + '<transform name="to_world"><scale value="9"/></transform></shape></scene>'
+    )
+    with pytest.raises(InputError, match=told):
+        load_scene(tmp_path / "scene.xml", 850)
+
+
+def test_a_metal_of_mitsuba_is_rejected(tmp_path):
+    """Gold reflects 98 % at 850 nm (Johnson and Christy: n 0.16, k 5.3), and 82 % by the luminance of n and k."""
+    text = (
+        '<scene version="3.0.0"><shape type="sphere" id="ball"><float name="radius" value="9"/><bsdf type="conductor">'
+    )
+    index = '<spectrum name="eta" value="0.16"/><spectrum name="k" value="5.3"/>'
+    for content in ('<string name="material" value="Au"/>', '<string name="material" value="none"/>', index):
+        (tmp_path / "scene.xml").write_text(f"{text}{content}</bsdf></shape></scene>")
+        if "Au" in content:
+            with pytest.raises(
+                InputError, match="material: found 'Au'; allowed: none, with the spectra eta and k at 850"
+            ):
+                load_scene(tmp_path / "scene.xml", 850)
+        else:
+            assert load_scene(tmp_path / "scene.xml", 850).names == ("ball",)
