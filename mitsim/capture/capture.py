@@ -6,7 +6,6 @@ map and report. Maps of depth, disparity or points that a device computes itself
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from characterisation.files.errors import InputError
 from mitsim.capture.decoding import Decoding
 from mitsim.sensor.camera import Rig
+from mitsim.sensor.modulation import correlated_light
 from mitsim.sensor.transforms import Transform
 
 Source = Literal["simulated", "device", "replay", "emulator"]
@@ -121,7 +121,7 @@ class Capture:
         """
         stack = self.images[camera]
         if self.technology == "time_of_flight":
-            return np.asarray(2 * math.sqrt(2) * stack.std(axis=0, dtype=np.float64))
+            return correlated_light(stack)
         lit = stack[:-1] if self.decoding.ambient_image and len(stack) > 1 else stack
         return np.asarray(lit.mean(axis=0, dtype=np.float64))
 

@@ -137,6 +137,11 @@ def delayed(
     return out
 
 
+def correlated_light(stack: NDArray[np.generic]) -> NDArray[np.float64]:
+    """Return the light (H, W) [DN] of correlations (P, H, W): their range over the phase steps, twice the amplitude."""
+    return np.asarray(2 * np.sqrt(2) * stack.std(axis=0, dtype=np.float64))
+
+
 def expose_taps(
     electrons: NDArray[np.floating],
     code: AmplitudeModulation,

@@ -190,14 +190,11 @@ def _scale(
         allowed = f"under {full}, since a saturated image does not determine the power"
         raise InputError(where, "images", found, allowed, "repeat the capture with a shorter exposure")
     needed = list(plain.images)
-    if isinstance(simulated.sensor.pattern, AmplitudeModulation):  # its taps are exposed together
-        needed = list(range(len(light.radiance[name])))
 
     def too_bright(scale: float) -> bool:
         radiance = light.radiance[name][needed] * np.float32(scale)
         seen = simulated.expose(replace(light, radiance={name: radiance}, rois={name: roi}), seed).images[name]
-        seen = seen[[needed.index(number) for number in plain.images]].max(axis=0)
-        return median_level(np.bincount(seen[there])) > wanted
+        return median_level(np.bincount(plain.merged(seen)[there])) > wanted
 
     low, high = _SCALES
     if too_bright(low) or not too_bright(high):
