@@ -159,7 +159,7 @@ def decode_time_of_flight(
     PointCloud
         On the camera's own pixels, points in the sensor frame [mm]. Status:
 
-        - ``SATURATED``: an image is at full scale.
+        - ``SATURATED``: an image is at full scale, or at 0 where another is not.
         - ``LOW_MODULATION``: the amplitude at one frequency at least is too small. The surface is dark or in shadow, or
           near and far light in one pixel cancel.
         - ``NO_SURFACE``: the same, where the light source does not reach the ray.
@@ -207,9 +207,9 @@ def decode_time_of_flight(
     path, sigma_path, chi_square = joint_path(phases.phase, noise, code, settings.systematic_rad)
     points, sigma, in_range = _points(path, sigma_path, geometry, settings, region)
     low_amplitude = phases.modulation.min(axis=0) < settings.minimum_amplitude_dn * full_scale / 255
-    status = rejection_status(
-        stack.max(axis=0) >= full_scale, low_amplitude, chi_square > settings.consistency_sigma**2
-    )
+    most, least = stack.max(axis=0), stack.min(axis=0)
+    clipped = (most >= full_scale) | ((least <= 0) & (most > 0))  # a difference can leave the scale at either end
+    status = rejection_status(clipped, low_amplitude, chi_square > settings.consistency_sigma**2)
     status[(status == Status.VALID) & ~in_range] = Status.OUT_OF_RANGE
     status[(status == Status.LOW_MODULATION) & ~geometry.seen[region]] = Status.NO_SURFACE
     status[np.isnan(geometry.ray[region]).any(axis=-1)] = Status.UNCALIBRATED

@@ -202,6 +202,27 @@ def test_a_pixel_with_a_full_tap_is_saturated_and_no_other():
     np.testing.assert_array_equal(saturated, [[False, False, False], [False, False, True]])
 
 
+def test_a_difference_below_the_scale_is_saturated_and_not_a_wrong_point(rng):
+    """With black at a quarter of the scale a strong difference is cut off at 0, and the phases are wrong."""
+    code, own = modulation(steps=4), rig()
+    geometry = geometry_of(own)
+    distance = rng.uniform(700, 4000, SHAPE)
+    path = path_to(geometry, own, distance)
+    chip = Imager(pixel_um=10, quantum_efficiency=0.2, full_well=20000, read_noise=20, bits=12, black_level=1024)
+    frequency, delay, contrast = (values[:, None, None] for values in code.images())
+    correlation = contrast * np.cos(2 * np.pi * frequency * path / LIGHT_MM_S - delay)
+    gain = (4095 - 1024) / 20000
+    for charge, any_cut in ((6000.0, False), (8000.0, True)):  # electrons of both taps; 1024 DN are 6669 of them
+        stack = expose_taps(charge * (1 + correlation), code, chip, None, Noise(), rng)
+        cloud = decode_time_of_flight(stack, geometry, code, SETTINGS, ImageContext("test", "simulated", 4095.0, chip))
+        cut = (1024 + gain * charge * correlation).min(axis=0) < -70  # 5 sigma below 0
+        assert cut.any() == any_cut and (cloud.status[cut] == Status.SATURATED).all()
+        off = np.linalg.norm(cloud.points - geometry.camera.centre, axis=-1)[cloud.valid] - distance[cloud.valid]
+        assert np.sqrt(np.mean((off / cloud.sigma[cloud.valid]) ** 2)) == pytest.approx(
+            1, abs=0.2
+        )  # of the noise, those are kept that stay above 0
+
+
 def test_a_delay_of_the_pixels_is_a_longer_path(rng):
     """For light of several paths at once too; the offset of a pixel (DSNU) is that of its difference."""
     code = AmplitudeModulation(
