@@ -108,7 +108,9 @@ def test_interreflections_of_a_view_are_rendered_once(study, limited, monkeypatc
     def images(_, scene, poses):
         rendered.extend(pose.matrix().tobytes() for pose in poses)
         whole = effect.rays.whole
-        image = InterreflectionImage(effect.coarse, whole, np.zeros((4, whole.height, whole.width)))
+        values = np.zeros((5, whole.height, whole.width))
+        values[4] = 1  # times the noise
+        image = InterreflectionImage(effect.coarse, whole, values)
         return [image] * len(poses)
 
     monkeypatch.setattr(InterreflectionEffect, "render_views", images)

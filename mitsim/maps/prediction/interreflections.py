@@ -10,7 +10,8 @@ code of another place. Weak interreflections are a background that reduces the c
 
     h = 1 + rho,
 
-and adds shot noise to a phase, h = sqrt(1 + rho) (EMVA 1288: the variance of a photon signal is its mean). Under strong
+and adds shot noise to a phase, h = sqrt(1 + rho) (EMVA 1288: the variance of a photon signal is its mean). For time of
+flight h is the ratio of the decoder's sigma: the modulation of interreflected light counts too. Under strong
 interreflections the other code prevails: the decoder rejects the pixel, or the point is false. The share of points that
 are found at the right place is
 
@@ -116,17 +117,19 @@ class Interreflections:
 
     ``displaced`` (n,) is the bias of a phase code [rad] or of a path [mm], ``scattered`` (n,) the standard deviation
     about it. ``rejected`` (n,) is the share that a time-of-flight decoder rejects. All three are 0 for other sensors.
+    ``noisier`` (n,) is the factor on the noise of a path, or that of a phase.
     """
 
     rho: Floats
     displaced: Floats
     scattered: Floats
     rejected: Floats
+    noisier: Floats
 
 
 @dataclass(frozen=True)
 class InterreflectionImage:
-    """:class:`Interreflections` of the pixels of a ``region`` of a ``camera``, (4, h, w) in the order of its fields."""
+    """:class:`Interreflections` of the pixels of a ``region`` of a ``camera``, (5, h, w) in the order of its fields."""
 
     camera: Camera
     region: Roi
@@ -135,13 +138,13 @@ class InterreflectionImage:
     def at(self, points: NDArray[np.floating]) -> Interreflections:
         """Return the values of the pixels that show points (n, 3) of the sensor frame.
 
-        Points outside the region have rho NaN, and 0 for the other values.
+        Points outside the region have rho NaN, ``noisier`` 1, and 0 for the other values.
         """
         pixels = np.nan_to_num(self.camera.project(np.asarray(points, float)), nan=-9)
         column, row = (np.rint(pixels).astype(int) - [self.region.left, self.region.top]).T
         inside = (column >= 0) & (row >= 0) & (column < self.region.width) & (row < self.region.height)
-        rho, *values = self.values[:, np.where(inside, row, 0), np.where(inside, column, 0)]
-        return Interreflections(np.where(inside, rho, np.nan), *(np.where(inside, value, 0.0) for value in values))
+        values = self.values[:, np.where(inside, row, 0), np.where(inside, column, 0)]
+        return Interreflections(*np.where(inside, values, np.array([[np.nan], [0], [0], [0], [1]])))
 
 
 class InterreflectionEffect:
@@ -192,7 +195,7 @@ class InterreflectionEffect:
                 self.fringe.range_bias(phase, view.ideal)
                 for phase in (interreflections.displaced, interreflections.scattered)
             )
-        return Perturbation(kept, np.sqrt(1 + rho), displaced, np.abs(scattered), nothing.shared)
+        return Perturbation(kept, interreflections.noisier, displaced, np.abs(scattered), nothing.shared)
 
     def _rendered_with_next(self, scene: Scene, pose: Transform) -> InterreflectionImage:
         """Return the image of a view; if it is one of ``poses``, render it together with those that follow."""
@@ -260,10 +263,11 @@ class InterreflectionEffect:
         with np.errstate(divide="ignore", invalid="ignore"):
             rho = np.where(first > 0, other / first, np.nan)
         displaced, scattered, rejected = np.zeros((3, *rho.shape))
+        noisier = np.sqrt(1 + np.nan_to_num(rho))
         if isinstance(code, AmplitudeModulation):
             assert isinstance(self.sensor.settings, TimeOfFlightSettings)
             levels = self._levels(region)
-            displaced, rejected = path_bias(
+            displaced, rejected, noisier = path_bias(
                 path_amplitudes(direct, code) * levels,
                 path_amplitudes(indirect[0], code) * levels,
                 code,
@@ -277,7 +281,7 @@ class InterreflectionEffect:
             displaced, scattered = phase_bias(
                 direct_amplitude, (indirect_amplitudes[0], indirect_amplitudes[1]), shape, self.step
             )
-        return InterreflectionImage(self.coarse, region, np.stack([rho, displaced, scattered, rejected]))
+        return InterreflectionImage(self.coarse, region, np.stack([rho, displaced, scattered, rejected, noisier]))
 
     def _levels(self, region: Roi) -> float | Floats:
         """Return grey levels per radiance [DN / (W mm^-2 sr^-1)] in the shortest exposure, for pixels of a region."""

@@ -3,11 +3,12 @@ r"""Bias of a time-of-flight path by interreflections.
 Signal chain: correlations of direct light and of interreflections (:mod:`mitsim.maps.prediction.interreflections`) ->
 complex amplitudes A_1 and A_2 at every frequency -> A_2 relative to the phase of A_1, smoothed over one face -> its
 ratio z to A_1 -> phases with and without arg(1 + z) -> the sensor's decoder
-(:func:`mitsim.decoding.time_of_flight.joint_path`) -> bias of the path, and whether the decoder rejects the phases.
+(:func:`mitsim.decoding.time_of_flight.joint_path`) -> bias of the path, whether the decoder rejects the phases, and its
+sigma with A_1 + A_2 over that with A_1.
 
 A time-of-flight imager adds amplitudes: it measures the phase of A_1 + A_2, where A_2 has travelled a longer path. A
-concave face, or one next to another, therefore appears too far away ("multipath"; Fuchs, ICPR 2010, recalled). The
-model has no fitted constants.
+concave face, or one next to another, therefore appears too far away ("multipath"; Fuchs, ICPR 2010, recalled). Where
+the two are nearly in phase the amplitude grows, and the noise falls. The model has no fitted constants.
 """
 
 from __future__ import annotations
@@ -45,10 +46,10 @@ def path_bias(
     imager: Imager,
     shape: NDArray[np.integer],
     step: int,
-) -> tuple[Floats, Floats]:
-    """Return the bias of the path (H, W) [mm], and whether the decoder rejects the phases (H, W), 1 or 0.
+) -> tuple[Floats, Floats, Floats]:
+    """Return the bias of the path [mm], whether the decoder rejects the phases, 1 or 0, and a factor on sigma; (H, W).
 
-    The bias is 0 without direct light.
+    Without direct light the bias is 0 and the factor 1.
 
     Parameters
     ----------
@@ -69,18 +70,20 @@ def path_bias(
         z = (mean[: len(size)] + 1j * mean[len(size) :]) / size
     lit = np.isfinite(z).all(axis=0)
     z = np.where(lit, z, 0.0)
-    noise = np.stack(
-        [
+
+    def decoded(phase: Floats, amplitude: Floats) -> tuple[Floats, NDArray[np.float32], NDArray[np.float32]]:
+        """Return path, sigma and disagreement (H, W) of phases and amplitudes [DN] (F, H, W)."""
+        noise = [
             sample_variance(level, float(contrast), imager) * 2 / code.steps / np.maximum(level, 1e-3) ** 2
-            for level, contrast in zip((size * np.abs(1 + z)).astype(np.float32), code.contrasts, strict=True)
+            for level, contrast in zip(amplitude.astype(np.float32), code.contrasts, strict=True)
         ]
-    ).astype(np.float32)
-    nominal, read = (
-        joint_path(np.mod(phase, 2 * math.pi).astype(np.float32), noise, code, settings.systematic_rad)
-        for phase in (direct_phase, direct_phase + np.angle(1 + z))
-    )
+        within = np.mod(phase, 2 * math.pi).astype(np.float32)
+        return joint_path(within, np.stack(noise).astype(np.float32), code, settings.systematic_rad)
+
+    nominal, read = decoded(direct_phase, size), decoded(direct_phase + np.angle(1 + z), size * np.abs(1 + z))
     rejected = lit & (read[2] > settings.consistency_sigma**2)
-    return np.where(lit, read[0] - nominal[0], 0.0), rejected.astype(float)
+    noisier = np.where(lit, read[1] / nominal[1], 1.0)
+    return np.where(lit, read[0] - nominal[0], 0.0), rejected.astype(float), noisier.astype(float)
 
 
 def range_bias(path: Floats, light_source: NDArray[np.floating], ideal: Ideal) -> Floats:

@@ -126,7 +126,9 @@ def test_beside_a_wall_points_are_noisier_and_fewer_and_codes_are_pulled(name):
     plate = (ideal.shape == 0) & (ideal.status == Status.VALID) & (np.abs(world[:, 0]) < 80)
     beside, far = plate & (world[:, 1] > 65) & (world[:, 1] < 95), plate & (world[:, 1] < -60)
     assert beside.sum() > 20 and far.sum() > 20
-    assert found.noisier[beside].mean() > found.noisier[far].mean() > 1
+    near_wall, apart = found.noisier[beside].mean(), found.noisier[far].mean()
+    # the light of the wall is modulated, too, and adds to the amplitude of time of flight
+    assert near_wall < apart < 1.05 if name == "kinect-v2" else near_wall > apart > 1
     assert found.kept[beside].mean() <= found.kept[far].mean()
     assert found.kept[beside].mean() < 1 or name == "kinect-v2"
     moved = np.abs(found.displaced)

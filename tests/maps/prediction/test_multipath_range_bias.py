@@ -16,7 +16,7 @@ from mitsim.maps.prediction.multipath_range_bias import path_amplitudes, path_bi
 from mitsim.maps.prediction.perturbation import SceneView
 from mitsim.scene.backend import activate
 from mitsim.scene.load import scene_from_dict
-from mitsim.sensor.modulation import LIGHT_MM_S
+from mitsim.sensor.modulation import LIGHT_MM_S, expose_taps
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
@@ -56,7 +56,7 @@ def test_light_from_one_other_way_lengthens_the_path_between_the_two(kinect, sha
         path_amplitudes(_light(code, path, size), code) * levels
         for path, size in ((1200.0, 1.0), (1200.0 + longer, share))
     )
-    found, refused = path_bias(direct, other, code, kinect.settings, kinect.imager, FACE, 3)
+    found, refused, _ = path_bias(direct, other, code, kinect.settings, kinect.imager, FACE, 3)
     assert found == pytest.approx(np.full(SIZE, share / (1 + share) * longer), rel=0.02)
     assert not refused.any()
 
@@ -65,15 +65,15 @@ def test_light_from_far_away_makes_the_phases_disagree(kinect):
     """As strong as direct light and 3 m longer: no path fits 16, 80 and 120 MHz, and the decoder says so."""
     code = kinect.pattern
     direct, other = (path_amplitudes(_light(code, path, 1.0), code) * 5000 for path in (1200.0, 4200.0))
-    _, refused = path_bias(direct, other, code, kinect.settings, kinect.imager, FACE, 3)
+    _, refused, _ = path_bias(direct, other, code, kinect.settings, kinect.imager, FACE, 3)
     assert refused.all()
 
 
 def test_without_direct_light_nothing_is_said(kinect):
     code = kinect.pattern
     direct, other = (path_amplitudes(_light(code, 1200.0, size), code) for size in (0.0, 1.0))
-    found, refused = path_bias(direct, other, code, kinect.settings, kinect.imager, FACE, 3)
-    assert not found.any() and not refused.any()
+    found, refused, noisier = path_bias(direct, other, code, kinect.settings, kinect.imager, FACE, 3)
+    assert not found.any() and not refused.any() and (noisier == 1).all()
 
 
 def test_a_path_becomes_the_depth_at_which_light_has_come_so_far():
@@ -130,3 +130,21 @@ def test_a_white_corner_is_lengthened_as_the_full_render_is(kinect):
     found, expected = np.array(means).T
     assert found.max() > 15 and found.min() < 0.7 * found.max()
     np.testing.assert_allclose(expected, found, rtol=0.1)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5])
+def test_light_that_comes_nearly_in_phase_makes_a_path_less_noisy(kinect, rng, share):
+    """Taps are exposed 400 times: the amplitude grows by the share, the shot noise by its root."""
+    code, imager, charge = kinect.pattern, kinect.imager, 40_000.0
+    direct, other = _light(code, 1200.0, charge), _light(code, 1260.0, share * charge)
+    amplitudes = [path_amplitudes(light, code) * imager.gain for light in (direct, other)]
+    noisier = path_bias(*amplitudes, code, kinect.settings, imager, FACE, 3)[2]
+    scatter = []
+    for light in (direct, direct + other):
+        seen = np.array([expose_taps(light, code, imager, None, Noise(), rng) for _ in range(400)])
+        phases = np.angle(np.einsum("k,nfkij->nfij", np.exp(1j * code.delays), seen.reshape(400, 3, 3, *SIZE)))
+        turns = code.frequencies_hz / LIGHT_MM_S * 2 * math.pi
+        scatter.append(np.sqrt((phases.std(axis=0) ** 2).mean(axis=(1, 2)))[-1] / turns[-1])  # that of 120 MHz [mm]
+    assert noisier.mean() == pytest.approx(scatter[1] / scatter[0], rel=0.03)
+    one, both = (charge * (1 + part) + 2 * imager.read_noise**2 for part in (0, share))  # of both taps
+    assert noisier.mean() == pytest.approx(math.sqrt(both / one) / (1 + share), rel=0.05)
