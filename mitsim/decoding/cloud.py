@@ -32,7 +32,7 @@ from mitsim.decoding.decoder_registry import (
 )
 from mitsim.decoding.device_maps import DeviceMapGeometry, roi_of_other_grid
 from mitsim.decoding.exposures import MERGED_FULL_SCALE, companded, merge_exposures
-from mitsim.decoding.grey_levels import MeasuredNoise
+from mitsim.decoding.grey_levels import MeasuredNoise, with_dark_noise
 from mitsim.decoding.grid_cloud import empty_cloud
 from mitsim.decoding.matching.stereo import StereoGeometry
 from mitsim.sensor.decoder_settings import DecoderSettings, DeviceMapSettings
@@ -298,6 +298,7 @@ def capture_cloud(
     if roi is not None:
         roi = checked_roi(roi, geometry.grid.width, geometry.grid.height, "capture_cloud")
     exposures, read_out = capture.decoding.bracket_s, capture.decoding.read_out
+    imager = with_dark_noise(imager, capture.decoding.exposures_s)
     images, full_scale, linear_share = capture.images, 2.0**capture.bits - 1, 1.0
     if exposures is not None and not isinstance(settings, DeviceMapSettings):
         images, full_scale = _merged_exposures(capture, exposures, read_out)

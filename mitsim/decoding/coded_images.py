@@ -21,7 +21,7 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Settings
 from mitsim.decoding.cloud import capture_cloud
 from mitsim.decoding.decoder_registry import Coordinates, Geometry, projector_size
-from mitsim.decoding.grey_levels import MeasuredNoise
+from mitsim.decoding.grey_levels import MeasuredNoise, with_dark_noise
 from mitsim.decoding.structured_light.decoder import decode_coordinates
 from mitsim.decoding.structured_light.measured_noise import measured_noise
 from mitsim.decoding.structured_light.projector_coordinate import ProjectorCoordinate
@@ -71,7 +71,9 @@ class CodedImages:
         stacks = {name: stack[:count] for name, stack in list(capture.images.items())[:cameras]}
         if len(stacks) < cameras or any(len(stack) < count for stack in stacks.values()):
             return None
-        noise = _fringe_noise(capture.images, code, size, full_scale) if imager is None else imager
+        noise = with_dark_noise(imager, stated.exposures_s)
+        if noise is None:
+            noise = _fringe_noise(capture.images, code, size, full_scale)
         return cls(stacks, code, size, settings, full_scale, noise, stated.read_out)
 
     @cached_property

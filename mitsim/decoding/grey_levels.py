@@ -5,7 +5,7 @@ Signal chain: grey level [DN] -> its variance [DN^2].
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,19 @@ class MeasuredNoise:
         return level, float(np.sqrt(self.variance(np.array([level]))[0]))
 
 
+def with_dark_noise(
+    imager: Imager | MeasuredNoise | None, exposures_s: tuple[float, ...]
+) -> Imager | MeasuredNoise | None:
+    """Return an imager whose read noise contains the shot noise of its dark current, which then is 0.
+
+    Measured noise contains it, and that of several or unknown exposures [s] is left out.
+    """
+    if not isinstance(imager, Imager) or len(exposures_s) != 1 or imager.dark_current == 0:
+        return imager
+    dark = imager.dark_current * exposures_s[0]
+    return replace(imager, read_noise=float(np.sqrt(imager.read_noise**2 + dark)), dark_current=0.0)
+
+
 def grey_level_variance(level: NDArray[np.float32], imager: Imager | MeasuredNoise | None) -> NDArray[np.float32]:
     """Return the variance (...) [DN^2] of grey levels (...) [DN].
 
@@ -45,8 +58,9 @@ def grey_level_variance(level: NDArray[np.float32], imager: Imager | MeasuredNoi
         sigma^2 = s^2 K^2 sigma_read^2 + s K^2 sigma_row^2 + s^2 K (level - black level) + 1/12
 
     with the gain K [DN/e-], and s the sum of the squared weights by which the device smooths along each axis. A curved
-    response multiplies all but 1/12 by the square of its slope. The shot noise of dark current is excluded. Measured
-    noise is interpolated. If ``imager`` is None the variance is that of quantisation, 1/12.
+    response multiplies all but 1/12 by the square of its slope. The shot noise of dark current must be part of the read
+    noise (:func:`with_dark_noise`). Measured noise is interpolated. If ``imager`` is None the variance is that of
+    quantisation, 1/12.
     """
     if imager is None:
         return np.full(level.shape, 1 / 12, np.float32)
