@@ -137,6 +137,13 @@ def delayed(
     return out
 
 
+def fullest_tap(light: NDArray[np.float32], code: AmplitudeModulation) -> NDArray[np.float32]:
+    """Return the light (H, W) of the fullest tap of each pixel in any image, from correlations (P, H, W)."""
+    by_frequency = light.reshape(-1, code.steps, *light.shape[1:])
+    other_tap = by_frequency.mean(axis=1) - 0.5 * by_frequency.min(axis=1)
+    return np.asarray(np.maximum(0.5 * light.max(axis=0), other_tap.max(axis=0)), np.float32)
+
+
 def correlated_light(stack: NDArray[np.generic]) -> NDArray[np.float64]:
     """Return the light (H, W) [DN] of correlations (P, H, W): their range over the phase steps, twice the amplitude."""
     return np.asarray(2 * np.sqrt(2) * stack.std(axis=0, dtype=np.float64))

@@ -22,7 +22,7 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.sensor.fitted_to import records_of
 from mitsim.sensor.image_formation import FixedPattern, converter, expose, fixed_pattern
-from mitsim.sensor.modulation import AmplitudeModulation, delay_pattern, delayed, expose_taps
+from mitsim.sensor.modulation import AmplitudeModulation, delay_pattern, delayed, expose_taps, fullest_tap
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.projector_images import described
 from mitsim.sensor.sensor import Sensor
@@ -97,13 +97,17 @@ def shifted_units(units: dict[str, UnitPatterns], seed: int) -> dict[str, UnitPa
 def brightest_images(sensor: Sensor, radiance: dict[str, NDArray[np.float32]]) -> NDArray[np.float32] | None:
     """Return the electrons per second of the brightest image of each camera, as one flat array.
 
-    None if the exposure is fixed.
+    For time of flight they are those of the fullest tap of each pixel. None if the exposure is fixed.
     """
     if sensor.exposure.base_s is not None:
         return None
     flat = []
     for name, stack in radiance.items():
-        camera, image = sensor.rig.cameras[name], stack[np.argmax(stack.mean(axis=(1, 2)))]
+        camera, code = sensor.rig.cameras[name], sensor.pattern
+        if isinstance(code, AmplitudeModulation):
+            image = fullest_tap(stack, code)
+        else:
+            image = stack[np.argmax(stack.mean(axis=(1, 2)))]
         # the exposure rule refers to the whole image: pixels that are not read out count as dark
         flat += [image.ravel(), np.zeros(camera.width * camera.height - image.size, np.float32)]
     return np.concatenate(flat) * np.float32(sensor.electrons())
