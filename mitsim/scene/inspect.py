@@ -35,6 +35,10 @@ _ROW = 96
 _MERGE = 1e-6
 
 
+#: least angle over which the intensity of a spot falls [rad], so that its flux is finite; chosen
+_LEAST_FALL = 1e-6
+
+
 @dataclass(frozen=True)
 class ShapeFacts:
     """Facts about one shape of a scene.
@@ -257,7 +261,8 @@ def _count_escaping_rays(scene: Scene, shape: ShapeFacts, size: float) -> ShapeF
 def _emitters(scene: Scene) -> tuple[tuple[str, float], ...]:
     """Return the kind and flux [W] of each emitter.
 
-    A surface of area A and radiance L emits pi L A, a point of intensity I emits 4 pi I.
+    A surface of area A and radiance L emits pi L A, a point of intensity I emits 4 pi I. A spot whose intensity falls
+    linearly from I at the angle b to 0 at c emits 2 pi I (1 - (sin c - sin b) / (c - b)).
     """
     out = []
     for shape in scene.shapes:
@@ -266,7 +271,12 @@ def _emitters(scene: Scene) -> tuple[tuple[str, float], ...]:
             out.append(("area", np.pi * radiance * _area(shape)))
     for emitter in scene.mitsuba.emitters():
         if not emitter.flags() & int(mi.EmitterFlags.Surface):
-            out.append((emitter.class_name(), 4 * np.pi * _value(emitter, "intensity.value")))
+            solid_angle = 4 * np.pi
+            if emitter.class_name() == "SpotLight":
+                beam, cutoff = (np.radians(_value(emitter, key)) for key in ("beam_width", "cutoff_angle"))
+                beam = min(beam, cutoff - _LEAST_FALL)
+                solid_angle = 2 * np.pi * (1 - (np.sin(cutoff) - np.sin(beam)) / (cutoff - beam))
+            out.append((emitter.class_name(), solid_angle * _value(emitter, "intensity.value")))
     return tuple(out)
 
 

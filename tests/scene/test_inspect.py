@@ -194,6 +194,21 @@ def test_lamps_have_their_flux_and_delta_materials_are_known(tmp_path):
     assert shapes["rough"].bsdf == "roughconductor"
 
 
+@pytest.mark.parametrize(("beam", "cutoff"), [(20.0, 30.0), (0.0, 80.0), (15.0, 15.0)])
+def test_a_spot_emits_within_its_cone(tmp_path, beam, cutoff):
+    """The intensity over the sphere, by the midpoint rule; it was taken for that of a point: 15 times as much."""
+    spot = (
+        f'<shape type="sphere"><float name="radius" value="9"/></shape><emitter type="spot">'
+        f'<float name="cutoff_angle" value="{cutoff}"/><float name="beam_width" value="{beam}"/>'
+        '<rgb name="intensity" value="0.5"/></emitter>'
+    )
+    facts, _ = facts_of(tmp_path, spot)
+    angle = (np.arange(200_000) + 0.5) * np.radians(cutoff) / 200_000
+    share = np.clip((cutoff - np.degrees(angle)) / max(cutoff - beam, 1e-9), 0, 1)
+    flux = 2 * np.pi * 0.5 * np.mean(share * np.sin(angle)) * np.radians(cutoff)
+    assert dict(facts.emitters)["SpotLight"] == pytest.approx(flux, rel=1e-3)
+
+
 @pytest.mark.parametrize(
     ("body", "field", "says"),
     [
