@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import importlib.metadata
 import math
 import re
 import stat
@@ -44,6 +45,12 @@ _FILE_PLUGINS = {"bitmap", "envmap", "gridvolume", "measured", "ply", "obj", "se
 
 #: plugins of spectra that Mitsuba cannot evaluate with one wavelength
 _OF_WAVELENGTHS = {"irregular", "regular", "blackbody", "discrete"}
+
+#: plugins of metals, of which Mitsuba knows the index of refraction as a function of the wavelength
+_CONDUCTORS = {"conductor", "roughconductor"}
+
+#: the metal that Mitsuba takes without ``material``, ``eta`` and ``k``
+_DEFAULT_METAL = "Cu"
 
 #: deepest chain of includes; a longer one is taken for a cycle
 _MOST_INCLUDES = 16
@@ -115,9 +122,8 @@ def check_spectra(
     elements, values = _elements(trees, parameters)
     for element in elements:
         text, name = _filled_in(element.get("value", ""), values), element.get("name", "")
-        if element.tag == "string" and name == "material" and text != "none":
-            allowed = f"none, with the spectra eta and k at {wavelength_nm:g} nm; or a machined_metal"
-            raise InputError(path, "material", repr(text), allowed)
+        if element.tag == "bsdf" and element.get("type") in _CONDUCTORS:
+            _check_conductor(path, element, values, wavelength_nm)
         found = element.get("filename") or (element.get("type") if element.get("type") in _OF_WAVELENGTHS else "")
         if element.tag != "spectrum" or not (found or ":" in text):
             continue
@@ -127,6 +133,32 @@ def check_spectra(
             if pairs.size and pairs[0, 0] <= wavelength_nm <= pairs[-1, 0]:
                 allowed += f': value="{np.interp(wavelength_nm, *pairs.T):.6g}"'
         raise InputError(path, f"spectrum {name}".strip(), repr(found or text), allowed)
+
+
+def _check_conductor(path: Path, element: ElementTree.Element, values: Mapping[str, str], wavelength_nm: float) -> None:
+    """Check that a BSDF of a metal states its index of refraction, in place of a material or of Mitsuba's default."""
+    given = {child.get("name"): _filled_in(child.get("value", ""), values) for child in element}
+    material = given.get("material", "none" if {"eta", "k"} & set(given) else _DEFAULT_METAL)
+    if material == "none":
+        return
+    index = [_index_of_refraction(material, part, wavelength_nm) for part in ("eta", "k")]
+    spectra = "the spectra eta and k"
+    if None not in index:
+        spectra = " ".join(
+            f'<spectrum name="{name}" value="{value:.4g}"/>' for name, value in zip(("eta", "k"), index, strict=True)
+        )
+    where = "material" if "material" in given else f"bsdf of type {element.get('type')} without eta and k"
+    allowed = f'<string name="material" value="none"/> with {spectra} at {wavelength_nm:g} nm; or a machined_metal'
+    raise InputError(path, where, repr(material), allowed)
+
+
+def _index_of_refraction(material: str, part: str, wavelength_nm: float) -> float | None:
+    """Return ``eta`` or ``k`` of a metal in Mitsuba's tables; None if they lack it, or the wavelength."""
+    table = importlib.metadata.distribution("mitsuba").locate_file(f"mitsuba/data/ior/{material}.{part}.spd")
+    if not (material.isidentifier() and is_file(Path(str(table)))):
+        return None
+    nm, value = np.loadtxt(str(table), comments="#").T
+    return float(np.interp(wavelength_nm, nm, value)) if nm[0] <= wavelength_nm <= nm[-1] else None
 
 
 def _elements(
