@@ -208,7 +208,7 @@ class InterreflectionEffect:
                 end += 1
             images = self.render_views(scene, self.poses[index:end])
             self.ready = dict(enumerate(images, index))
-        return self.ready.pop(index)
+        return self.ready[index]
 
     def render(self, scene: Scene, world_from_sensor: Transform, seed: int = 1) -> InterreflectionImage:
         """Render the interreflections in a view."""

@@ -12,7 +12,7 @@ same in one kernel on the device, for clouds.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -114,6 +114,25 @@ class Predictor:
         """Return a predictor that casts about ``rays`` rays, as :meth:`thinned`."""
         step = max(1, math.floor(math.sqrt(self.grid.width * self.grid.height / rays)))
         return self.thinned(step) if step > 1 else self
+
+    def closer(self, bounds: NDArray[np.floating], world_from_sensor: Transform, rays: int) -> Predictor:
+        """Return a predictor of the region that can show a box (2, 3) [mm] of the world frame, by up to ``rays`` rays.
+
+        Its pixels are those of the sensor, or every ``step``-th of every ``step``-th row.
+        """
+        assert self.step == 1, "thinned already"
+        roi, grid = self.view.roi(bounds, world_from_sensor, self.margin), self.grid
+        normalised = None if grid.normalised is None else grid.normalised[roi.slices]
+        part = replace(
+            grid,
+            cx=grid.cx - roi.left,
+            cy=grid.cy - roi.top,
+            width=roi.width,
+            height=roi.height,
+            normalised=normalised,
+        )
+        step = math.ceil(math.sqrt(roi.width * roi.height / rays))
+        return Predictor(self.rig, part, self.seen[roi.slices], self.sensor, self.edge_margin_px, step)
 
     def surfaces(self, scene: Scene, world_from_sensor: Transform) -> Surfaces:
         """Return the ray-cast surfaces of a view, in the sensor frame."""
