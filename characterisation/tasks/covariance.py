@@ -89,6 +89,8 @@ class ExpectedPoints:
     - ``angular_pitch`` [rad] between neighbouring sensor pixels.
     - ``shared`` (n, k) [mm]: displacement of the points by one standard deviation of each of k independent errors,
       which all features share.
+    - ``shown`` (m, 3) [mm]: all places of the surface that every eye sees, also next to its edges, where pixels belong
+      to no feature; by default ``point``.
     """
 
     point: Floats
@@ -105,6 +107,7 @@ class ExpectedPoints:
     thinning: float = 1.0
     angular_pitch: float = math.nan
     shared: Floats | None = None
+    shown: Floats | None = None
 
     @property
     def count(self) -> float:
@@ -216,7 +219,7 @@ def usable(surface: Surface, expected: ExpectedPoints) -> ExpectedPoints:
         used &= near
         if used.any():
             rows: dict[str, Any] = {
-                n: value[used] for n, value in vars(expected).items() if isinstance(value, np.ndarray)
+                n: value[used] for n, value in vars(expected).items() if isinstance(value, np.ndarray) and n != "shown"
             }
             return replace(expected, **rows)
     raise FitError("no points are expected")

@@ -16,7 +16,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import block_diag
+from scipy.spatial import cKDTree
 from scipy.special import ndtr
 
 from characterisation.features.edges import LEAST_CROSSINGS, LEAST_FRACTION
@@ -25,7 +27,7 @@ from characterisation.features.fitted import with_covariance
 from characterisation.features.form import Form, form_modes
 from characterisation.features.pose_fit import PoseFit, pose_jacobian
 from characterisation.features.robust_fit import FitError
-from characterisation.features.surfaces import Cone, Cylinder, Plane
+from characterisation.features.surfaces import Cone, Cylinder, Plane, tangents
 from characterisation.files.arrays import Floats
 from characterisation.tasks.covariance import ExpectedFit, ExpectedPoints, expected_fit, expected_sums, solved, usable
 from characterisation.tasks.measurement_model import InputQuantity, evaluate, measurement_model
@@ -33,6 +35,16 @@ from characterisation.tasks.task_file import Task
 
 #: step of the parameters for the quadratic form of a measurement, in units of their standard deviations
 STEP = 1e-3
+
+#: number of places of an edge that are tested for whether the face beside them is seen; chosen
+PLACES = 120
+
+#: distance, in spacings of the rays, within which a place of an edge has a ray on its face, at any angle; chosen
+RAYS_APART = 1.5
+
+#: least visible share of an edge; chosen. Fits to drawn clouds of a hole of 22 px under a cover are right with 58 %,
+#: off by 2 mm with 55 %, and follow the edge of the cover or fail with 47 %
+LEAST_VISIBLE = 0.57
 
 #: number of random steps that give the mean square of a zone: known to a tenth
 DRAWS = 200
@@ -118,7 +130,8 @@ def _pose(
 def _figure(name: str, task: Task, expected: Mapping[str, ExpectedPoints]) -> ExpectedInput:
     """Predict a circle or the point of an edge in a face; the only error of the edge is that of sampling by pixels.
 
-    It is possible with enough crossings, and with the probability that enough of the face beside it is recovered.
+    It is possible with enough crossings, if enough of the edge is visible, and with the probability that enough of the
+    face beside it is recovered. The part of the edge that is hidden, or outside the image, does not count.
     """
     feature = task.features[name]
     (plane,) = feature.of or ("",)
@@ -134,15 +147,45 @@ def _figure(name: str, task: Task, expected: Mapping[str, ExpectedPoints]) -> Ex
     pitch = distance * around.angular_pitch * math.sqrt((1 + 1 / cosine**2) / 2)
     reach = float(feature.reach_mm or math.nan)
     length = 2 * math.pi * figure.radius if isinstance(figure, Circle) else 2 * reach
-    count, fraction = crossings(length, pitch), float(around.fraction[near])
+    within_mm = RAYS_APART * math.sqrt(around.thinning) * distance * around.angular_pitch / cosine
+    visible, places = _visible(figure, reach, around, within_mm)
+    whole, fraction = crossings(length, pitch), float(around.fraction[near])
+    if visible.mean() < LEAST_VISIBLE:
+        found, least = 100 * visible.mean(), 100 * LEAST_VISIBLE
+        raise FitError(f"{found:.0f} % of the edge is visible, at least {least:.0f} % are required")
+    count = whole * float(visible.mean())
     if count < LEAST_CROSSINGS:
         raise FitError(f"{count:.0f} crossings of the edge are expected, at least {LEAST_CROSSINGS} are required")
-    covariance = edge_covariance(figure, pitch, count, fraction, reach)
+    covariance = edge_covariance(figure, pitch, whole, fraction, reach)
+    if not visible.all():  # it is proportional to the inverse of J^T J
+        jacobian = figure.linearised(np.zeros(len(covariance)), places)[1]
+        seen = jacobian[visible]
+        covariance = covariance @ (jacobian.T @ jacobian) @ np.linalg.inv(seen.T @ seen)
+        covariance = (covariance + covariance.T) / 2
     nothing = np.zeros((len(covariance), 1 + (0 if around.shared is None else around.shared.shape[1])))
     doubt = float(around.fraction_error[near])
     chance = float(ndtr((fraction - LEAST_FRACTION) / doubt)) if doubt > 0 else float(fraction >= LEAST_FRACTION)
     fit = ExpectedFit(covariance, nothing, count * fraction, chance, position, pitch)
     return ExpectedInput(fit, with_covariance(figure, covariance))
+
+
+def _visible(
+    figure: Circle | EdgePoint, reach: float, around: ExpectedPoints, within_mm: float
+) -> tuple[NDArray[np.bool_], Floats]:
+    """Return which places of an edge have a visible place of the face within a distance [mm], and the places (k, 3).
+
+    ``reach`` [mm] is that of the point of an edge.
+    """
+    middle = (np.arange(PLACES) + 0.5) / PLACES
+    if isinstance(figure, Circle):
+        angle = 2 * np.pi * middle
+        offset = figure.radius * np.column_stack([np.cos(angle), np.sin(angle)]) @ tangents(figure.normal)
+        places = figure.centre + offset
+    else:
+        along = np.cross(figure.normal, figure.direction) + figure.slope * figure.direction
+        places = figure.point + reach * (2 * middle - 1)[:, None] * along
+    shown = around.point if around.shown is None else around.shown
+    return np.asarray(cKDTree(shown).query(places)[0] <= within_mm), places
 
 
 def _viewpoint(expected: ExpectedPoints) -> Floats:

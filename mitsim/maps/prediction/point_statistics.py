@@ -141,6 +141,7 @@ def expected_points(
         view.thinning,
         view.angular_pitch,
         shared=None if perturbation is None else perturbation.shared[mask][possible],
+        shown=world_from_sensor.points(ideal.point[(ideal.shape == shape) & (ideal.status == Status.VALID)]),
     )
 
 

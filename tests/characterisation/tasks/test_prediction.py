@@ -199,7 +199,7 @@ def test_a_hole_is_possible_where_its_edge_can_be_fitted(clouds, radius, fractio
     task = Task.model_validate(
         {"features": {"plane": TASK.features["plane"], "hole": hole}, "measurements": {"size": size}}
     )
-    face = seen("plane", clouds["plane"])
+    face = replace(seen("plane", clouds["plane"]), thinning=40.0)  # 700 places of 120 x 80 mm
     face = replace(face, fraction=fraction * face.fraction, fraction_error=doubt * face.fraction)
     known = expected_inputs(task, {"plane": face}, 100)
     (hole_fit,) = (fit for quantity, fit in known.items() if quantity.features == ("hole",))
@@ -208,6 +208,36 @@ def test_a_hole_is_possible_where_its_edge_can_be_fitted(clouds, radius, fractio
     else:
         assert hole_fit.fit.chance == pytest.approx(chance, abs=1e-4)
     assert expected_measurement(task, "size", known).chance <= chance + 1e-4
+
+
+@pytest.mark.parametrize(("cover", "visible"), [(40.0, 1.0), (10.0, 0.732), (5.0, 0.608), (0.0, 0.5), (-10.0, 0.268)])
+def test_the_hidden_part_of_a_hole_s_edge_does_not_count(cover, visible) -> None:
+    """A cover hides all beyond x = ``cover`` of a hole of 15 mm: u against circles fitted to the rest of its edge.
+
+    Before, u was that of the whole edge, and a hole that is hidden by three quarters was possible.
+    """
+    radius, pitch, rng = 15.0, 0.4, np.random.default_rng(1)
+    x, y = (values.ravel() for values in np.meshgrid(*[np.arange(-35, 35, pitch)] * 2))
+    shows = (np.hypot(x, y) > radius) & (x < cover)
+    face = seen("plane", np.column_stack([x, y, 0 * x])[shows])
+    away = face.point - [0.0, 0.0, 500.0]
+    pixel = np.rint((face.point[:, 1::-1] + 35) / pitch).astype(int)
+    ray = away / np.linalg.norm(away, axis=1, keepdims=True)
+    face = replace(face, ray=ray, pixel=pixel, angular_pitch=pitch / 500)
+    hole = {"kind": "circle", "of": ["plane"], "point_mm": [0, 0, 0], "radius_mm": radius}
+    sizes = {"size": {"kind": "radius", "features": ["hole"], "nominal": radius, "unit": "mm"}}
+    task = Task.model_validate({"features": {"plane": TASK.features["plane"], "hole": hole}, "measurements": sizes})
+    found = expected_measurement(task, "size", expected_inputs(task, {"plane": face}, 100))
+    if visible < 0.57:
+        assert found.chance == 0 and "% of the edge is visible" in found.reason
+        return
+    angle = np.linspace(-np.pi, np.pi, round(2 * np.sqrt(2) / np.pi * 2 * np.pi * radius / pitch), endpoint=False)
+    angle = angle[radius * np.cos(angle) < cover]
+    assert len(angle) / (2 * np.sqrt(2) / np.pi * 2 * np.pi * radius / pitch) == pytest.approx(visible, abs=0.01)
+    design = np.column_stack([np.cos(angle), np.sin(angle), np.ones(len(angle))])
+    noise = pitch * np.sqrt(5 / 6 / 12) * rng.standard_normal((len(angle), 4000))
+    assert found.uncertainty == pytest.approx(np.linalg.lstsq(design, noise, rcond=None)[0][2].std(), rel=0.1)
+    assert found.chance == 1
 
 
 @pytest.mark.parametrize(("fraction", "minimum"), [(0.1, 75), (0.1, 65), (0.5, 340), (0.9, 640)])

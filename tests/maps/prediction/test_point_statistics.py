@@ -23,7 +23,7 @@ def test_a_perturbation_changes_what_the_map_says(scenes):
     shared = np.stack([0.1 * many, 0.2 * many], axis=1)
     moved = Perturbation(0.5 * many, 2 * many, 3 * many, 0.3 * many, shared)
     found = expected_points(*given, perturbation=moved)
-    assert len(plain.fraction) > 50
+    assert 50 < len(plain.fraction) < len(plain.shown)  # also pixels next to an edge show the pillar
     assert found.fraction == pytest.approx(0.5 * plain.fraction)
     assert found.fraction_error == pytest.approx(0.5 * plain.fraction_error)
     assert found.sigma == pytest.approx(np.hypot(2 * plain.sigma, 0.3))
