@@ -41,10 +41,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
-from scipy.special import ndtr
+from scipy.special import chdtr, ndtr
 
 from characterisation.coupon.offsets import own_area
-from characterisation.features.credibility import most_uncertain
+from characterisation.features.credibility import PLACES, most_uncertain
 from characterisation.features.fits import COVERAGE, GATE, LEAST_BELONGING, LEAST_GATE_MM
 from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import GRAZING_COSINE, Surface
@@ -69,6 +69,9 @@ SHORTEST_REACH = 0.45
 
 #: a measurement is called possible with at least this probability
 LEAST_CHANCE = 0.5
+
+#: directions of the errors of a fit that are averaged; chosen: chances are known to 0.02
+DIRECTIONS = 200
 
 #: points with a smaller F are excluded
 LEAST_SHARE = 1e-6
@@ -181,22 +184,30 @@ def expected_fit(surface: Surface, expected: ExpectedPoints, minimum_points: flo
 def _credible_chance(surface: Surface, expected: ExpectedPoints, used: ExpectedPoints, fit: ExpectedFit) -> float:
     """Return the probability that a fit is credible (:mod:`characterisation.features.credibility`).
 
-    It is 0 if the points do not determine the surface wherever it is seen. Else it is the probability that a normal
-    error, of the largest variance over these places, is within the limit.
+    It is 0 if the points do not determine the surface wherever it is seen. Else it is the probability that the largest
+    normal error there exceeds the median error at the points, which moves the limit, by less than the limit. Both are
+    proportional to the length r of the vector of standardised errors; the mean is over its directions.
     """
     at = surface.meet(expected.point, expected.ray)
     points = at.foot[np.abs(at.cosine) > GRAZING_COSINE]
-    jacobian = surface.linearised(np.zeros(surface.parameter_count), points, None)[1]
+    zero = np.zeros(surface.parameter_count)
+    jacobian, of_used = surface.linearised(zero, points, None)[1], surface.linearised(zero, used.point, None)[1]
     weight = used.fraction
     noise = float(np.sqrt(np.average(used.sigma**2 + used.persistent**2, weights=weight)))
-    limit = max(GATE * noise, LEAST_GATE_MM) + float(np.average(np.abs(used.displaced), weights=weight))
-    spread, total = (
-        math.sqrt(max(float(np.einsum("ij,jk,ik->i", jacobian, matrix, jacobian).max()), 0.0))
-        for matrix in (fit.noise_covariance, fit.covariance)
-    )
-    if spread > most_uncertain(surface, limit):
+    limit = max(GATE * noise, LEAST_GATE_MM)
+    displaced = float(np.average(np.abs(used.displaced), weights=weight))
+    spread = math.sqrt(max(float(np.einsum("ij,jk,ik->i", jacobian, fit.noise_covariance, jacobian).max()), 0.0))
+    if spread > most_uncertain(surface, limit + displaced):
         return 0.0
-    return float(2 * ndtr((limit + COVERAGE * spread) / total) - 1) if total > 0 else 1.0
+    values, vectors = np.linalg.eigh(fit.covariance)
+    drawn = np.random.default_rng(0).standard_normal((len(values), DIRECTIONS))
+    unit_errors = vectors @ (np.sqrt(np.clip(values, 0, None))[:, None] * drawn / np.linalg.norm(drawn, axis=0))
+    largest, median = (
+        reduce(np.abs(rows[:: -(-len(rows) // PLACES)] @ unit_errors), axis=0)
+        for rows, reduce in ((jacobian, np.max), (of_used, np.median))
+    )
+    allowed = (limit + COVERAGE * spread) / np.maximum(largest - median, 1e-12)
+    return float(chdtr(len(values), allowed**2).mean())
 
 
 def usable(surface: Surface, expected: ExpectedPoints) -> ExpectedPoints:
