@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from characterisation.features.figures import Circle, EdgePoint
 from characterisation.features.fitted import ConeFit, CylinderFit, PlaneFit, SphereFit
 from characterisation.features.robust_fit import (
+    SMALLEST_SCALE,
     FitError,
     UndeterminedError,
     covariance_of,
@@ -25,7 +26,7 @@ from characterisation.features.robust_fit import (
     robust_fit,
     usable,
 )
-from characterisation.features.starts import plane_start, sphere_start
+from characterisation.features.starts import plane_start, rounding_scale, sphere_start
 from characterisation.features.surfaces import (
     Cone,
     Cylinder,
@@ -87,7 +88,8 @@ def fit_plane(points: ArrayLike, viewpoint: ArrayLike | None = None) -> PlaneFit
     [ 0.  0. -1.]
     """
     points = _usable(points, Plane)
-    plane, kept = _fit(plane_start(points), points, viewpoint)
+    start = plane_start(points)
+    plane, kept = _fit(start, points, viewpoint, rounding_scale(points, start.normal))
     centroid = points[kept].mean(axis=0)
     outward = plane.normal[np.argmax(np.abs(plane.normal))]
     if viewpoint is not None:
@@ -308,7 +310,9 @@ def _radius(initial: Cylinder | Cone) -> float:
 Shape = TypeVar("Shape", Plane, Cylinder, Sphere, Cone)
 
 
-def _fit(shape: Shape, points: Array, viewpoint: ArrayLike | None) -> tuple[Shape, NDArray[np.bool_]]:
+def _fit(
+    shape: Shape, points: Array, viewpoint: ArrayLike | None, least_scale: float = SMALLEST_SCALE
+) -> tuple[Shape, NDArray[np.bool_]]:
     """Return the robust least-squares shape and the mask (n,) of the points used."""
     rays = rays_from(viewpoint, points)
 
@@ -319,7 +323,7 @@ def _fit(shape: Shape, points: Array, viewpoint: ArrayLike | None) -> tuple[Shap
         seen = None if rays is None or not along_rays else rays if every else rays[chosen]
         return shape.linearised(parameters, points if every else points[chosen], seen)
 
-    return robust_fit(shape, linearised, len(points))
+    return robust_fit(shape, linearised, len(points), least_scale)
 
 
 def _uncertainty(shape: Surface, points: Array, viewpoint: ArrayLike | None) -> tuple[Array, float, int]:

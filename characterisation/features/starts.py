@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eig
 from scipy.spatial import cKDTree
 
-from characterisation.features.robust_fit import FitError, usable
+from characterisation.features.robust_fit import SMALLEST_SCALE, FitError, usable
 from characterisation.features.surfaces import Cylinder, Plane, Sphere, tangents
 
 Array = NDArray[np.float64]
@@ -201,6 +201,24 @@ def plane_start(points: Array) -> Plane:
     return squares
 
 
+def rounding_scale(points: Array, normal: Array) -> float:
+    """Return the least scale [mm] of the residuals of a plane of unit ``normal`` (3,) through rounded points (n, 3).
+
+    Most points of a plane across an axis may have the same rounded coordinate. The median of their residuals is then 0,
+    and all others would count as outliers. With a scale of half a step, points two steps away are kept.
+    """
+    column = points[:: 1 + len(points) // _MOST_ROUNDED, np.argmax(np.abs(normal))]
+    values, counts = np.unique(column, return_counts=True)
+    if len(values) < 2 or counts.max() < _TIED * len(column):
+        return SMALLEST_SCALE
+    step = float(np.diff(values).min())
+    steps = (values - values[0]) / step
+    rounded = step > _LEAST_STEP_MM and np.abs(steps - np.rint(steps)).max() < _OFF_STEP
+    if len(values) == 2:  # noise mixes two steps; the two faces of a part lie apart
+        rounded &= np.mean(column[1:] != column[:-1]) > np.prod(counts / len(column))
+    return step / 2 if rounded else SMALLEST_SCALE
+
+
 #: about the largest number of points that are tried; chosen
 _SOME = 1000
 
@@ -224,3 +242,15 @@ _MUCH = 3.0
 
 #: the same of a circle or sphere; of normal noise it is about 1
 _MORE = 2.0
+
+#: about the largest number of points whose rounding is looked for; chosen
+_MOST_ROUNDED = 4000
+
+#: least share of points with one rounded coordinate, at which the median of the residuals may be 0: a half, less chance
+_TIED = 0.4
+
+#: least step of rounded coordinates [mm] that matters; float32 rounds those 10 m away to 1e-3 mm
+_LEAST_STEP_MM = 1e-3
+
+#: largest distance of a rounded coordinate from a multiple of the step, in steps, from float32; chosen
+_OFF_STEP = 0.05

@@ -1,0 +1,36 @@
+"""Points that are hard to start from: rounded coordinates."""
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from characterisation.features.fits import fit_plane
+
+EYE = np.zeros(3)
+
+
+def face(across, rng, count=5000):
+    """A face perpendicular to the view, 500 mm away, whose depths are ``across`` (count,) farther."""
+    return np.column_stack([rng.uniform(-40, 40, (count, 2)), 500 + across])
+
+
+@pytest.mark.parametrize("step", [0.1, 1.0])
+@pytest.mark.parametrize(("offset", "sigma"), [(0.0, 0.3), (0.0, 0.5), (0.0, 0.7), (0.3, 0.1), (0.3, 0.4), (0.5, 0.1)])
+def test_rounded_depths_have_the_mean_and_the_noise_of_rounded_noise(step, offset, sigma, rng):
+    """Offset and sigma are in steps; most points have one depth, and the median of the residuals is 0."""
+    depths = step * np.round(offset + sigma * rng.standard_normal(5000))
+    fit = fit_plane(face(depths, rng), EYE)
+    steps = np.arange(-8, 9)
+    share = norm.cdf(steps + 0.5, offset, sigma) - norm.cdf(steps - 0.5, offset, sigma)
+    mean = share @ steps
+    noise = np.sqrt(share @ (steps - mean) ** 2)
+    assert -fit.normal @ fit.point == pytest.approx(500 + step * mean, abs=step * (4 * noise / np.sqrt(5000) + 0.005))
+    assert fit.residual_std == pytest.approx(step * noise, rel=0.1)
+
+
+def test_a_step_of_a_part_is_no_rounding(rng):
+    """Two faces without noise lie apart, so the larger one is the plane."""
+    points = face(np.zeros(5000), rng)
+    points[points[:, 0] > 15, 2] += 1.0
+    points = points[np.argsort(points[:, 0])]
+    assert -fit_plane(points, EYE).normal @ fit_plane(points, EYE).point == pytest.approx(500, abs=1e-6)
