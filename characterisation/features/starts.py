@@ -1,8 +1,8 @@
 """Estimate a plane, a sphere or a cylinder from its points alone, as the starting value of a fit.
 
 Signal chain of a cylinder: points -> normals of some of them, from the plane through the neighbours of each -> axis,
-the direction perpendicular to all normals -> circle through the points projected along the axis (Pratt's algebraic fit)
--> cylinder.
+the direction perpendicular to all normals, or the longest extent of a thin rod -> circle through the points projected
+along the axis (Pratt's algebraic fit) -> cylinder.
 
 The number of neighbours is large enough for a normal if noise is up to a tenth of their extent.
 
@@ -50,14 +50,23 @@ def cylinder_start(points: ArrayLike) -> Cylinder:
     sample = points[:: 1 + len(points) // _NORMALS]
     _, index = cKDTree(points).query(sample, count)
     patches = points[index] - points[index].mean(axis=1, keepdims=True)
-    axis = _across(np.linalg.svd(patches, full_matrices=False)[2][:, -1])
-    basis = tangents(axis)
     middle = points.mean(axis=0)
-    centre, radius = _robust_circle((points - middle) @ basis.T)
-    extent = _width((points - middle) @ basis.T)
-    if not 0 < radius < 100 * extent:
+    across = _about(_across(np.linalg.svd(patches, full_matrices=False)[2][:, -1]), middle, points)
+    # the neighbours of a point of a thin rod surround it, so that all normals are the same
+    along = _about(np.linalg.eigh((points - middle).T @ (points - middle))[1][:, -1], middle, points)
+    cylinder, extent = along[:2] if along[2] * _MORE < across[2] else across[:2]
+    if not 0 < cylinder.radius < 100 * extent:
         raise FitError(f"{len(points)} points that do not curve enough to determine a cylinder")
-    return Cylinder(middle + centre @ basis, axis, radius)
+    return cylinder
+
+
+def _about(axis: Array, middle: Array, points: Array) -> tuple[Cylinder, float, float]:
+    """Return the cylinder along an axis (3,) through most points (n, 3), their width, and median distance from it."""
+    basis = tangents(axis)
+    local = (points - middle) @ basis.T
+    centre, radius = _robust_circle(local)
+    distance = float(np.median(np.abs(np.linalg.norm(local - centre, axis=1) - radius)))
+    return Cylinder(middle + centre @ basis, axis, radius), _width(local), distance
 
 
 def _across(normals: Array) -> Array:

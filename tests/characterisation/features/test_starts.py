@@ -1,10 +1,11 @@
-"""Points that are hard to start from: rounded coordinates."""
+"""Points that are hard to start from: rounded coordinates, thin rods."""
 
 import numpy as np
 import pytest
 from scipy.stats import norm
 
-from characterisation.features.fits import fit_plane
+from characterisation.features.fits import fit_cylinder, fit_plane
+from characterisation.features.starts import cylinder_start
 
 EYE = np.zeros(3)
 
@@ -34,3 +35,20 @@ def test_a_step_of_a_part_is_no_rounding(rng):
     points[points[:, 0] > 15, 2] += 1.0
     points = points[np.argsort(points[:, 0])]
     assert -fit_plane(points, EYE).normal @ fit_plane(points, EYE).point == pytest.approx(500, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize(("radius", "length", "count"), [(3.0, 400.0, 3000), (1.0, 100.0, 500)])
+def test_a_rod_much_longer_than_wide_is_found(radius, length, count, seed):
+    """The neighbours of a point, 3 % of all, span the whole width of the rod."""
+    rng = np.random.default_rng(seed)
+    axis = np.array([np.cos(seed), np.sin(seed), 0.2]) / np.sqrt(1.04)
+    toward = np.array([0, 0, -1.0]) + axis[2] * axis
+    toward /= np.linalg.norm(toward)
+    angle = np.deg2rad(rng.uniform(-75, 75, count))
+    around = np.outer(np.cos(angle), toward) + np.outer(np.sin(angle), np.cross(axis, toward))
+    points = [0, 0, 600] + radius * around + np.outer(rng.uniform(-length / 2, length / 2, count), axis)
+    points += rng.normal(0, 0.05, (count, 1)) * points / np.linalg.norm(points, axis=1, keepdims=True)
+    fit = fit_cylinder(points, cylinder_start(points), EYE)
+    assert fit.radius == pytest.approx(radius, abs=5 * np.sqrt(fit.covariance[4, 4]))
+    assert np.linalg.norm(np.cross(fit.axis, axis)) < 1e-3
