@@ -6,7 +6,8 @@ from the covariance of the fit. The transform itself is taken as exact.
 - Plane: perpendicular distance from the origin of the frame, and the unit normal toward the sensor.
 - Sphere: the centre.
 - Cylinder: the unit direction of the axis, whose largest component is positive, and the point of the axis nearest the
-  middle of its points.
+  middle of its points. Of components that are nearly the largest, the first is positive: at 45 deg between two of
+  opposite sign, noise would choose the sense.
 """
 
 from __future__ import annotations
@@ -20,6 +21,9 @@ from numpy.typing import NDArray
 from characterisation.features.surfaces import Cylinder, Plane, Sphere
 
 Array = NDArray[np.float64]
+
+#: least component of an axis over the largest one that counts as equal: axes lie at 45 deg rather than at 42; chosen
+NEARLY_LARGEST = 0.9
 
 #: quantities by shape, with their units; "1" is a number without unit
 PLACE_QUANTITIES: dict[str, tuple[tuple[str, str], ...]] = {
@@ -59,7 +63,8 @@ def place_functions(
         kind = "sphere"
     else:
         along = rotation @ fit.axis
-        sign = 1.0 if along[np.argmax(np.abs(along))] > 0 else -1.0
+        sizes = np.abs(along)
+        sign = 1.0 if along[np.argmax(sizes > NEARLY_LARGEST * sizes.max())] > 0 else -1.0
         functions = [_component(lambda cylinder: sign * rotation @ cylinder.axis, k) for k in range(3)]
         beside = middle - ((middle - fit.point) @ fit.axis) * fit.axis
         functions += [

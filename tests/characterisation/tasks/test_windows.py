@@ -102,6 +102,18 @@ def test_the_point_of_a_short_axis_slides_along_it_as_its_uncertainty_says(rng):
     assert stated == pytest.approx(np.std([one.value for one in along], ddof=1), rel=4 / np.sqrt(2 * runs))
 
 
+@pytest.mark.parametrize("direction", [(1, 0, -1), (1, -1, 0), (0, 1, -1), (1, -1, 1)])
+def test_an_axis_between_two_coordinate_axes_keeps_its_sense(direction, rng):
+    """Noise decides which of two components is the larger one; clouds of one pin still have one direction."""
+    pin, plan = cylinder([0, 0, 470], direction, 15), WindowPlan({"pin": ("cylinder", Roi(85, 70, 30, 20))})
+    axes = []
+    for _ in range(8):
+        results = by_name(measure_windows(cloud_of(pin, 0.05, rng), plan))
+        axes.append([results[f"pin axis {letter}"].value for letter in "xyz"])
+    expected = np.array(direction) / np.linalg.norm(direction)
+    assert np.abs(axes - expected).max() < 0.02
+
+
 def test_repeatability_is_mean_and_standard_deviation_over_clouds(trials):
     over = {one.name: one for one in repeatability(trials)}
     values = [by_name(one)["ball diameter"].value for one in trials]
