@@ -116,10 +116,9 @@ def robust_fit(
 def _near(shape: Fitted, residual: Array, cosine: Array, least_scale: float) -> NDArray[np.bool_]:
     """Return the points (n,) that are used: not at grazing incidence, and within the robust limit."""
     facing = np.abs(cosine) > GRAZING_COSINE
-    if not facing.any():
-        raise FitError(
-            f"all {len(residual)} points are seen at grazing incidence from the sensor, the origin of their frame"
-        )
+    if facing.sum() <= shape.parameter_count:
+        which = f"{len(facing) - facing.sum()} of {len(facing)}" if facing.any() else f"all {len(facing)}"
+        raise FitError(f"{which} points are seen at grazing incidence from the sensor, the origin of their frame")
     near = facing & (np.abs(residual) <= CLIP * max(robust_std(residual[facing]), least_scale))
     if near.sum() <= shape.parameter_count:
         raise FitError(f"only {near.sum()} of {len(residual)} points lie on one {shape.kind}")

@@ -24,7 +24,7 @@ from characterisation.features.fitted import CylinderFit, PlaneFit, SphereFit
 from characterisation.features.form import fit_form, zone
 from characterisation.features.robust_fit import CLIP, FitError, rays_from
 from characterisation.features.starts import cylinder_start
-from characterisation.features.surfaces import distances, lengths
+from characterisation.features.surfaces import GRAZING_COSINE, distances, lengths
 from characterisation.files.errors import InputError, nearest
 from characterisation.point_cloud import PointCloud
 from characterisation.region_of_interest import Roi
@@ -206,6 +206,10 @@ def fit_shape(points: NDArray[np.float64], shape: Shape, viewpoint: NDArray[np.f
         case "cylinder":
             fit = fit_cylinder(points, cylinder_start(points), viewpoint)
     if fit.count < LEAST_SHARE * len(points):
+        grazing = np.abs(distances(fit, points, rays_from(viewpoint, points))[1]) <= GRAZING_COSINE
+        if shape == "plane" and grazing.mean() > 1 - LEAST_SHARE:
+            which = f"{100 * grazing.mean():.0f} % of the {len(points)} points"
+            raise FitError(f"{which} are seen at grazing incidence from the sensor, the origin of their frame")
         share = f"{100 * fit.count / len(points):.0f} % of the {len(points)} points"
         raise FitError(f"only {share} lie on the fitted {shape}")
     distance = float(np.median(lengths(points - viewpoint)))

@@ -6,11 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from characterisation.features.fits import fit_cylinder
+from characterisation.features.robust_fit import FitError
 from characterisation.features.starts import cylinder_start
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from characterisation.tasks.result import Result, repeatability
-from characterisation.tasks.windows import WindowPlan, measure_windows
+from characterisation.tasks.windows import WindowPlan, fit_shape, measure_windows
 from mitsim.decoding.measured_document import repeatability_table
 from tests.seen_shapes import GRID, cloud_of, cylinder, plane, sphere
 
@@ -134,6 +135,14 @@ def test_a_window_that_shows_something_else_has_no_value_and_says_so(rng):
     assert not any(one.possible for one in found)
     assert "does the window show one plane?" in found[0].reason
     assert repeatability([found])[0].count == 0
+
+
+@pytest.mark.parametrize("height", [0.0, 1.0])
+def test_a_face_seen_from_within_it_is_called_grazing(height, rng):
+    """A plate in the frame of its part, whose origin lies in its face or 1 mm below it: beyond 6 mm, over 80 deg."""
+    points = np.column_stack([rng.uniform(0, 100, (4000, 2)), height + rng.normal(0, 0.02, 4000)])
+    with pytest.raises(FitError, match=r"points are seen at grazing incidence from the sensor, the origin"):
+        fit_shape(points, "plane", np.zeros(3))
 
 
 def test_points_that_are_all_false_have_no_value(rng):
