@@ -1,7 +1,8 @@
 """Compute the signed difference of two clouds, along the rays of a shared grid or to the surface of the other cloud.
 
 Signal chain, along rays: distance |V| of each pixel in one cloud -> minus that in the other. To the surface: points of
-one cloud -> nearest points of the other -> the plane through these -> orthogonal distance.
+one cloud -> nearest points of the other -> the surface of second order through these -> distance along its normal. A
+plane through them would lie inside a ball of 60 mm radius by 0.16 mm, if they are 2.7 mm apart.
 
 For a window of pixels only the points of the reference near it are searched, and no search extends beyond the distance
 at which a point has no counterpart.
@@ -31,11 +32,14 @@ Window = tuple[slice, slice]
 
 _ALL = (slice(None), slice(None))
 
-#: number of points of the reference that determine the plane at a point
+#: number of points of the reference that determine the surface at a point: it has six coefficients
 NEIGHBOURS = 12
 
 #: a foot farther from the middle of its neighbours than this many times their distance lies beyond the edge
 _ASIDE = 1.5
+
+#: stiffness of the terms of second order, which two rows of points leave undetermined; chosen: takes 0.3 % of a bow
+_STIFF = (0.0, 1e-12, 1e-12, 1e-3, 1e-3, 1e-3)
 
 #: number of points processed at once
 _BLOCK = 32768
@@ -182,23 +186,33 @@ class _Searched:
 def _to_surface(points: Floats, farthest: Floats, searched: _Searched, viewpoint: Floats) -> Floats:
     """Return signed distances (n,) of points (n, 3) from a surface, NaN without a counterpart within ``farthest`` (n,).
 
-    The surface at a point is the plane through its nearest points.
+    The surface at a point is that of second order through its nearest points, over the plane through them.
     """
     out = np.full(len(points), np.nan)
     met, patch = searched.neighbours(points, farthest)
     points = points[met]
-    away = points - viewpoint
     middle = patch.mean(axis=1)
     spread = patch - middle[:, None]
-    values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))
-    normal = vectors[:, :, 0]
-    normal *= np.sign(np.einsum("ni,ni->n", normal, away))[:, None]
-    height = np.einsum("ni,ni->n", points - middle, normal)
-    aside = np.linalg.norm(points - height[:, None] * normal - middle, axis=1)
+    values, axes = np.linalg.eigh(spread.swapaxes(1, 2) @ spread)
+    axes[..., 0] *= np.sign(np.einsum("ni,ni->n", axes[..., 0], points - viewpoint))[:, None]
     # the square root of the largest variance of the neighbours is about their distance
-    reach = _ASIDE * np.sqrt(values[:, 2] / NEIGHBOURS)
-    out[met] = np.where(aside > reach, np.nan, height)
+    apart = np.sqrt(values[:, 2] / NEIGHBOURS)
+    height, *foot = np.einsum("nij,ni->jn", axes, points - middle)
+    heights, *feet = np.moveaxis(spread @ axes, -1, 0)
+    scale = np.maximum(apart, np.finfo(float).tiny)
+    terms = _second_order(*(coordinate / scale[:, None] for coordinate in feet))
+    products = terms.swapaxes(1, 2) @ terms + NEIGHBOURS * np.diag(_STIFF)
+    coefficients = np.linalg.solve(products, terms.swapaxes(1, 2) @ heights[..., None])[..., 0]
+    surface = np.einsum("ni,ni->n", coefficients, _second_order(*(coordinate / scale for coordinate in foot)))
+    low, high = heights.min(axis=1), heights.max(axis=1)
+    height -= np.clip(surface, low - (high - low) / 2, high + (high - low) / 2)  # points of two faces have no surface
+    out[met] = np.where(np.hypot(*foot) > _ASIDE * apart, np.nan, height)
     return out
+
+
+def _second_order(u: Floats, v: Floats) -> Floats:
+    """Return the terms (..., 6) of a surface of second order at places (...)."""
+    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
 
 
 def _described(grid: ViewGrid) -> str:
