@@ -64,11 +64,6 @@ class BoardCalibration:
         """Return ``sensor_from_board`` (n, 4, 4) at angles (n, k) [rad]."""
         return np.asarray(self.axes.motion(angles) @ self.zero_pose)
 
-    def pose_covariance(self, angles: ArrayLike) -> Floats:
-        """Return the covariance (n, 6, 6) of the poses: rotation about the sensor's axes [rad], position [mm]."""
-        jacobian = _pose_derivatives(self.axes, self.zero_pose, np.atleast_2d(np.asarray(angles, float)))
-        return np.asarray(jacobian @ self.covariance @ jacobian.swapaxes(1, 2))
-
 
 def axis_deviations(calibration: BoardCalibration) -> tuple[Floats, Floats]:
     """Return standard deviations of each axis: of its direction (k,) [rad], and of its point (k,) [mm].

@@ -74,9 +74,3 @@ class TurningAxes:
 def rotation_about(direction: Floats, angles: Floats) -> Floats:
     """Return rotations (n, 3, 3) about a unit direction (3,) by angles (n,) [rad]; the identity for NaN."""
     return np.asarray(Rotation.from_rotvec(np.nan_to_num(angles)[:, None] * direction).as_matrix())
-
-
-def cross_matrix(vector: Floats) -> Floats:
-    """Return [v] (3, 3) with [v] x = v cross x."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -20,7 +20,6 @@ from mitsim.sensor.transforms import Transform, is_rotation
 Number = Annotated[float, Field(ge=-1e9, le=1e9)]
 Row3 = tuple[Number, Number, Number]
 Row4 = tuple[Number, Number, Number, Number]
-Row6 = tuple[Number, Number, Number, Number, Number, Number]
 Side = Annotated[int, Field(ge=1, le=LONGEST_SIDE_PX)]
 
 
@@ -41,14 +40,6 @@ def _rigid(rows: tuple[Row4, Row4, Row4, Row4]) -> tuple[Row4, Row4, Row4, Row4]
     return rows
 
 
-def _covariance(rows: tuple[Row6, ...]) -> tuple[Row6, ...]:
-    matrix = np.array(rows)
-    largest = np.abs(matrix).max()
-    if np.abs(matrix - matrix.T).max() > 1e-9 * largest or np.linalg.eigvalsh(matrix).min() < -1e-9 * largest:
-        raise ValueError("a covariance matrix, 6 x 6, by rows: symmetric, with no negative eigenvalue")
-    return rows
-
-
 def _intrinsic(rows: tuple[Row3, Row3, Row3]) -> tuple[Row3, Row3, Row3]:
     if rows[0][0] <= 0 or rows[1][1] <= 0 or rows[1][0] != 0 or rows[2] != (0, 0, 1):
         raise ValueError("a camera matrix by rows: fx s cx, 0 fy cy, 0 0 1, with fx and fy over 0")
@@ -57,7 +48,6 @@ def _intrinsic(rows: tuple[Row3, Row3, Row3]) -> tuple[Row3, Row3, Row3]:
 
 RotationRows = Annotated[tuple[Row3, Row3, Row3], AfterValidator(_rotation)]
 RigidRows = Annotated[tuple[Row4, Row4, Row4, Row4], AfterValidator(_rigid)]
-CovarianceRows = Annotated[tuple[Row6, Row6, Row6, Row6, Row6, Row6], AfterValidator(_covariance)]
 IntrinsicRows = Annotated[tuple[Row3, Row3, Row3], AfterValidator(_intrinsic)]
 
 
@@ -108,20 +98,9 @@ class CalibrationDocument(Document):
 
 
 class PoseDocument(Document):
-    """Content of ``pose.json``; null means unknown.
-
-    ``world_from_sensor`` is 4 x 4 [mm]. ``covariance`` is 6 x 6: rotation vector about the world's axes [rad], and
-    position of the sensor in the world [mm].
-    """
+    """Content of ``pose.json``: ``world_from_sensor``, 4 x 4 [mm], null if unknown."""
 
     world_from_sensor: RigidRows | None
-    covariance: CovarianceRows | None = None
-
-    @model_validator(mode="after")
-    def _check_pose(self) -> PoseDocument:
-        if self.covariance is not None and self.world_from_sensor is None:
-            raise ValueError("no covariance without a pose")
-        return self
 
     def transform(self) -> Transform | None:
         """Return ``world_from_sensor``, None if unknown."""
@@ -140,12 +119,9 @@ def calibration_table(rig: Rig) -> dict[str, Any]:
     }
 
 
-def pose_table(pose: Transform | None, covariance: NDArray[np.float64] | None = None) -> dict[str, Any]:
-    """Return the content of ``pose.json``, not yet checked: ``world_from_sensor``, and its covariance (6, 6)."""
-    return {
-        "world_from_sensor": None if pose is None else _rows(pose.matrix()),
-        "covariance": None if covariance is None else _rows(covariance),
-    }
+def pose_table(pose: Transform | None) -> dict[str, Any]:
+    """Return the content of ``pose.json``, not yet checked."""
+    return {"world_from_sensor": None if pose is None else _rows(pose.matrix())}
 
 
 def rig_of(document: CalibrationDocument) -> Rig:

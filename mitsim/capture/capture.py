@@ -58,15 +58,12 @@ class Capture:
         Maps that the device itself computed, float32, NaN where a value is missing. ``depth`` (H, W) is along the
         axis [mm]. ``disparity`` (H, W) is of the rectified left image [px]. ``points`` (H, W, 3) are in the sensor
         frame [mm].
-    pose_covariance
-        (6, 6) covariance of the pose, None if unknown: rotation vector about the world's axes [rad], and position of
-        the sensor's origin in the world [mm].
 
     Raises
     ------
     ValueError
-        If the source is unknown, an image or map has the wrong shape or type, or a covariance has no pose. An
-        InputError if a region was read out of a camera that the capture does not have, or is not inside its image.
+        If the source is unknown, or an image or map has the wrong shape or type. An InputError if a region was read
+        out of a camera that the capture does not have, or is not inside its image.
     """
 
     sensor: str
@@ -80,7 +77,6 @@ class Capture:
     world_from_sensor: Transform | None = None
     serial: str = ""
     derived: dict[str, NDArray[np.float32]] = field(default_factory=dict)
-    pose_covariance: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         if self.source not in SOURCES:
@@ -111,8 +107,6 @@ class Capture:
                 found = [region.left, region.top, region.width, region.height]
                 allowed = f"[left, top, width, height] within {camera.width} x {camera.height} pixels"
                 raise InputError(where, f"read_out.{name}", found, allowed)
-        if self.pose_covariance is not None and self.world_from_sensor is None:
-            raise ValueError("a pose covariance without a pose")
 
     def brightness(self, camera: str) -> NDArray[np.float64]:
         """Return the light that a camera sees, (H, W) [DN]: the mean of its images but that of ambient light.

@@ -221,7 +221,6 @@ def read_capture(path: str | Path) -> Capture:
         world_from_sensor=pose.transform(),
         serial=document.serial,
         derived=derived,
-        pose_covariance=None if pose.covariance is None else np.array(pose.covariance),
     )
 
 

@@ -63,7 +63,7 @@ def packed(
     extra = {("vendor", name): data for name, data in (vendor or {}).items()}
     extra |= {("truth", f"{camera}.exr"): data for camera, data in (truth or {}).items()}
     calibration = calibration_table(capture.rig)
-    pose = pose_table(capture.world_from_sensor, capture.pose_covariance)
+    pose = pose_table(capture.world_from_sensor)
     validate(folder / "calibration.json", calibration, CalibrationDocument)
     validate(folder / "pose.json", pose, PoseDocument)
     files = {

@@ -189,7 +189,7 @@ def _posed(capture: Capture, window: tuple[int, int, int, int], where: str) -> C
 
     settings, imager = decoder_settings(capture, None, None)
     pose = pose_over_coupon(capture_cloud(capture, settings, imager=imager), Roi(*window), where)
-    return replace(capture, world_from_sensor=pose, pose_covariance=None)
+    return replace(capture, world_from_sensor=pose)
 
 
 def _patterns(images: list[str] | None) -> dict[str, str] | None:

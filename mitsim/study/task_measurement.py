@@ -278,7 +278,7 @@ def read_pose(path: Path, view: int | None = None) -> Transform:
         If the file cannot be read, has no pose or no such view, or its matrix is not a rigid motion.
     """
     if path.suffix.lower() != ".json":
-        return read_pose_file(path)[0]
+        return read_pose_file(path)
     table = read_json_object(path, "pose.json of a capture, poses.json of a run, or statement.json")
     key, matrix = "world_from_sensor", table.get("world_from_sensor")
     if "views" in table:

@@ -29,7 +29,6 @@ from mitsim.sensor.png import decode_png, encode_png
 from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT = 24, 16
-COVARIANCE = np.diag([1e-8, 2e-8, 3e-8, 1e-2, 2e-2, 3e-2]) + 1e-9
 
 
 def example(dtype=np.uint8, bits: int = 8) -> Capture:
@@ -53,7 +52,6 @@ def example(dtype=np.uint8, bits: int = 8) -> Capture:
         Transform.from_degrees([10, 20, 30], [1, 2, 1e-3]),
         "42",
         maps(),
-        COVARIANCE,
     )
 
 
@@ -73,9 +71,6 @@ def assert_same(a: Capture, b: Capture) -> None:
     assert (a.world_from_sensor is None) == (b.world_from_sensor is None)
     if a.world_from_sensor and b.world_from_sensor:
         np.testing.assert_array_equal(a.world_from_sensor.matrix(), b.world_from_sensor.matrix())
-    assert (a.pose_covariance is None) == (b.pose_covariance is None)
-    if a.pose_covariance is not None:
-        np.testing.assert_array_equal(a.pose_covariance, b.pose_covariance)
     assert list(a.derived) == list(b.derived)
     for name, values in a.derived.items():
         assert b.derived[name].dtype == np.float32
@@ -115,7 +110,6 @@ def test_what_is_not_known_stays_unknown(tmp_path):
         rig=Rig(example().rig.cameras),
         settings={},
         derived={},
-        pose_covariance=None,
     )
     assert_same(capture, read_capture(write_capture(capture, tmp_path / "c")))
 
@@ -197,8 +191,6 @@ def test_a_failure_in_the_middle_leaves_things_as_they_were(tmp_path, monkeypatc
         ({"images": {"left": np.zeros((0, HEIGHT, WIDTH), np.uint8)}}, "images.left"),
         ({"derived": {"depth": np.full((2, 2), np.inf, np.float32)}}, "derived.depth"),
         ({"derived": {"depth": np.zeros((0, 2), np.float32)}}, "derived.depth"),
-        ({"pose_covariance": -np.eye(6)}, "covariance"),
-        ({"pose_covariance": np.triu(np.ones((6, 6)))}, "covariance"),
     ],
 )
 def test_what_could_not_be_read_back_is_not_written(tmp_path, change, message):
@@ -273,8 +265,6 @@ def set_to(key, value):
         ("calibration.json", lambda t: t["cameras"][1].update(name="left"), "different names"),
         ("calibration.json", set_to("cameras", []), "cameras"),
         ("pose.json", set_to("world_from_sensor", [[1, 2], [3, 4]]), "world_from_sensor"),
-        ("pose.json", set_to("world_from_sensor", None), "no covariance without a pose"),
-        ("pose.json", set_to("covariance", [[1, 2], [3, 4]]), "covariance"),
     ],
 )
 def test_what_another_program_got_wrong_is_named(tmp_path, name, change, message):

@@ -31,7 +31,7 @@ def test_a_rounded_pose_is_the_nearest_motion_wherever_it_is_read(tmp_path, deci
     path = tmp_path / name
     path.write_text(text or "\n".join(" ".join(f"{value:g}" for value in row) for row in rows.tolist()))
     pose = read_pose(path)
-    np.testing.assert_allclose(pose.matrix(), imported_pose(path)[0].matrix(), atol=1e-12)
+    np.testing.assert_allclose(pose.matrix(), imported_pose(path).matrix(), atol=1e-12)
     np.testing.assert_allclose(
         pose.rotation @ pose.rotation.T, np.eye(3), atol=3e-6
     )  # a text of six digits is taken as it is

@@ -227,7 +227,7 @@ def read_recording(path: str | Path, options: ReadOptions, kind: str | None = No
     for name in (options.images or {}) if kind in ("images", "stereo-pair") else ():
         if name not in capture.rig.cameras:
             raise InputError("--images", "", repr(name), ", ".join(capture.rig.cameras))
-    pose, covariance = (None, None) if options.pose is None else read_pose(options.pose)
+    pose = None if options.pose is None else read_pose(options.pose)
     if pose is not None and (note := unit_note(pose, str(options.pose))):
         records["warnings"] = [*capture.settings.get("warnings", []), note]
     capture = replace(
@@ -235,7 +235,6 @@ def read_recording(path: str | Path, options: ReadOptions, kind: str | None = No
         decoding=capture.decoding.model_copy(update=decoding),
         settings=capture.settings | records,
         world_from_sensor=pose or capture.world_from_sensor,
-        pose_covariance=covariance if pose is not None else capture.pose_covariance,
     )
     return Imported(capture, kind, originals)
 

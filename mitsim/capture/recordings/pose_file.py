@@ -1,8 +1,8 @@
 """Read the pose of a sensor, ``world_from_sensor``, 4 x 4 [mm], from a file.
 
-The file is JSON, as ``pose.json`` of a capture, optionally with the covariance, or a list of rows; or text, four rows
-of four numbers, as NumPy, MATLAB and robots write them; or JSON or YAML with a position and a quaternion of known
-order, such as a pose or a transform of ROS, which are in metres.
+The file is JSON, as ``pose.json`` of a capture, or a list of rows; or text, four rows of four numbers, as NumPy, MATLAB
+and robots write them; or JSON or YAML with a position and a quaternion of known order, such as a pose or a transform of
+ROS, which are in metres.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ _POSITIONS = ("position", "translation")
 _TURNS = ("orientation", "rotation", "quaternion", "xyzw", "wxyz")
 
 
-def read_pose(file: str | Path) -> tuple[Transform, NDArray[np.float64] | None]:
-    """Return the pose of the sensor in the world [mm] and its covariance (6, 6), None if the file has none.
+def read_pose(file: str | Path) -> Transform:
+    """Return the pose of the sensor in the world [mm].
 
     Raises
     ------
@@ -78,10 +78,9 @@ def read_pose(file: str | Path) -> tuple[Transform, NDArray[np.float64] | None]:
         rows_given = np.array(table["world_from_sensor"], float)
         if rows_given.shape == (4, 4):
             table = table | {"world_from_sensor": with_exact_rotation(rows_given).tolist()}
-    document = validate(file, table, PoseDocument)
-    pose = document.transform()
+    pose = validate(file, table, PoseDocument).transform()
     assert pose is not None  # checked above
-    return pose, None if document.covariance is None else np.array(document.covariance)
+    return pose
 
 
 def unit_note(pose: Transform, where: str) -> str:

@@ -175,6 +175,5 @@ def _live_capture(live: LiveCampaign, shot: Shot, camera: OpenDevice, stage: Liv
         capture,
         sensor=live.campaign.sensor.name,
         world_from_sensor=calibration.sensor_from_coupon(angles).inverse(),
-        pose_covariance=calibration.world_covariance(angles),
         settings={**capture.settings, "device_model": capture.sensor, "stage": stage_record},
     )

@@ -2,10 +2,7 @@
 
 Signal chain: axes as lines in the sensor's frame and the coupon's pose at zero
 (:mod:`characterisation.stage.calibration`) -> ``stage_calibration.json`` -> motion of the axes by the angles read back,
-applied to the pose at zero -> ``sensor_from_coupon``, its inverse and the covariance of the inverse.
-
-Let r be the rotation vector about the sensor's axes and d the shift of ``sensor_from_coupon`` = (R, t). The inverse
-then rotates by -R^T r and shifts by -R^T ([t] r + d), which transforms the covariance.
+applied to the pose at zero -> ``sensor_from_coupon``.
 """
 
 from __future__ import annotations
@@ -30,7 +27,7 @@ from characterisation.files.documents import Document, Name, validate
 from characterisation.files.errors import InputError
 from characterisation.stage.angles import Stage
 from characterisation.stage.calibration import BoardCalibration
-from characterisation.stage.turning_axes import LINE_PARAMETERS, TurningAxes, cross_matrix
+from characterisation.stage.turning_axes import TurningAxes
 from mitsim.capture.calibration import RigidRows, Row3
 from mitsim.capture.devices.stage_connection import StageConnection
 from mitsim.sensor.transforms import Transform
@@ -72,58 +69,41 @@ class AxisLine(Document):
 
 
 class StageCalibrationFile(Document):
-    """Content of ``stage_calibration.json``.
-
-    ``covariance`` is that of four parameters for each axis, and of rotation [rad] and shift [mm] of
-    ``sensor_from_coupon`` at zero, as in :class:`~characterisation.stage.calibration.BoardCalibration`; null if
-    unknown.
-    """
+    """Content of ``stage_calibration.json``."""
 
     schema_version: Literal[1]
     axes: Annotated[tuple[AxisLine, ...], Field(min_length=1, max_length=3)]
     sensor_from_coupon: RigidRows
-    covariance: tuple[tuple[float, ...], ...] | None = None
 
     @model_validator(mode="after")
     def _whole(self) -> StageCalibrationFile:
         if any(np.linalg.norm(axis.direction) < 1e-9 for axis in self.axes):
             raise ValueError("axes with a non-zero direction")
-        size = LINE_PARAMETERS * len(self.axes) + 6
-        if self.covariance is not None and {len(self.covariance), *map(len, self.covariance)} != {size}:
-            raise ValueError(f"a covariance of {size} x {size}, or null")
         return self
 
 
 @dataclass(frozen=True)
 class StageCalibration:
-    """A calibrated stage with a coupon: ``names`` of its axes, and ``fit`` of the coupon, whose covariance may be NaN.
+    """A calibrated stage with a coupon: ``names`` of its ``axes`` in the sensor's frame, and ``sensor_from_zero``.
 
-    ``where`` is the file that it was read from; ``checksum`` has twelve hexadecimal digits of its content.
+    ``sensor_from_zero`` is the coupon's pose with all angles at zero. ``where`` is the file that it was read from;
+    ``checksum`` has twelve hexadecimal digits of its content.
     """
 
     names: tuple[str, ...]
-    fit: BoardCalibration
+    axes: TurningAxes
+    sensor_from_zero: Transform
     where: str
     checksum: str
 
     def sensor_from_coupon(self, angles: ArrayLike) -> Transform:
         """Return the coupon's pose at angles (axes,) [rad]."""
-        return Transform.from_matrix(self.fit.poses(np.atleast_2d(np.asarray(angles, float)))[0])
-
-    def world_covariance(self, angles: ArrayLike) -> Floats | None:
-        """Return the covariance (6, 6) of ``world_from_sensor``, None if unknown; the world is the coupon's frame."""
-        if not np.isfinite(self.fit.covariance).all():
-            return None
-        angles = np.atleast_2d(np.asarray(angles, float))
-        pose = Transform.from_matrix(self.fit.poses(angles)[0])
-        back = -pose.rotation.T
-        jacobian = np.block([[back, np.zeros((3, 3))], [back @ cross_matrix(pose.translation), back]])
-        out = jacobian @ self.fit.pose_covariance(angles)[0] @ jacobian.T
-        return np.asarray((out + out.T) / 2)
+        motion = self.axes.motion(np.atleast_2d(np.asarray(angles, float)))[0]
+        return Transform.from_matrix(motion @ self.sensor_from_zero.matrix())
 
     def distance(self, eye: Floats) -> float:
         """Return the distance [mm] of the coupon at zero from the reference camera at ``eye`` (3,) [mm]."""
-        return float(np.linalg.norm(np.asarray(self.fit.zero_pose)[:3, 3] - eye))
+        return float(np.linalg.norm(self.sensor_from_zero.translation - eye))
 
     def stage(self, table: StageTable, eye: Floats) -> StageTable:
         """Return the ``[stage]`` table with the calibrated axes and normal, in the view frame of the coupon.
@@ -140,11 +120,11 @@ class StageCalibration:
             allowed = ", ".join(axis.name for axis in table.axes)
             hint = "the axes of the campaign's [stage], in its order"
             raise InputError(self.where, "axes", ", ".join(self.names), allowed, hint)
-        zero = self.sensor_from_coupon(np.zeros(len(self.names)))
+        zero = self.sensor_from_zero
         ray = zero.translation - eye
         view = view_frame(ray / np.linalg.norm(ray), np.array([1.0, 0.0, 0.0]))
         axes = []
-        for number, (axis, direction) in enumerate(zip(table.axes, self.fit.axes.directions, strict=True)):
+        for number, (axis, direction) in enumerate(zip(table.axes, self.axes.directions, strict=True)):
             direction_seen = view @ direction
             apart = math.degrees(math.acos(np.clip(axis.unit() @ direction_seen, -1, 1)))
             if apart > LARGEST_MISMATCH_DEG:
@@ -177,15 +157,12 @@ def write_stage_calibration(
     --------
     read_stage_calibration : the inverse
     """
-    board, on_board = Transform.from_matrix(fit.zero_pose), board_from_coupon or Transform.identity()
-    carried = np.eye(len(fit.covariance))
-    carried[-3:, -6:-3] = -cross_matrix(board.rotation @ on_board.translation)
+    coupon = Transform.from_matrix(fit.zero_pose) @ (board_from_coupon or Transform.identity())
     lines = zip(names, fit.axes.directions, fit.axes.points, strict=True)
     table: dict[str, Any] = {
         "schema_version": 1,
         "axes": [{"name": n, "direction": d.tolist(), "point_mm": p.tolist()} for n, d, p in lines],
-        "sensor_from_coupon": (board @ on_board).matrix().tolist(),
-        "covariance": (carried @ fit.covariance @ carried.T).tolist(),
+        "sensor_from_coupon": coupon.matrix().tolist(),
     }
     validate(path, json.loads(json.dumps(table)), StageCalibrationFile)
     write_json(path, table)
@@ -204,8 +181,6 @@ def read_stage_calibration(path: str | Path) -> StageCalibration:
     directions = np.array([axis.direction for axis in read.axes])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     axes = TurningAxes(directions, np.array([axis.point_mm for axis in read.axes]))
-    size = LINE_PARAMETERS * axes.count + 6
-    covariance = np.full((size, size), np.nan) if read.covariance is None else np.array(read.covariance)
-    fit = BoardCalibration(axes, np.array(read.sensor_from_coupon), covariance, np.empty((0, 6)))
+    zero = Transform.from_matrix(read.sensor_from_coupon)
     checksum = hashlib.sha256(read.model_dump_json().encode()).hexdigest()[:12]
-    return StageCalibration(tuple(axis.name for axis in read.axes), fit, str(path), checksum)
+    return StageCalibration(tuple(axis.name for axis in read.axes), axes, zero, str(path), checksum)

@@ -186,16 +186,15 @@ def test_frames_by_number_or_name(tmp_path):
     "text",
     [
         json.dumps(POSE.matrix().tolist()),
-        json.dumps({"world_from_sensor": POSE.matrix().tolist(), "covariance": None}),
+        json.dumps({"world_from_sensor": POSE.matrix().tolist()}),
         "\n".join(",".join(f"{value:.12g}" for value in row) for row in POSE.matrix()),
         "\n".join("\t".join(f"{value:.12g}" for value in row) for row in POSE.matrix()) + "\n\n",
     ],
 )
 def test_poses_in_the_usual_files(tmp_path, text):
     (tmp_path / "pose").write_text(text)
-    pose, covariance = read_pose(tmp_path / "pose")
+    pose = read_pose(tmp_path / "pose")
     np.testing.assert_allclose(pose.matrix(), POSE.matrix(), atol=1e-9)
-    assert covariance is None
 
 
 @pytest.mark.parametrize(("unit", "doubted"), [(1.0, False), (1e-3, True), (0.0, False)])
@@ -279,10 +278,9 @@ OF_QUATERNIONS = {
 @pytest.mark.parametrize("name", OF_QUATERNIONS)
 def test_a_pose_of_a_position_and_an_orientation(tmp_path, name):
     (tmp_path / "pose").write_text(OF_QUATERNIONS[name])
-    pose, covariance = read_pose(tmp_path / "pose")
+    pose = read_pose(tmp_path / "pose")
     points = np.array([[0.0, 0.0, 0.0], [30.0, -40.0, 600.0]])
     np.testing.assert_allclose(pose.points(points), TURN.apply(points) + np.array([100, -20, 500]), atol=1e-9)
-    assert covariance is None
 
 
 @pytest.mark.parametrize(
@@ -336,7 +334,7 @@ def test_a_pose_of_few_decimals_is_the_nearest_rotation(tmp_path, decimals, comm
     """Before, six were "no rotation matrix"; and a colon in a comment was YAML."""
     rows = [" ".join(f"{value:.{decimals}f}" for value in row) for row in POSE.matrix()]
     (tmp_path / "pose").write_text(comment + "\n".join(rows))
-    pose, _ = read_pose(tmp_path / "pose")
+    pose = read_pose(tmp_path / "pose")
     np.testing.assert_allclose(pose.matrix(), POSE.matrix(), atol=10.0**-decimals)
     assert np.abs(pose.rotation @ pose.rotation.T - np.eye(3)).max() < 1e-6
 

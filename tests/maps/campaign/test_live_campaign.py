@@ -98,7 +98,6 @@ def test_a_live_campaign_that_is_killed_goes_on_and_ends_in_the_same_map(rig, tm
         assert 0 < np.abs(np.subtract(turned["asked_deg"], turned["read_deg"])).max() < 0.0514 / 2 + 1e-3
         pose = fit.poses(np.radians([turned["read_deg"]]))[0]
         assert np.allclose(capture.world_from_sensor.inverse().matrix(), pose, atol=1e-9)
-        assert np.sqrt(np.diag(capture.pose_covariance)).min() > 0
         # that of the plan, to the half step of both axes
         name = [float(shot.name[:7]), float(shot.name[7:])]
         ray = fit.zero_pose[:3, 3] / np.linalg.norm(fit.zero_pose[:3, 3])

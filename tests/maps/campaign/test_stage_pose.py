@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
@@ -45,29 +44,6 @@ def test_a_calibration_comes_back_from_its_file(board, tmp_path):
     expected = board.poses(ANGLES[None])[0] @ ON_BOARD.matrix()
     assert np.allclose(read.sensor_from_coupon(ANGLES).matrix(), expected, atol=1e-9)
     assert read.names == ("pan", "tilt")
-
-
-def test_the_covariance_of_the_pose_is_that_of_numbers(board, tmp_path):
-    """Central differences over all fourteen parameters of the board's calibration, through the file."""
-    write_stage_calibration(tmp_path / "stage.json", board, ["pan", "tilt"], board_from_coupon=ON_BOARD)
-    stated = read_stage_calibration(tmp_path / "stage.json").world_covariance(ANGLES)
-
-    def world(parameters):
-        zero = board.zero_pose.copy()
-        zero[:3, :3] = Rotation.from_rotvec(parameters[8:11]).as_matrix() @ zero[:3, :3]
-        zero[:3, 3] += parameters[11:]
-        moved = BoardCalibration(AXES.moved(parameters[:8]), zero, board.covariance, board.residuals)
-        return np.linalg.inv(moved.poses(ANGLES[None])[0] @ ON_BOARD.matrix())
-
-    columns, at = [], world(np.zeros(14))
-    for i, h in enumerate([1e-6, 1e-6, 1e-3, 1e-3] * 2 + [1e-6] * 3 + [1e-3] * 3):
-        plus, minus = world(h * np.eye(14)[i]), world(-h * np.eye(14)[i])
-        turned = [Rotation.from_matrix(one[:3, :3] @ at[:3, :3].T).as_rotvec() for one in (plus, minus)]
-        columns.append(np.concatenate([turned[0] - turned[1], plus[:3, 3] - minus[:3, 3]]) / (2 * h))
-    jacobian = np.stack(columns, axis=1)
-    known = jacobian @ board.covariance @ jacobian.T
-    scale = np.sqrt(np.outer(np.diag(known), np.diag(known)))
-    assert (np.abs(stated - known) < 1e-5 * scale).all()
 
 
 def test_the_planned_stage_shows_the_normals_that_the_calibrated_one_has(board, tmp_path):
@@ -147,7 +123,6 @@ def test_a_damaged_calibration_is_refused_or_read(data, tmp_path_factory):
     [
         ({"schema_version": 2}, "schema_version"),
         ({"axes": []}, "axes"),
-        ({"covariance": [[1.0]]}, "a covariance of 14 x 14, or null"),
         ({"sensor_from_coupon": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, "a rotation matrix"),
         ({"axis": 1}, "axis: found an unknown key"),
     ],
