@@ -54,6 +54,9 @@ LEAST_CROSSINGS = 12
 #: least F of the face beside the edge for which its place is fitted; *assumed*
 LEAST_FRACTION = 0.3
 
+#: terms of the sampling errors that noise dithers; chosen: the rest is 1/50 of their variance at most
+HARMONICS = 30
+
 
 class Crossings(NamedTuple):
     """Points where an edge crosses rows and columns of the grid.
@@ -146,7 +149,7 @@ def fit_edge_point(
     residual, jacobian, _ = edge.linearised(np.zeros(2), points)
     _, residual_std, count = covariance_of(residual, jacobian, edge.kind)
     pitch = edge.linearised(np.zeros(2), points + steps)[0] - residual
-    covariance = _straight_covariance(residual, jacobian, pitch)
+    covariance = _straight_covariance(residual, jacobian, pitch, crossings.fraction)
     covariance[0, 0] += crossings.shared**2
     fit = EdgePointFit(edge.point, edge.direction, edge.normal, edge.slope, edge.ray, covariance, residual_std, count)
     check_figure(fit, nominal, reach)
@@ -287,7 +290,7 @@ def _window(cloud: PointCloud, figure: Circle | EdgePoint, reach: float) -> tupl
     return rows, columns
 
 
-def _straight_covariance(residual: Array, jacobian: Array, pitch: Array) -> Array:
+def _straight_covariance(residual: Array, jacobian: Array, pitch: Array, fraction: float) -> Array:
     """Return the covariance (2, 2) of a straight edge through crossings with residuals (n,) [mm], derivatives (n, 2).
 
     Where the edge lies between two pixels a ``pitch`` (n,) [mm] apart is uniform, but the same for all crossings: they
@@ -295,13 +298,40 @@ def _straight_covariance(residual: Array, jacobian: Array, pitch: Array) -> Arra
 
         d_i d_j (1/12 - t (1 - t) / 2),      t = p_i - p_j modulo 1
 
-    The remaining variance of the residuals is that of random losses and noise, which are independent.
+    The remaining variance of the residuals is that of random losses and noise, which are independent. Losses move a
+    crossing by whole pixels. Noise, with a variance of s^2 pixels^2, also dithers the places between pixels: it
+    multiplies the term of d_i d_j cos(2 pi k t) / (2 pi^2 k^2), of which the covariance above is the sum over k, by
+    exp(-(2 pi k s)^2). Losses with the ``fraction`` F have a variance of (1 - F) / F^2 pixels^2; s^2 is what exceeds
+    it by more than a standard error.
+
+    Parameters
+    ----------
+    residual, jacobian, pitch, fraction
+        As above.
+
+    See Also
+    --------
+    characterisation.features.figures.edge_covariance : expected, before there are crossings
     """
+    count = len(residual)
     normal = jacobian.T @ jacobian
     inverse = np.linalg.inv(normal)
     phase = residual / pitch
     apart = (phase[:, None] - phase) % 1.0
     weights = (jacobian * pitch[:, None]) @ inverse
-    sampling = weights.T @ (1 / 12 - apart * (1 - apart) / 2) @ weights
-    remaining = max(float(residual @ residual - pitch @ pitch / 12 + np.sum(normal * sampling)), 0.0)
-    return np.asarray(sampling + remaining / (len(residual) - 2) * inverse)
+
+    def parts(jitter: float) -> tuple[Array, float]:
+        between = 1 / 12 - apart * (1 - apart) / 2
+        for harmonic in 2 * np.pi * np.arange(1, HARMONICS + 1) if jitter else ():
+            between -= 2 / harmonic**2 * -np.expm1(-(harmonic**2) * jitter) * np.cos(harmonic * apart)
+        np.fill_diagonal(between, 1 / 12)
+        sampling = np.asarray(weights.T @ between @ weights)
+        squares = float(residual @ residual - pitch @ pitch / 12 + np.sum(normal * sampling))
+        return sampling, max(squares, 0.0) / (count - 2)
+
+    _, remaining = parts(0.0)
+    lost = (1 - fraction) / fraction**2
+    # the numbers of lost pixels have the kurtosis 9 + 1 / lost
+    lost += np.sqrt(lost * (8 * lost + 1) / count)
+    sampling, remaining = parts(max(remaining / float(np.mean(pitch**2)) - lost, 0.0))
+    return np.asarray(sampling + remaining * inverse)
