@@ -29,6 +29,8 @@ def write_calibration(checked: CheckedCalibration, output: Path) -> Path:
 def opencv_text(rig: Rig, fitted_to: Sequence[FittedCapture] = ()) -> str:
     """Return a rig as OpenCV's YAML, by the names of its stereo sample; a projector by ``proj_``.
 
+    ``R`` and ``T`` are those of the second camera, or of the projector of a single one.
+
     Comments name the images that it was ``fitted_to``.
     """
     (_, first), *other_cameras = rig.cameras.items()
@@ -41,7 +43,9 @@ def opencv_text(rig: Rig, fitted_to: Sequence[FittedCapture] = ()) -> str:
         lines += _eye(first, "cam_K", "cam_kc", "image_size")
     if rig.projector is not None:
         lines += _eye(rig.projector, "proj_K", "proj_kc", "projector_size")
-        lines += _pose(rig.projector)
+        lines += _pose(rig.projector, "proj_" if other_cameras else "")
+    if rig.projector is not None or other_cameras:
+        lines.append('unit: "mm"')
     return "\n".join(lines) + "\n"
 
 
@@ -79,9 +83,9 @@ def _eye(eye: Camera, matrix: str, distortion: str, size: str) -> list[str]:
     ]
 
 
-def _pose(eye: Camera) -> list[str]:
+def _pose(eye: Camera, prefix: str = "") -> list[str]:
     motion = eye.sensor_from_camera.inverse()
-    return [*_matrix("R", motion.rotation), *_matrix("T", motion.translation.reshape(3, 1)), 'unit: "mm"']
+    return [*_matrix(f"{prefix}R", motion.rotation), *_matrix(f"{prefix}T", motion.translation.reshape(3, 1))]
 
 
 def _matrix(name: str, values: ArrayLike) -> list[str]:

@@ -23,7 +23,7 @@ from mitsim.study.calibration.board import Board
 from mitsim.study.calibration.corner_files import read_corners
 from mitsim.study.calibration.halves import calibrate_checked, in_words
 from mitsim.study.calibration.recorded import RecordedBoard, RecordedCorners
-from mitsim.study.calibration.written import write_calibration
+from mitsim.study.calibration.written import opencv_text, write_calibration
 from tests.shell import mitsim_here
 
 BOARD = Board(9, 7, 20.0, "glass")
@@ -280,3 +280,21 @@ def test_images_of_one_pose_in_two_folders_are_refused(tmp_path):
         write_images(tmp_path, place + "/{camera}-{pose:04d}.png")
     with pytest.raises(InputError, match=r"tuesday.*: found a second image of left, pose 0000"):
         read_corners(tmp_path, BOARD)
+
+
+def test_a_projector_beside_two_cameras_has_a_pose_of_its_own(tmp_path):
+    """R, T and the unit were written twice, and OpenCV read the R and T of one of them."""
+    turned = Transform(Rotation.from_rotvec([0.02, 0.15, 0.0]).as_matrix(), np.array([-60.0, 5.0, 1.0]))
+    rig = replace(pair(), projector=Camera(pair().cameras["left"].matrix, np.zeros(5), 912, 1140, turned))
+    (tmp_path / "rig.yml").write_text(opencv_text(rig))
+    stored = cv2.FileStorage(str(tmp_path / "rig.yml"), cv2.FILE_STORAGE_READ)
+    assert len(stored.root().keys()) == len(set(stored.root().keys())) == 14
+    for prefix, eye in (("", rig.cameras["right"]), ("proj_", rig.projector)):
+        rotation, shift = eye.sensor_from_camera.rotation, eye.sensor_from_camera.translation
+        np.testing.assert_allclose(stored.getNode(f"{prefix}R").mat(), rotation.T, atol=1e-12)
+        np.testing.assert_allclose(stored.getNode(f"{prefix}T").mat().ravel(), -rotation.T @ shift, atol=1e-9)
+    stored.release()
+    table = {"calibration": {"file": "rig.yml", "cameras": ["left", "right"]}}
+    read, _ = with_calibration(tmp_path / "sensor.toml", table)
+    for eye, place in ((read["cameras"]["right"], [100.0, 1.0, 3.0]), (read["projector"], [-60.0, 5.0, 1.0])):
+        np.testing.assert_allclose(eye["position_mm"], place, atol=1e-9)
