@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from characterisation.features.robust_fit import MEDIAN_TO_STD
-from characterisation.files.arrays import Floats
+from characterisation.files.arrays import MEDIAN_TO_STD, Floats
 from characterisation.files.errors import InputError
 from characterisation.files.threads import thread_count
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, PointCloud, ViewGrid

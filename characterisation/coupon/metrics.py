@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import betaincinv
 
-from characterisation.files.arrays import Floats
+from characterisation.files.arrays import MEDIAN_TO_STD, Floats
 
 #: degrees of freedom that the fit of a plane takes
 PLANE_PARAMETERS = 3
@@ -33,8 +33,6 @@ LEAST_DEGREES = 10
 
 #: an outlier lies farther from the plane than this many robust standard deviations, as 6e-7 of Gaussian points do
 OUTLIER_SIGMAS = 5.0
-
-_MAD_TO_SIGMA = 1.482602218505602
 
 #: smallest 1 - r^2 for which a plane is fitted, r being the correlation of the coordinates; 0 for points on a line
 _SMALLEST_DETERMINANT = 1e-10
@@ -183,7 +181,7 @@ def _robust_sigma(residual: Floats, present: NDArray[np.bool_]) -> Floats:
         return np.asarray(0.5 * (pick(ordered, low[..., None], -1) + pick(ordered, high[..., None], -1))[..., 0])
 
     centred = np.abs(residual - masked_median(residual)[..., None])
-    return np.asarray(_MAD_TO_SIGMA * masked_median(centred))
+    return np.asarray(MEDIAN_TO_STD * masked_median(centred))
 
 
 def recovered_fraction(

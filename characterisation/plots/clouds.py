@@ -11,6 +11,7 @@ from matplotlib.patches import Patch
 from matplotlib.transforms import ScaledTranslation
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import MEDIAN_TO_STD
 from characterisation.plots.style import DIVERGING, FIELD, SEQUENTIAL, figure_of, side_bar
 
 #: meaning and colour of each status, by name: Okabe and Ito's palette, and greys of different lightness
@@ -38,7 +39,7 @@ _BEYOND = 2.0
 #: distance of the legend from the picture: its ticks and label lie between [in]
 _UNDER_IN = 0.42
 
-#: end of the colour scale of residuals, in standard deviations by the median (1.4826 MAD of a normal distribution)
+#: end of the colour scale of residuals, in standard deviations by the median
 _RESIDUAL_SIGMAS = 3.0
 
 
@@ -54,7 +55,7 @@ def depth_limits(values: NDArray[np.floating], beyond: float = _BEYOND_PREDICTED
 def residual_limit(values: NDArray[np.floating]) -> float:
     """Return the end of a symmetric colour scale of residuals [mm]."""
     sizes = np.abs(values[np.isfinite(values)])
-    limit = _RESIDUAL_SIGMAS * 1.4826 * float(np.median(sizes)) if len(sizes) else 0.0
+    limit = _RESIDUAL_SIGMAS * MEDIAN_TO_STD * float(np.median(sizes)) if len(sizes) else 0.0
     return limit if limit > 0 else 1.0
 
 

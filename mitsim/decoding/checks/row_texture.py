@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from characterisation.files.arrays import Floats
+from characterisation.files.arrays import MEDIAN_TO_STD, Floats
 from characterisation.point_cloud import PointCloud
 from mitsim.decoding.matching.row_error import MAXIMUM_ROWS, row_error
 from mitsim.decoding.matching.stereo import StereoGeometry
@@ -113,7 +113,7 @@ def textured_row_error(
 
 def _spread(errors: Floats) -> float:
     """Return the standard deviation of errors (n,), from the median of their deviations."""
-    return 1.4826 * float(np.median(np.abs(errors - np.median(errors))))
+    return MEDIAN_TO_STD * float(np.median(np.abs(errors - np.median(errors))))
 
 
 def _of_patches(left: Floats, right: Floats, geometry: StereoGeometry, disparity: Floats, reach: int) -> Floats:

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from characterisation.features.robust_fit import FOUR_DIGITS
 from characterisation.files.arrays import Floats
 from mitsim.decoding.grey_levels import MeasuredNoise
 from mitsim.decoding.structured_light.phase_shift import fit_phases
@@ -41,9 +42,6 @@ _PIXELS_PER_LEVEL = 500
 
 #: highest harmonic of a fringe that is subtracted
 _HARMONICS = 8
-
-#: ratio of standard deviation to median absolute deviation of a normal distribution
-_MAD_TO_STD = 1.4826
 
 #: least modulation of the pixels that are used [1/255 of full scale]
 _MINIMUM_MODULATION = 8.0
@@ -145,7 +143,7 @@ def _without_harmonics(residuals: Floats, phase: Floats, modulation: Floats) -> 
         used_terms = terms[:, used]
         coefficients = np.linalg.lstsq(used_terms @ used_terms.T, used_terms @ residuals[:, used].T, rcond=1e-9)[0]
         remainder = residuals - coefficients.T @ terms
-        used = (np.abs(remainder) < 4 * _MAD_TO_STD * np.median(np.abs(remainder), axis=1, keepdims=True) + 1).all(
+        used = (np.abs(remainder) < 4 * FOUR_DIGITS * np.median(np.abs(remainder), axis=1, keepdims=True) + 1).all(
             axis=0
         )
         if used.sum() < _MINIMUM_PIXELS:

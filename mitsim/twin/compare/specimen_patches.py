@@ -24,7 +24,7 @@ from scipy.sparse import csr_array
 
 from characterisation.coupon.metrics import RayNoise, ray_noise_std
 from characterisation.coupon.residual_field import LARGEST_LAG, autocorrelation
-from characterisation.files.arrays import Floats
+from characterisation.files.arrays import MEDIAN_TO_STD, Floats
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, PointCloud, Status
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
@@ -52,8 +52,6 @@ _WINDOWS = (7, 31)
 
 #: width of this window in run lengths of the pattern, so that several dots lie in it; chosen
 _RUNS = 2.5
-
-_MAD_TO_SIGMA = 1.482602218505602
 
 
 @dataclass(frozen=True)
@@ -143,7 +141,7 @@ def specimen_patches(
         contrast=np.nanmean(of_image(deviation / np.maximum(mean, 1.0)), axis=-1),
         crossings=np.nansum(crossings, axis=-1),
         pixels=np.isfinite(crossings).sum(axis=-1).astype(float),
-        finest=_MAD_TO_SIGMA * np.nanmedian(of_image(finest), axis=-1),
+        finest=MEDIAN_TO_STD * np.nanmedian(of_image(finest), axis=-1),
         status=np.stack([(status == value).sum(axis=-1) for value in Status], axis=-1).astype(float),
         recovered=np.nansum(recovered, axis=-1),
         sigma=sigma,

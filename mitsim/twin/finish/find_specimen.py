@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from characterisation.features.fits import fit_plane
 from characterisation.features.robust_fit import FitError
-from characterisation.files.arrays import Floats
+from characterisation.files.arrays import MEDIAN_TO_STD, Floats
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
@@ -123,7 +123,7 @@ def find_specimen(capture: Capture, settings: Settings, roi: Roi | None, where: 
     columns, rows = np.ceil(extent / cell).astype(int)
     xs, ys = np.meshgrid(first[0] + (np.arange(columns) + 0.5) * cell[0], first[1] + (np.arange(rows) + 0.5) * cell[1])
     occupied = shown(pose.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1)))
-    specimen = Specimen(pose, first, cell, occupied, float(1.482602218505602 * np.median(np.abs(off))))
+    specimen = Specimen(pose, first, cell, occupied, float(MEDIAN_TO_STD * np.median(np.abs(off))))
     return replace(specimen, bend=_bend_of(specimen, points))
 
 

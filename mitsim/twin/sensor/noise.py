@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from characterisation.files.arrays import MEDIAN_TO_STD
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.point_spread import point_spread
 from mitsim.sensor.sensor import Sensor
@@ -117,7 +118,7 @@ def smoothing_of(image: NDArray[np.unsignedinteger], mask: NDArray[np.bool_]) ->
     noise of whole grey levels is subtracted first.
     """
     fine = finest_detail(image.astype(float))
-    size = 1.4826 * float(np.median(np.abs(fine[mask])))
+    size = MEDIAN_TO_STD * float(np.median(np.abs(fine[mask])))
     usable = mask & (np.abs(fine) < 4 * max(size, 0.5))
     energy, products = float((fine[usable] ** 2).mean()), []
     for first, second in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from characterisation.files.arrays import Floats
+from characterisation.files.arrays import MEDIAN_TO_STD, Floats
 from mitsim.capture.capture import Capture
 from mitsim.decoding.cloud import Settings, capture_geometry
 from mitsim.decoding.matching.stereo import StereoGeometry
@@ -27,7 +27,6 @@ _FEWEST = 6
 
 #: outlier limit in standard deviations; chosen
 _CLIP = 3.0
-_MAD_TO_SIGMA = 1.482602218505602
 
 
 def row_turns(
@@ -59,7 +58,7 @@ def row_turns(
             return {}
         turns, covariance, residual = _line(design[used], errors[used], np.array(prior))
         off = errors - design @ turns
-        used &= np.abs(off) <= _CLIP * max(_MAD_TO_SIGMA * float(np.median(np.abs(residual))), 1e-3)
+        used &= np.abs(off) <= _CLIP * max(MEDIAN_TO_STD * float(np.median(np.abs(residual))), 1e-3)
     spread = np.sqrt(np.diag(covariance))
     return {name: (float(turns[k]), float(spread[k])) for k, name in enumerate(("row_mrad", "roll_mrad"))}
 
