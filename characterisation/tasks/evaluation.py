@@ -20,7 +20,7 @@ from characterisation.features.edges import fit_circle, fit_edge_point
 from characterisation.features.figures import Circle, EdgePoint
 from characterisation.features.fits import LEAST_BELONGING, belonging, fit_surface
 from characterisation.features.fitted import CylinderFit, Fit, PlaneFit
-from characterisation.features.form import Form, fit_form
+from characterisation.features.form import Form, fit_form, zone_uncertainty
 from characterisation.features.pose_fit import PoseFit, fit_pose
 from characterisation.features.robust_fit import FitError, UndeterminedError
 from characterisation.features.surfaces import Surface
@@ -259,7 +259,9 @@ def _result(
             prefix = f"{quantity.features[0]}: " if quantity.kind == "feature" else ""
             return failed(name, measurement.unit, f"{prefix}{estimate}", points_given=point_count)
         estimates.append(estimate)
-    value, uncertainty = evaluate(model.value, estimates) if propagated else (model.value(*estimates), math.nan)
+    form, value, uncertainty = estimates[0], model.value(*estimates), math.nan
+    if propagated:
+        uncertainty = zone_uncertainty(form) if isinstance(form, Form) else evaluate(model.value, estimates)[1]
     if not np.isfinite([value, uncertainty] if propagated else value).all():
         why = "an axis lies in a plane, or planes or axes that must intersect are parallel"
         return failed(name, measurement.unit, f"{measurement.kind} has no value: {why}", points_given=point_count)
