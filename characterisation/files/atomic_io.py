@@ -27,6 +27,9 @@ FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 #: this machine in the names of partial files, since process numbers of different machines may be equal
 HOST = hashlib.sha256(platform.node().encode()).hexdigest()[:6]
 
+#: bytes that a disk must still have for a failed writer's error not to be that of a full disk; chosen
+_ROOM = 64 * 1024
+
 #: bytes of a netCDF file beside its values, for each file; measured: 8 kB
 _NETCDF_FILE = 16 * 1024
 
@@ -68,7 +71,12 @@ def atomic_write_named(path: str | Path) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", suffix=f".{ours}", dir=path.parent) as folder:
         partial = Path(folder) / path.name
         with _naming(path):
-            yield partial
+            try:
+                yield partial
+            except Exception as error:
+                if not isinstance(error, OSError):  # libraries report a full disk as errors of their own
+                    (Path(folder) / ".full").write_bytes(bytes(_ROOM))
+                raise
             partial.replace(path)
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
-from characterisation.files.atomic_io import atomic_write_named
+from characterisation.files.atomic_io import atomic_write
 from characterisation.point_cloud import Status
 from mitsim.report.cloud_figures import REASONS
 from mitsim.report.export.cloud_points import cloud_points
@@ -36,25 +36,24 @@ _UNKNOWN = (150, 150, 150)
 def write_rrd(scene: RunScene, path: str | Path, recording: str) -> None:
     """Write a recording; ``recording`` is its id, which distinguishes it in the viewer."""
     rerun = needed("rerun", "rerun-sdk", f"{path}: Rerun")
-    with atomic_write_named(path) as file:
-        stream = rerun.RecordingStream("mitsim", recording_id=recording, send_properties=False)
-        stream.save(str(file))
-        stream.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        colours = {status: (255 * np.array(to_rgb(REASONS[status][1]))).round().astype(np.uint8) for status in Status}
-        classes = [(status.value, status.name.lower(), colour.tolist()) for status, colour in colours.items()]
-        stream.log("views", rerun.AnnotationContext(classes), static=True)
-        if scene.part is not None:
-            mesh = rerun.Mesh3D(
-                vertex_positions=scene.part.vertices,
-                triangle_indices=scene.part.faces,
-                vertex_normals=scene.part.vertex_normals,
-                albedo_factor=(180, 180, 185),
-            )
-            stream.log("part", mesh, static=True)
-        for view in scene.views:
-            _log_view(rerun, stream, scene, view)
-        stream.flush()
-        stream.disconnect()
+    stream = rerun.RecordingStream("mitsim", recording_id=recording, send_properties=False)
+    memory = stream.memory_recording()  # on a full disk Rerun's own file is cut short without an error, or never ends
+    stream.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    colours = {status: (255 * np.array(to_rgb(REASONS[status][1]))).round().astype(np.uint8) for status in Status}
+    classes = [(status.value, status.name.lower(), colour.tolist()) for status, colour in colours.items()]
+    stream.log("views", rerun.AnnotationContext(classes), static=True)
+    if scene.part is not None:
+        mesh = rerun.Mesh3D(
+            vertex_positions=scene.part.vertices,
+            triangle_indices=scene.part.faces,
+            vertex_normals=scene.part.vertex_normals,
+            albedo_factor=(180, 180, 185),
+        )
+        stream.log("part", mesh, static=True)
+    for view in scene.views:
+        _log_view(rerun, stream, scene, view)
+    with atomic_write(path) as file:
+        file.write_bytes(memory.drain_as_bytes())
 
 
 def _log_view(rerun: Any, stream: Any, scene: RunScene, view: ShownView) -> None:
