@@ -61,7 +61,8 @@ def recorded_streams(path: str | Path) -> dict[str, Path]:
     if path.is_file():
         files = [path]
     elif path.is_dir():
-        files = sorted(file for file in path.glob("*.mcap") if file.is_file() and is_inside(file, path))
+        there = (file for file in sorted(path.iterdir()) if file.suffix.lower() == ".mcap")
+        files = [file for file in there if file.is_file() and is_inside(file, path)]
     else:
         raise InputError(path, "", "no such file or folder", "an .mcap file, or a folder of them")
     streams: dict[str, Path] = {}
@@ -186,7 +187,7 @@ def calibration_beside(path: Path) -> Path:
     folder = path if path.is_dir() else path.parent
     if (folder / "calibration.json").is_file():
         return folder / "calibration.json"
-    files = sorted(folder.glob("*calib*.json"))
+    files = sorted(file for file in folder.iterdir() if re.search(r"calib.*\.json$", file.name.lower()))
     if len(files) != 1:
         names = ", ".join(file.name for file in files[:4]) or "no such file"
         raise InputError(folder, "*calib*.json", names, "one calibration beside the recording", "or --calibration FILE")

@@ -168,10 +168,11 @@ def _kind_of_folder(path: Path, sensor: str | None, calibration: str | None) -> 
     ):
         return "ensenso"
     top = [name for name in names if "/" not in name]
-    recorded = [path / name for name in top if name.endswith((".mcap", ".db3", ".db3.zstd", ".mcap.zstd"))]
-    if "metadata.yaml" in top or any(file.suffix == ".db3" for file in recorded):
+    packed = (".mcap", ".db3", ".db3.zstd", ".mcap.zstd")
+    recorded = [file for file in _down_to(path, 1) if file.is_file() and file.name.lower().endswith(packed)]
+    if "metadata.yaml" in top or any(file.suffix.lower() == ".db3" for file in recorded):
         return "ros"
-    if recorded and recorded[0].suffix == ".mcap" and _kind_of_mcap(recorded[0]) == "ros":
+    if recorded and recorded[0].suffix.lower() == ".mcap" and _kind_of_mcap(recorded[0]) == "ros":
         return "ros"
     if recorded or any(name.endswith((".mp4", ".h264", ".h265")) for name in top):
         return "depthai"

@@ -86,7 +86,7 @@ def open_bag(path: Path) -> RosBag:
     files = [file for file in islice(path.iterdir(), MOST_FILES) if file.is_file() and not file.is_symlink()]
     bag_files = sorted((file for file in files if file.suffix.lower() in ROS2_SUFFIXES), key=_numbered)
     if not bag_files:
-        packed = next((file.name for file in files if file.name.endswith(".zstd")), None)
+        packed = next((file.name for file in files if file.name.lower().endswith(".zstd")), None)
         hint = "" if packed is None else f"unpack it: zstd -d {packed}"
         raise InputError(path, "", packed or "no .db3 and no .mcap", "the folder of a ROS 2 bag", hint)
     bags = [_opened(file) for file in bag_files]

@@ -22,6 +22,7 @@ from mitsim.capture.calibration import calibration_table
 from mitsim.capture.folder import read_capture
 from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
 from mitsim.capture.recordings.calibration_file import read_calibration
+from mitsim.capture.recordings.depthai_recording import read_depthai_recording, recorded_streams
 from mitsim.capture.recordings.recognise import NAMES, kind_of
 from mitsim.cli.program import app
 from mitsim.sensor.camera import Camera, Rig
@@ -106,6 +107,31 @@ def test_folders_are_told_by_the_names_in_them(tmp_path):
             kind_of(save(tmp_path / name, b"PK\x03\x04" if name == "x.3mf" else b"hello"))
     with pytest.raises(InputError, match=r"unknown kind.*--as"):
         kind_of(save(tmp_path / "x.docx", b"hello"))
+
+
+def test_names_in_a_folder_may_have_capitals(tmp_path):
+    """Windows writes them; Rec_0.mcap was looked for as rec_0.mcap, and Left.MCAP was no stream."""
+    pytest.importorskip("rosbags")
+    from tests.capture.recordings.ros_bags import ROS2, depth_messages, write_bag
+
+    bag = write_bag(tmp_path / "bag", depth_messages(ROS2), "mcap")
+    for name in ("Rec_0.mcap", "REC_0.MCAP"):
+        folder = tmp_path / name.partition(".")[2]
+        folder.mkdir()
+        save(folder / name, bag.read_bytes())
+        assert kind_of(folder) == "ros"
+        assert read_recording(folder, ReadOptions()).capture.source == "device"
+    streams = tmp_path / "oak"
+    streams.mkdir()
+    save(streams / "Left.MCAP", b"")
+    save(streams / "RIGHT.mcap", b"")
+    assert kind_of(streams) == "depthai"
+    assert {side: file.name for side, file in recorded_streams(streams).items()} == {
+        "left": "Left.MCAP",
+        "right": "RIGHT.mcap",
+    }
+    with pytest.raises(InputError, match=r"DepthAI_Calib\.JSON"):
+        read_depthai_recording(save(streams / "DepthAI_Calib.JSON", b"{").parent)
 
 
 RIGS = Path(__file__).parents[3] / "scenes" / "rigs"
