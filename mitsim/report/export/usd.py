@@ -29,7 +29,8 @@ def write_usd(scene: RunScene, path: str | Path) -> None:
     usd, geometry = needed("pxr.Usd", "usd-core", f"{path}: USD"), needed("pxr.UsdGeom", "usd-core", f"{path}: USD")
     values = needed("pxr.Gf", "usd-core", f"{path}: USD")
     with atomic_write_named(path) as file:
-        layer = file.with_suffix(".usdc") if path.suffix == ".usdz" else file
+        package = path.suffix.lower() == ".usdz"
+        layer = file.with_suffix(".usdc") if package else file
         stage = usd.Stage.CreateNew(str(layer))
         geometry.SetStageUpAxis(stage, geometry.Tokens.z)
         geometry.SetStageMetersPerUnit(stage, geometry.LinearUnits.millimeters)
@@ -54,7 +55,7 @@ def write_usd(scene: RunScene, path: str | Path) -> None:
                 _camera(stage, geometry, values, f"/part_frame/{view.name}/camera", scene.grid)
         stage.GetRootLayer().Save()
         del stage
-        if path.suffix == ".usdz":
+        if package:
             needed("pxr.UsdUtils", "usd-core", f"{path}: USD").CreateNewUsdzPackage(str(layer), str(file))
 
 

@@ -72,7 +72,7 @@ def test_gltf_camera_shows_the_field_of_view(scene, tmp_path):
     assert across < wide < across * 33 / 31
 
 
-@pytest.mark.parametrize("suffix", [".usda", ".usdc", ".usdz"])
+@pytest.mark.parametrize("suffix", [".usda", ".usdc", ".usdz", ".USDZ"])
 def test_usd_is_read_by_usd(scene, tmp_path, suffix):
     usd, geometry = pytest.importorskip("pxr.Usd"), pytest.importorskip("pxr.UsdGeom")
     path = tmp_path / f"run{suffix}"
