@@ -30,7 +30,7 @@ _LEFT_OVER = re.compile(
     r"|(?P<kind>partial|old)-(?P<pid2>\d+)-(?P<host2>[0-9a-f]{6})[0-9a-f]*)"
 )
 
-#: age [s] after which a partial file of another machine counts as abandoned; its processes cannot be checked from here
+#: age [s] after which a partial file counts as abandoned whose process cannot be checked: that of another machine
 _STALE_S = 24 * 3600.0
 
 #: folders of a run in which files are written one by one
@@ -94,7 +94,8 @@ def _is_of(target: str, name: str) -> bool:
 
 
 def _may_be_alive(path: Path, match: re.Match[str]) -> bool:
-    if (match["host"] or match["host2"] or HOST) == HOST:
+    ours = (match["host"] or match["host2"] or HOST) == HOST
+    if ours and sys.platform != "win32":  # signal 0 is Ctrl-C on Windows: os.kill would interrupt the process
         return _is_alive(int(match["pid"] or match["pid2"]))
     try:
         return time.time() - path.stat().st_mtime < _STALE_S

@@ -57,6 +57,20 @@ def test_a_lock_of_no_process_is_another_mitsim(tmp_path):
         assert _holder(stream.fileno()) == "another mitsim"
 
 
+def test_no_process_is_asked_on_windows(tmp_path, monkeypatch):
+    """os.kill(pid, 0) sends Ctrl-C there: signal.CTRL_C_EVENT is 0."""
+    asked = []
+    monkeypatch.setattr("mitsim.cli.folder_lock.os.kill", lambda *signal: asked.append(signal))
+    monkeypatch.setattr("mitsim.cli.folder_lock.sys", mock.Mock(platform="win32"))
+    names = [f".a.ply.{999999990 + k}-{HOST}.partial" for k in (1, 2)]
+    for name in names:
+        (tmp_path / name).write_text("half")
+    two_days_ago = time.time() - 2 * 86400
+    os.utime(tmp_path / names[1], (two_days_ago, two_days_ago))
+    assert remove_partial_beside(tmp_path / "a.ply") == [tmp_path / names[1]]
+    assert asked == []
+
+
 def test_only_left_overs_of_the_dead_are_swept(tmp_path):
     (tmp_path / "captures" / f".view_0001.partial-999999999-{HOST}1b").mkdir(parents=True)
     kept = [
