@@ -130,7 +130,7 @@ def sensor_(
 
     if not sensor:
         raise InputError("--sensor", "", "none", "the preset of this type of sensor, or a sensor TOML file")
-    if output.suffix != ".toml":
+    if output.suffix.lower() != ".toml":
         raise InputError("--output", "", str(output), "a .toml file")
     options.check_file(output)
     if study is None:

@@ -279,7 +279,7 @@ def _parsed(path: Path, text: str) -> ElementTree.Element:
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         if isinstance(error, InputError):
             raise
-        is_study = path.suffix == ".toml"
+        is_study = path.suffix.lower() == ".toml"
         hint = "name the scene of the study here; `mitsim run` and `mitsim study` take the study" if is_study else ""
         raise InputError(path, "", f"XML that does not parse ({error})", "well-formed XML", hint) from None
     if root is None:
@@ -303,6 +303,6 @@ def _check_named(path: Path, name: str) -> None:
 def _xml_files_beside(path: Path) -> list[str]:
     """Return the names of the XML files in the same folder, to suggest one of them."""
     try:
-        return sorted(file.name for file in path.parent.iterdir() if file.suffix == ".xml")
+        return sorted(file.name for file in path.parent.iterdir() if file.suffix.lower() == ".xml")
     except (OSError, ValueError):
         return []

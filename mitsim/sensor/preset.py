@@ -103,7 +103,7 @@ def named_sensor(name: str | Path) -> tuple[str, str]:
 def _written_table(name: str | Path) -> tuple[Path, dict[str, Any]]:
     """Return the path of a preset or sensor file, and its table as written."""
     path = Path(name)
-    if path.suffix != ".toml":
+    if path.suffix.lower() != ".toml":
         if str(name) not in presets():
             allowed = f"{', '.join(presets())}, or the path of a .toml file"
             raise InputError("--sensor", "", repr(str(name)), allowed, nearest(str(name), presets()))

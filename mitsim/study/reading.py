@@ -143,7 +143,7 @@ def open_study(
         file = _with_map(file, performance_map)
     path = Path(path)
     folder = path.parent
-    own_sensor = folder / file.sensor if file.sensor.endswith(".toml") else file.sensor
+    own_sensor = folder / file.sensor if file.sensor.lower().endswith(".toml") else file.sensor
     sensor = load_sensor(own_sensor)
     check_exposure(sensor)
     task = read_task(folder / file.task)

@@ -180,12 +180,12 @@ def sample_key(name: str) -> str:
 
 def sensor_key(name: str) -> str:
     """Return the name of a preset or of a sensor file as part of a file name."""
-    return Path(name).stem if name.endswith(".toml") else name
+    return Path(name).stem if name.lower().endswith(".toml") else name
 
 
 def sensor_in(folder: str | Path, name: str) -> Sensor:
     """Return a preset by its name, or the sensor of a TOML file, whose path is relative to ``folder``."""
-    return load_sensor(Path(folder) / name if name.endswith(".toml") else name)
+    return load_sensor(Path(folder) / name if name.lower().endswith(".toml") else name)
 
 
 def map_in(folder: str | Path, name: str) -> PerformanceMap:

@@ -12,6 +12,10 @@ from characterisation.files.errors import InputError
 from mitsim.sensor.imager import electrons_per_radiance
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.transforms import Transform
+from mitsim.study.reading import open_study
+from mitsim.talk.talk_file import sensor_in, sensor_key
+from mitsim.twin.sensor.run import sensor_path
+from tests.small_study import small_study
 
 PRESET = Path(__file__).parents[2] / "mitsim/sensor/presets/ensenso-n10.toml"
 
@@ -74,6 +78,17 @@ def test_a_measurement_has_an_image_for_each_pattern_or_delay(name):
     sensor = load_sensor(name)
     delays = 0 if sensor.pattern.kind != "amplitude_modulation" else len(sensor.pattern.images()[0])
     assert sensor.frames == len(sensor.patterns()) + delays > 0
+
+
+def test_a_sensor_file_may_be_named_in_capitals(tmp_path):
+    """Before, RIG.TOML was an unknown preset, also in a study, in the talk and when fitting a sensor."""
+    path = tmp_path / "RIG.TOML"
+    path.write_bytes(PRESET.read_bytes())
+    (tmp_path / "study.toml").write_text(small_study("{}", sensor="RIG.TOML"))
+    assert load_sensor(path).name == "ensenso-n10"
+    assert open_study(tmp_path / "study.toml").sensor.name == "ensenso-n10"
+    assert sensor_in(tmp_path, "RIG.TOML").name == "ensenso-n10" and sensor_key("RIG.TOML") == "RIG"
+    assert sensor_path(path) == path
 
 
 def test_an_unknown_preset_names_the_nearest():

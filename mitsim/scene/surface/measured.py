@@ -203,7 +203,7 @@ def read_height_map(path: str | Path, spacing_um: float, where: str | Path = "")
         If the file is missing, is not such a grid, is too small or too large, has gaps or is flat.
     """
     path = Path(path)
-    if path.suffix == ".npy":
+    if path.suffix.lower() == ".npy":
         _there(path, where, "height_map", "a .npy or CSV of heights in um")
         try:
             z = np.lib.format.read_array(io.BytesIO(read_bounded(path)), allow_pickle=False, max_header_size=1000)

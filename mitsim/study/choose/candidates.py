@@ -106,7 +106,7 @@ def open_candidate(path: Path, file: StudyFile, text: str, ask: Ask | None) -> C
         Answers whether finishes that its map lacks may be characterised now; None if nobody can answer.
     """
     sensor, _, map_name = text.partition("=")
-    is_file = sensor.endswith(".toml")
+    is_file = sensor.lower().endswith(".toml")
     if not is_file and sensor not in presets():
         raise InputError("--sensors", "", sensor, f"{', '.join(presets())}, or a sensor TOML")
     mapped = is_file or map_name or sensor in shipped_maps()

@@ -163,7 +163,7 @@ def fit_sensor(
 
 def sensor_path(name: str | Path) -> Path:
     """Return the file of a preset, or the path of a file."""
-    if Path(name).suffix == ".toml":
+    if Path(name).suffix.lower() == ".toml":
         return Path(name)
     return Path(str(files("mitsim.sensor") / "presets" / f"{name}.toml"))
 

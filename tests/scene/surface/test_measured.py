@@ -124,6 +124,8 @@ def test_a_height_map_is_the_same_from_csv_and_npy(tmp_path, rng):
     one, other = read_height_map(tmp_path / "map.npy", 0.5), read_height_map(tmp_path / "map.csv", 0.5)
     assert np.isclose(one.Sq, other.Sq, rtol=1e-5) and np.isclose(one.lay, other.lay, rtol=1e-5)
     np.testing.assert_allclose(one.rho_along, other.rho_along, rtol=1e-5, atol=1e-6)
+    (tmp_path / "map.npy").rename(tmp_path / "MAP.NPY")
+    assert read_height_map(tmp_path / "MAP.NPY", 0.5).Sq == one.Sq  # before, read as text
 
 
 @pytest.mark.parametrize(
