@@ -314,6 +314,10 @@ def check_folder(folder: Path, locked: bool = True) -> None:
 
     ``locked`` is false for the folder of a single file: other commands may write to that folder at the same time.
     """
+    whole = str(folder.absolute())
+    if locked and whole != whole.encode(errors="replace").decode():
+        hint = "rename the folder, or give one elsewhere: -o /tmp/out"
+        raise InputError("--output", "", whole, "a path in UTF-8, which netCDF files need", hint)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

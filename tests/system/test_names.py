@@ -1,6 +1,7 @@
 """Names that a user gives become files and pages: checked once, at the door, before anything is written."""
 
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from characterisation.files.documents import LONGEST_NAME, checked_name
 from characterisation.files.errors import InputError
 from mitsim.cli.program import main
 from mitsim.sensor.preset import load_sensor
+from tests.small_study import small_study
 
 SCENES = Path(__file__).parents[2] / "scenes"
 PRESET = Path(__file__).parents[2] / "mitsim" / "sensor" / "presets" / "ensenso-n10.toml"
@@ -137,3 +139,19 @@ def test_a_camera_has_a_name_that_its_images_can_have(tmp_path, name):
     (tmp_path / "sensor.toml").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match="camera's name"):
         load_sensor(tmp_path / "sensor.toml")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of any bytes are of Linux")
+def test_a_folder_with_a_name_in_latin_1_is_refused_before_the_work(tmp_path, capfd, monkeypatch):
+    """Before, a traceback when the scores of all views were written."""
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/Pr\xfcfstand"))
+    folder.mkdir()
+    (folder / "study.toml").write_text(small_study("{}"), encoding="utf-8")
+    monkeypatch.chdir(folder)
+    for command in (["run"], ["study", "score"]):
+        monkeypatch.setattr(sys, "argv", ["mitsim", *command, "study.toml", "-o", "out"])
+        with pytest.raises(SystemExit) as stopped:
+            main()
+        assert stopped.value.code == 2
+        assert "Pr\\udcfcfstand/out; allowed: a path in UTF-8" in capfd.readouterr().err
+    assert [path.name for path in folder.iterdir()] == ["study.toml"]
