@@ -137,7 +137,9 @@ def _of_opencv(file: Path, data: bytes) -> dict[str, Any]:
         found = f"XML of another program: it begins with <{first[1].decode('utf-8', 'replace')[:60]}>"
         raise InputError(file, "", found, _KINDS, "write its numbers as [cameras.NAME] of a TOML")
     try:
-        storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
+        # not by the name: OpenCV crashes on one that is not UTF-8, and Windows has its own code page for it
+        text = data.decode("utf-8-sig", "replace")
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         fault = "" if storage.isOpened() and storage.root().isMap() else "nothing in it"
     except (cv2.error, SystemError) as error:
         fault = _last_line(error) if isinstance(error, cv2.error) else "no YAML, JSON or XML in it"

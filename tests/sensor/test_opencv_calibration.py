@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import sys
 from pathlib import Path
 
 import cv2
@@ -11,6 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from characterisation.files.errors import InputError
+from mitsim.sensor.calibration_formats import read_documents
 from mitsim.sensor.preset import load_sensor
 from tests.sensor.opencv_files import opencv_file
 
@@ -55,6 +58,14 @@ def test_every_format_gives_the_numbers_that_were_written(tmp_path, suffix):
     np.testing.assert_array_equal(projector.matrix, KP)
     np.testing.assert_array_equal(projector.distortion, DP)
     assert (camera.width, camera.height, projector.width, projector.height) == (640, 480, 912, 570)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of any bytes are of Linux")
+def test_a_name_in_latin_1_gives_the_same_numbers(tmp_path):
+    """Before, OpenCV ended the process with a segmentation fault."""
+    opencv_file(tmp_path / "calib.xml", **USUAL)
+    named = (tmp_path / "calib.xml").rename(os.fsdecode(os.fsencode(tmp_path) + b"/pr\xfcf.xml"))
+    np.testing.assert_array_equal(read_documents(Path(named))[0]["camera_matrix"], K)
 
 
 def test_the_projector_stands_where_stereo_calibrate_says(tmp_path):
