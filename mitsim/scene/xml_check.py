@@ -49,9 +49,6 @@ _OF_WAVELENGTHS = {"irregular", "regular", "blackbody", "discrete"}
 #: plugins of metals, of which Mitsuba knows the index of refraction as a function of the wavelength
 _CONDUCTORS = {"conductor", "roughconductor"}
 
-#: the metal that Mitsuba takes without ``material``, ``eta`` and ``k``
-_DEFAULT_METAL = "Cu"
-
 #: deepest chain of includes; a longer one is taken for a cycle
 _MOST_INCLUDES = 16
 
@@ -136,9 +133,9 @@ def check_spectra(
 
 
 def _check_conductor(path: Path, element: ElementTree.Element, values: Mapping[str, str], wavelength_nm: float) -> None:
-    """Check that a BSDF of a metal states its index of refraction, in place of a material or of Mitsuba's default."""
+    """Check that a BSDF of a metal names no material, whose index of refraction is a function of the wavelength."""
     given = {child.get("name"): _filled_in(child.get("value", ""), values) for child in element}
-    material = given.get("material", "none" if {"eta", "k"} & set(given) else _DEFAULT_METAL)
+    material = given.get("material", "none")
     if material == "none":
         return
     index = [_index_of_refraction(material, part, wavelength_nm) for part in ("eta", "k")]
@@ -147,9 +144,8 @@ def _check_conductor(path: Path, element: ElementTree.Element, values: Mapping[s
         spectra = " ".join(
             f'<spectrum name="{name}" value="{value:.4g}"/>' for name, value in zip(("eta", "k"), index, strict=True)
         )
-    where = "material" if "material" in given else f"bsdf of type {element.get('type')} without eta and k"
     allowed = f'<string name="material" value="none"/> with {spectra} at {wavelength_nm:g} nm; or a machined_metal'
-    raise InputError(path, where, repr(material), allowed)
+    raise InputError(path, "material", repr(material), allowed)
 
 
 def _index_of_refraction(material: str, part: str, wavelength_nm: float) -> float | None:

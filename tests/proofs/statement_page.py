@@ -199,6 +199,9 @@ def coverage_figure(cases: Sequence[JudgedCase]) -> Figure:
         for place, case in enumerate(ordered):
             found = pooled_coverage([case])
             colour = VERMILION if case.case.sealed else BLUE
+            if not found.of:
+                axes.text(0.95, place, "no value", color=colour, ha="center", va="center", fontsize="small")
+                continue
             axes.plot([found.low, found.high], [place, place], color=colour, linewidth=1.4)
             axes.plot(found.value, place, "o", color=colour, markersize=4)
         axes.set_yticks(range(len(ordered)), [_label(one) for one in ordered])
