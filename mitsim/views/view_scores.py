@@ -162,8 +162,12 @@ def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above 
         shown = first.points.labels.reshape(-1)[first.points.ideal.pixel][first.points.ideal.status == Status.VALID]
         casts = [first]
         for k, name in enumerate(names):
-            if (shown == scene.names.index(name)).sum() < LEAST_RAYS:
+            count = int((shown == scene.names.index(name)).sum())
+            if count < LEAST_RAYS:
                 closer = predictor.closer(alone[k].scene.bounds, view.world_from_sensor, RAYS)
+                region = closer.grid.width * closer.grid.height * (closer.step / looking.step) ** 2
+                if not count and region > LEAST_RAYS:
+                    continue  # hidden: its region has many rays of the view
                 casts += [cast_by(closer, view, [k])] if closer.step < looking.step else []
         return casts
 
