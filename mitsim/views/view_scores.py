@@ -147,29 +147,38 @@ def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above 
     names = list(task.shapes)
     alone = [CharacterisedScene(scene.only(name), performance_map, MATT_WHITE) for name in names]
 
-    def cast_by(caster: Predictor, view: View, features: list[int]) -> _Cast:
-        pose, thinning = view.world_from_sensor, caster.step**2
+    def rays_of(caster: Predictor, view: View) -> tuple[SceneView, ViewPoints]:
+        pose, thinning, pitch = view.world_from_sensor, caster.step**2, caster.grid.angular_pitch / caster.step
         whole = caster.surfaces(scene, pose)
         ideal, labels = caster.ideal(whole), caster.labels(scene, pose, whole)
-        view_of = SceneView(scene, pose, whole, ideal)
-        perturbation = together((effect(view_of) for effect in effects), len(ideal.pixel))
-        points = ViewPoints(ideal, labels, pose, thinning, caster.grid.angular_pitch / caster.step)
-        n_only = np.array([_white_points(caster, alone[k], pose) * thinning for k in features])
-        return _Cast(features, points, n_only, perturbation)
+        return SceneView(scene, pose, whole, ideal), ViewPoints(ideal, labels, pose, thinning, pitch)
+
+    def cast_by(caster: Predictor, rays: tuple[SceneView, ViewPoints], features: list[int]) -> _Cast:
+        seen, points = rays
+        perturbation = together((effect(seen) for effect in effects), len(seen.ideal.pixel))
+        n_only = [_white_points(caster, alone[k], seen.world_from_sensor) * points.thinning for k in features]
+        return _Cast(features, points, np.array(n_only), perturbation)
+
+    def closer_to(feature: int, view: View, count: int) -> Predictor | None:
+        """Return a predictor that shows a feature by more rays than ``count``, None if it is enough, or hidden."""
+        if count >= LEAST_RAYS:
+            return None
+        closer = predictor.closer(alone[feature].scene.bounds, view.world_from_sensor, RAYS)
+        in_region = closer.grid.width * closer.grid.height * (closer.step / looking.step) ** 2
+        hidden = not count and in_region > LEAST_RAYS
+        return None if hidden or closer.step >= looking.step else closer
 
     def cast(view: View) -> list[_Cast]:
-        first = cast_by(looking, view, list(range(len(names))))
-        shown = first.points.labels.reshape(-1)[first.points.ideal.pixel][first.points.ideal.status == Status.VALID]
-        casts = [first]
-        for k, name in enumerate(names):
-            count = int((shown == scene.names.index(name)).sum())
-            if count < LEAST_RAYS:
-                closer = predictor.closer(alone[k].scene.bounds, view.world_from_sensor, RAYS)
-                region = closer.grid.width * closer.grid.height * (closer.step / looking.step) ** 2
-                if not count and region > LEAST_RAYS:
-                    continue  # hidden: its region has many rays of the view
-                casts += [cast_by(closer, view, [k])] if closer.step < looking.step else []
-        return casts
+        first = rays_of(looking, view)
+        ideal = first[1].ideal
+        shown = first[1].labels.reshape(-1)[ideal.pixel][ideal.status == Status.VALID]
+        counts = [int((shown == scene.names.index(name)).sum()) for name in names]
+        closer = {k: caster for k, count in enumerate(counts) if (caster := closer_to(k, view, count)) is not None}
+        whole = [k for k in range(len(names)) if k not in closer]
+        return [
+            cast_by(looking, first, whole),
+            *(cast_by(caster, rays_of(caster, view), [k]) for k, caster in closer.items()),
+        ]
 
     def score(casts: list[_Cast], view: View) -> _ViewScore:
         return _score_view(casts, scene, task, performance_map, minimum_points)
@@ -262,20 +271,18 @@ def screening_risk(scores: xr.Dataset) -> Floats:
 def _score_view(
     casts: list[_Cast], scene: Scene, task: Task, performance_map: PerformanceMap, minimum_points: float
 ) -> _ViewScore:
-    """Return the results of a view from its rays; of casts that show the same feature, the last counts."""
+    """Return the results of a view from its rays; each feature is of one cast."""
     names = list(task.shapes)
     shapes = [scene.names.index(name) for name in names]
     n, sigma, n_white, sigma_white, n_only = np.full((5, len(names)), np.nan)
     points: dict[str, ExpectedPoints] = {}
-    closer = {k for cast in casts[1:] for k in cast.features}
-    for number, cast in enumerate(casts):
-        chosen = [k for k in cast.features if number or k not in closer]
-        ideal, labels = cast.points.ideal, cast.points.labels
+    for cast in casts:
+        ideal, labels, features = cast.points.ideal, cast.points.labels, cast.features
         white = performance(ideal, scene, performance_map, MATT_WHITE)
-        count, sigma_white[chosen] = feature_statistics(ideal, labels, *white, [shapes[k] for k in chosen])
-        n_white[chosen] = count * cast.points.thinning
-        n_only[chosen] = cast.n_only[[cast.features.index(k) for k in chosen]]
-        for k in chosen:
+        count, sigma_white[features] = feature_statistics(ideal, labels, *white, [shapes[k] for k in features])
+        n_white[features] = count * cast.points.thinning
+        n_only[features] = cast.n_only
+        for k in features:
             as_mapped = expected_points(cast.points, scene, shapes[k], performance_map)
             n[k], sigma[k] = as_mapped.count, as_mapped.mean_sigma
             points[names[k]] = expected_points(cast.points, scene, shapes[k], performance_map, cast.perturbation)
