@@ -65,7 +65,7 @@ SAME_EXTENT = 0.01
 DRAWS = 400
 
 #: places whose range is that of a zone, in each draw; chosen: a form turns 3 times at most
-PLACES = 10_000
+PLACES_OF_ZONE = 10_000
 
 #: modes are excluded if less than this share of them remains after projection off the changes of the surface
 LEAST_SHARE = 0.01
@@ -113,7 +113,7 @@ def zone_uncertainty(form: Form) -> float:
     """Return the standard uncertainty [mm] of the zone of a fitted form, by noise of its covariance (JCGM 101)."""
     rng, noise = np.random.default_rng(0), float(np.trace(form.covariance))
     drawn = form.coefficients + rng.multivariate_normal(np.zeros(form.parameter_count), form.covariance, DRAWS)
-    modes = form.modes[:: 1 + len(form.modes) // PLACES]
+    modes = form.modes[:: 1 + len(form.modes) // PLACES_OF_ZONE]
     zones = [np.ptp(modes @ _shortened(coefficients, noise)) for coefficients in drawn]
     return float(np.sqrt(np.mean((np.array(zones) - np.ptp(modes @ form.coefficients)) ** 2)))
 

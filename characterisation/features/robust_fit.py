@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 CLIP = 4.0
 
 #: Standard deviation of normal residuals over the median of their size. More digits would change the bits of fits.
-FOUR_DIGITS = round(MEDIAN_TO_STD, 4)
+ROUNDED_MEDIAN_TO_STD = round(MEDIAN_TO_STD, 4)
 
 #: Smallest noise that is distinguished from rounding [mm]; float32 rounds points half a metre away to 3e-5 mm.
 SMALLEST_SCALE = 1e-6
@@ -256,4 +256,4 @@ def robust_std(residual: Array) -> float:
     sizes, middle = np.abs(residual), len(residual) // 2
     sizes.partition(middle)  # np.median looks for three places
     median = sizes[middle] if len(sizes) % 2 else 0.5 * (sizes[middle] + sizes[:middle].max())
-    return max(FOUR_DIGITS * float(median), SMALLEST_SCALE)
+    return max(ROUNDED_MEDIAN_TO_STD * float(median), SMALLEST_SCALE)

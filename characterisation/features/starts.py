@@ -255,7 +255,7 @@ _MORE = 2.0
 #: about the largest number of points whose rounding is looked for; chosen
 _MOST_ROUNDED = 4000
 
-#: least share of points with one rounded coordinate, at which the median of the residuals may be 0: a half, less chance
+#: least share of points with one rounded coordinate, at which the median of the residuals may be 0; chosen below a half
 _TIED = 0.4
 
 #: least step of rounded coordinates [mm] that matters; float32 rounds those 10 m away to 1e-3 mm

@@ -37,7 +37,7 @@ from characterisation.tasks.task_file import Task
 STEP = 1e-3
 
 #: number of places of an edge that are tested for whether the face beside them is seen; chosen
-PLACES = 120
+PLACES_OF_EDGE = 120
 
 #: distance, in spacings of the rays, within which a place of an edge has a ray on its face, at any angle; chosen
 RAYS_APART = 1.5
@@ -176,7 +176,7 @@ def _visible(
 
     ``reach`` [mm] is that of the point of an edge.
     """
-    middle = (np.arange(PLACES) + 0.5) / PLACES
+    middle = (np.arange(PLACES_OF_EDGE) + 0.5) / PLACES_OF_EDGE
     if isinstance(figure, Circle):
         angle = 2 * np.pi * middle
         offset = figure.radius * np.column_stack([np.cos(angle), np.sin(angle)]) @ tangents(figure.normal)

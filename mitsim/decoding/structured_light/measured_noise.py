@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from characterisation.features.robust_fit import FOUR_DIGITS
+from characterisation.features.robust_fit import ROUNDED_MEDIAN_TO_STD
 from characterisation.files.arrays import Floats
 from mitsim.decoding.grey_levels import MeasuredNoise
 from mitsim.decoding.structured_light.phase_shift import fit_phases
@@ -143,9 +143,9 @@ def _without_harmonics(residuals: Floats, phase: Floats, modulation: Floats) -> 
         used_terms = terms[:, used]
         coefficients = np.linalg.lstsq(used_terms @ used_terms.T, used_terms @ residuals[:, used].T, rcond=1e-9)[0]
         remainder = residuals - coefficients.T @ terms
-        used = (np.abs(remainder) < 4 * FOUR_DIGITS * np.median(np.abs(remainder), axis=1, keepdims=True) + 1).all(
-            axis=0
-        )
+        used = (
+            np.abs(remainder) < 4 * ROUNDED_MEDIAN_TO_STD * np.median(np.abs(remainder), axis=1, keepdims=True) + 1
+        ).all(axis=0)
         if used.sum() < _MINIMUM_PIXELS:
             break
     return np.asarray(remainder)

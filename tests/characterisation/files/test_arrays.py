@@ -5,13 +5,13 @@ from pathlib import Path
 import pytest
 from scipy.stats import norm
 
-from characterisation.features.robust_fit import FOUR_DIGITS
+from characterisation.features.robust_fit import ROUNDED_MEDIAN_TO_STD
 from characterisation.files import arrays
 
 
 def test_the_number_is_that_of_a_normal_distribution():
     assert pytest.approx(1 / norm.ppf(0.75), rel=1e-15) == arrays.MEDIAN_TO_STD
-    assert pytest.approx(1 / norm.ppf(0.75), abs=5e-5) == FOUR_DIGITS
+    assert pytest.approx(1 / norm.ppf(0.75), abs=5e-5) == ROUNDED_MEDIAN_TO_STD
 
 
 def test_no_other_module_writes_it():
