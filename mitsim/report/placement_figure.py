@@ -195,13 +195,8 @@ def _part(
     edge[:, :-1] |= shown[:, :-1] != shown[:, 1:]
     picture[edge & hit, :3] *= EDGE_SHADE
     half = 0.5 / scale
-    extent = (
-        low[0] - half,
-        low[0] + index.shape[1] / scale - half,
-        low[1] - half,
-        low[1] + index.shape[0] / scale - half,
-    )
-    return picture, extent
+    (left, bottom), (right, top) = low - half, low + np.array(index.shape[::-1]) / scale - half
+    return picture, (left, right, bottom, top)
 
 
 def _raster(flat: Floats, depth: Floats, pixels: int) -> tuple[NDArray[np.int64], Floats, Floats, float]:
@@ -319,19 +314,22 @@ def _axes_of_part(axes: Axes, turn: Floats) -> None:
 
 
 def _make_room_for_texts(axes: Axes) -> None:
-    """Widen the limits along x until all texts lie in the axes' part of the figure."""
+    """Widen the limits along x and y until all texts lie in the axes' part of the figure."""
     renderer = _renderer(axes.figure)
     for _ in range(_WIDENINGS):
         axes.apply_aspect()
         cell = axes.get_position(original=True).transformed(axes.figure.transSubfigure)
         boxes = [text.get_window_extent(renderer) for text in axes.texts if text.get_text()]
-        left = max([cell.x0 - box.x0 for box in boxes], default=0.0)
-        right = max([box.x1 - cell.x1 for box in boxes], default=0.0)
-        if max(left, right) <= 0:
+        ends = np.array([(box.x0, -box.x1, box.y0, -box.y1) for box in boxes]).reshape(-1, 2, 2)
+        beyond = ([(cell.x0, -cell.x1), (cell.y0, -cell.y1)] - ends).max(axis=0, initial=0.0)
+        if beyond.max() <= 0:
             return
-        low, high = axes.get_xlim()
-        per_pixel = (high - low) / axes.get_window_extent(renderer).width
-        axes.set_xlim(low - max(left + 2, 0) * per_pixel, high + max(right + 2, 0) * per_pixel)
+        drawn = axes.get_window_extent(renderer)
+        for axis, size, ends in zip((axes.xaxis, axes.yaxis), drawn.size, beyond, strict=True):
+            if ends.max() > 0:
+                low, high = axis.get_view_interval()
+                before, after = (ends + 2) * (high - low) / size
+                axis.set_view_interval(low - before, high + after, ignore=True)
 
 
 def _renderer(figure: Any) -> Any:

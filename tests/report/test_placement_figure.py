@@ -53,7 +53,22 @@ def test_no_writing_of_the_picture_overlaps_other_writing_or_leaves_it(tmp_path,
     assert len(boxes) >= 6
     inside = figure.bbox.padded(0.5)
     assert all(inside.x0 <= one.x0 and one.x1 <= inside.x1 for one in boxes), boxes
+    assert all(inside.y0 <= one.y0 and one.y1 <= inside.y1 for one in boxes), boxes
     assert not [(a, b) for k, a in enumerate(boxes) for b in boxes[:k] if a.overlaps(b)]
+
+
+@pytest.mark.parametrize("stacked", [False, True])
+@pytest.mark.parametrize("elevation_deg", [20, 58, 75])
+def test_the_name_of_a_view_lies_within_the_picture(tmp_path, elevation_deg, stacked):
+    """It is above the sensor, at the top of the picture, where it was cut in half in narrow windows."""
+    write_scene_geometry(tmp_path)
+    c, s = np.cos(np.radians(elevation_deg)), np.sin(np.radians(elevation_deg))
+    pose = np.eye(4)
+    pose[:3] = [[-1, 0, 0, 0], [0, s, -c, 620 * c], [0, -c, -s, 620 * s]]
+    figure = placement_figure(read_scene_geometry(tmp_path), [("view 28", pose)], {}, stacked)
+    drawn = FigureCanvasAgg(figure).get_renderer()
+    (box,) = (one.get_window_extent(drawn) for one in figure.axes[0].texts)
+    assert box.y1 <= figure.bbox.y1 and box.x0 >= 0
 
 
 @pytest.mark.parametrize("height", [1.3, 1.58, 3.4])
