@@ -17,6 +17,7 @@ The following biases are not corrected:
   inward by up to m, the limit (along the ray) times the sine of the incidence angle. This moves the centre by m/2 away
   from the wall, and reduces the radius by m/pi. An edge whose other face is visible moves outward likewise.
 - A chamfered or rounded edge is found where the plane ends.
+- A surface that covers the face is not told from a wall at the edge if it is as near as that could be.
 - Points are lost near an edge more often than elsewhere. F is counted on the face beside the edge, and corrects only
   for loss that is equal everywhere.
 
@@ -174,6 +175,17 @@ def _fit(nominal: Figure, crossings: Crossings) -> tuple[Figure, NDArray[np.bool
     return robust_fit(nominal, linearised, count, crossings.spread)
 
 
+def _covered(points: Array, rays: Array, behind: Array, axis: int) -> NDArray[np.bool_]:
+    """Return which pixels (h, w) show a surface that covers the face, rather than one that begins at its edge.
+
+    A wall at the edge stands at most one ``step`` along the ``axis`` from the face's last place, so it is no farther
+    in front of the plane, along the ray, than the step over the share of the ray that goes along it.
+    """
+    step = np.gradient(points, axis=axis)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(behind < -np.sum(step**2, axis=-1) / np.abs(np.sum(rays * step, axis=-1)))
+
+
 class _Ends(NamedTuple):
     """Places where the face ends along rows or columns.
 
@@ -205,8 +217,10 @@ def _crossings(
     signed_distance, band = _signed_distance(figure, points, reach)
     down, right = np.gradient(signed_distance)
     steep = np.abs(right) >= np.abs(down)  # the edge crosses this row more steeply than this column
-    along_rows = _ends(on_face, signed_distance, band, steep, np.sign(right), points)
-    along_columns = _ends(on_face.T, signed_distance.T, band.T, ~steep.T, np.sign(down).T, points.swapaxes(0, 1))
+    covered = [_covered(points, rays, behind + 2 * limit, axis) for axis in (1, 0)]
+    along_rows = _ends(on_face, covered[0], signed_distance, band, steep, np.sign(right), points)
+    turned = points.swapaxes(0, 1)
+    along_columns = _ends(on_face.T, covered[1].T, signed_distance.T, band.T, ~steep.T, np.sign(down).T, turned)
     shown, deeper = along_rows.shown + along_columns.shown, along_rows.deeper + along_columns.deeper
     last, following = (np.concatenate(pair) for pair in zip(along_rows[:2], along_columns[:2], strict=True))
     if len(last) == 0 or shown == 0:
@@ -222,6 +236,7 @@ def _crossings(
 
 def _ends(
     on_face: NDArray[np.bool_],
+    covered: NDArray[np.bool_],
     signed_distance: Array,
     band: NDArray[np.bool_],
     steep: NDArray[np.bool_],
@@ -230,6 +245,7 @@ def _ends(
 ) -> _Ends:
     """Find the ends of the face along each row, from the pixels that are ``on_face``.
 
+    It does not end where another surface has ``covered`` the next pixel, and covered pixels tell nothing of F.
     ``signed_distance`` grows in the direction ``sign`` (+1 or -1) along the row. Ends are searched within ``band``, and
     kept where ``steep`` is true.
     """
@@ -243,12 +259,13 @@ def _ends(
     next_column = column[last] + sign[row[last], column[last]].astype(np.intp)
     usable = shows[last] & steep[row[last], column[last]] & (next_column >= 0) & (next_column < on_face.shape[1])
     last, next_column = last[usable], next_column[usable]
-    inside = band[row[last], next_column]  # otherwise the band ends here, not the face
+    # otherwise the band ends here or another surface covers it, and not the face
+    inside = band[row[last], next_column] & ~covered[row[last], next_column]
     last, next_column = last[inside], next_column[inside]
     # F is counted deeper in the face than the last pixel, which shows the face by selection
     end = np.full(int(key.max(initial=0)) + 1, -np.inf)
     end[key[last]] = depth[last]
-    deeper = depth < end[key]
+    deeper = (depth < end[key]) & ~covered[row, column]
     return _Ends(
         points[row[last], column[last]],
         points[row[last], next_column],

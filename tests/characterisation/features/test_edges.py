@@ -267,3 +267,21 @@ def test_an_edge_that_is_not_there_is_refused(case, said):
         nominal = replace(nominal, centre=nominal.centre + np.array([500.0, 0, 0]))
     with pytest.raises(FitError, match=said):
         fit_circle(cloud, known_plane(truth), nominal)
+
+
+def test_the_edge_of_a_cover_is_not_the_edge_of_the_hole():
+    rng, errors = np.random.default_rng(1), []
+    for turn in rng.uniform(0, 2 * np.pi, 40):
+        cloud, truth = holed(10.0, 30.0, rng)
+        rays, away = cloud.grid.rays(), np.array([np.cos(turn), np.sin(turn)])
+        across, cover = (
+            rays * (point @ truth.normal / (rays @ truth.normal))[..., None]
+            for point in (truth.centre, truth.centre + 40.0 * truth.normal)
+        )
+        hidden = (across - truth.centre) @ tangents(truth.normal).T @ away > -5.0  # four fifths of the hole
+        points = np.where(hidden[..., None], cover, cloud.points).astype(np.float32)
+        covered = replace(cloud, points=points, feature=np.where(hidden, -1, cloud.feature).astype(np.int16))
+        fit = fit_circle(covered, known_plane(truth), truth)
+        off = tangents(truth.normal) @ (fit.centre - truth.centre)
+        errors.append(off @ np.linalg.inv(fit.covariance[:2, :2]) @ off)
+    assert np.mean(errors) == pytest.approx(2.0, abs=3 * np.sqrt(4 / 40))  # chi-square of two degrees of freedom
