@@ -145,12 +145,15 @@ def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above 
     """
     looking = predictor.thinned_to(RAYS)
     names = list(task.shapes)
+    shapes = [scene.names.index(name) for name in names]
     alone = [CharacterisedScene(scene.only(name), performance_map, MATT_WHITE) for name in names]
 
-    def rays_of(caster: Predictor, view: View) -> tuple[SceneView, ViewPoints]:
+    def rays_of(caster: Predictor, view: View, features: Sequence[int]) -> tuple[SceneView, ViewPoints]:
         pose, thinning, pitch = view.world_from_sensor, caster.step**2, caster.grid.angular_pitch / caster.step
         whole = caster.surfaces(scene, pose)
-        ideal, labels = caster.ideal(whole), caster.labels(scene, pose, whole)
+        measured = np.isin(whole.shape, [shapes[k] for k in features])
+        ideal = caster.ideal(replace(whole, shape=np.where(measured, whole.shape, np.int16(-1))))
+        labels = caster.labels(scene, pose, whole)
         return SceneView(scene, pose, whole, ideal), ViewPoints(ideal, labels, pose, thinning, pitch)
 
     def cast_by(caster: Predictor, rays: tuple[SceneView, ViewPoints], features: list[int]) -> _Cast:
@@ -169,15 +172,15 @@ def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above 
         return None if hidden or closer.step >= looking.step else closer
 
     def cast(view: View) -> list[_Cast]:
-        first = rays_of(looking, view)
+        first = rays_of(looking, view, range(len(names)))
         ideal = first[1].ideal
         shown = first[1].labels.reshape(-1)[ideal.pixel][ideal.status == Status.VALID]
-        counts = [int((shown == scene.names.index(name)).sum()) for name in names]
+        counts = [int((shown == shape).sum()) for shape in shapes]
         closer = {k: caster for k, count in enumerate(counts) if (caster := closer_to(k, view, count)) is not None}
         whole = [k for k in range(len(names)) if k not in closer]
         return [
             cast_by(looking, first, whole),
-            *(cast_by(caster, rays_of(caster, view), [k]) for k, caster in closer.items()),
+            *(cast_by(caster, rays_of(caster, view, [k]), [k]) for k, caster in closer.items()),
         ]
 
     def score(casts: list[_Cast], view: View) -> _ViewScore:
@@ -278,13 +281,13 @@ def _score_view(
     points: dict[str, ExpectedPoints] = {}
     for cast in casts:
         ideal, labels, features = cast.points.ideal, cast.points.labels, cast.features
-        white = performance(ideal, scene, performance_map, MATT_WHITE)
-        count, sigma_white[features] = feature_statistics(ideal, labels, *white, [shapes[k] for k in features])
-        n_white[features] = count * cast.points.thinning
+        of_cast = [shapes[k] for k in features]
+        for finish, counts, sigmas in ((None, n, sigma), (MATT_WHITE, n_white, sigma_white)):
+            mapped = performance(ideal, scene, performance_map, finish)
+            rays, sigmas[features] = feature_statistics(ideal, labels, *mapped, of_cast)
+            counts[features] = rays * cast.points.thinning
         n_only[features] = cast.n_only
         for k in features:
-            as_mapped = expected_points(cast.points, scene, shapes[k], performance_map)
-            n[k], sigma[k] = as_mapped.count, as_mapped.mean_sigma
             points[names[k]] = expected_points(cast.points, scene, shapes[k], performance_map, cast.perturbation)
     inputs = expected_inputs(task, points, minimum_points)
     measurements = [expected_measurement(task, name, inputs) for name in task.measurements]

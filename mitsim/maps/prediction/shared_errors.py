@@ -40,9 +40,9 @@ class SharedErrors:
         """
         with np.errstate(invalid="ignore", divide="ignore"):
             weight = normal / (normal * ray).sum(1, keepdims=True)
-        values = terms(points)
-        moved = [((values @ coefficient) * weight).sum(1) for coefficient in self.coefficients]
-        return np.stack(moved, axis=1) if moved else np.zeros((len(points), 0))
+        count, size, _ = self.coefficients.shape
+        moved = np.moveaxis(self.coefficients, 2, 1).reshape(3 * count, size) @ terms(points).T
+        return np.asarray((moved.reshape(count, 3, len(points)) * weight.T).sum(1).T)
 
 
 def independent_fields(points: Floats, moves: Floats) -> SharedErrors:
