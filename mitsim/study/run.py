@@ -28,7 +28,6 @@ from mitsim.capture.simulated.render_residual import (
     LIMIT,
     RenderResidual,
     largest_residual,
-    render_residual,
     warn_above_limit,
 )
 from mitsim.maps.campaign.acquire import coupon_residuals, in_turn, simulated_source
@@ -286,13 +285,13 @@ def _map(session: Session) -> PerformanceMap:
 
 
 def _residual(renderer: RenderedMeasurements, number: int) -> RenderResidual:
-    """Return the render noise of a view without kept light paths, which trials have."""
-    study = renderer.study
-    pose, camera = study.view(number).world_from_sensor, next(iter(study.sensor.rig.cameras))
-    residual = render_residual(renderer.simulated, study.scene, pose, camera, renderer.rendering, seed=study.file.seed)
+    """Return the render noise of the trials of a view."""
+    residual = renderer.residual(renderer.study.view(number))
+    if residual.quadrature > max(LIMIT, residual.noise):  # below the noise it is not determined
+        return warn_above_limit(f"view {number}", residual)
     if residual.noise > LIMIT:
         say(f"view {number}: {residual}")
-    return warn_above_limit(f"view {number}", residual) if residual.quadrature > LIMIT else residual
+    return residual
 
 
 def _show(

@@ -15,8 +15,8 @@ Either would be mistaken for an error of the sensor if it were not small.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,13 +24,13 @@ from numpy.typing import NDArray
 from characterisation.words.numbers import two_digits
 from characterisation.words.progress import say
 from mitsim.capture.capture import Capture
-from mitsim.capture.simulated.indirect_light import IndirectLight
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.scene.load import Scene
 from mitsim.scene.visible_surfaces import sees_nothing
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.roi import roi_around
+from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 
 #: largest error of a rendering, over the sensor's noise, without a warning
@@ -85,7 +85,7 @@ def render_residual(
     Parameters
     ----------
     simulated, scene, world_from_sensor, camera, rendering
-        The rendering to check. Of its images a few are compared, from the first to the last.
+        The rendering to check.
     seed
         Seed of the first rendering.
     around
@@ -93,20 +93,29 @@ def render_residual(
 
     See Also
     --------
-    warn_above_limit : prints a warning of large errors
+    residual_of : of images that are rendered otherwise
     """
-    sensor = simulated.sensor
-    roi = None if around is None else roi_around(sensor.rig.cameras[camera], around, 0)
+    roi = None if around is None else roi_around(simulated.sensor.rig.cameras[camera], around, 0)
+
+    def radiance(offset: int, finer: int) -> NDArray[np.float32]:
+        settings = rendering.finer(finer)
+        return simulated.radiance(scene, world_from_sensor, camera, settings, seed=seed + offset, roi=roi)
+
+    return residual_of(radiance, simulated.sensor)
+
+
+def residual_of(radiance: Callable[[int, int], NDArray[np.float32]], sensor: Sensor) -> RenderResidual:
+    """Return the errors of images (P, h, w) that a function renders, given an offset to its seed and a factor.
+
+    The factor is that of its numbers of samples. Of the images a few are compared, from the first to the last.
+    """
     scale = sensor.electrons()
-    # the first pattern is often the coarsest and the last the finest
-    chosen = np.unique(np.linspace(0, simulated.patterns.count - 1, IMAGES).astype(int))
 
     def electrons_per_s(offset: int, finer: int) -> NDArray[np.float32]:
-        settings = replace(rendering, samples=finer * rendering.samples)
-        if isinstance(settings.indirect, IndirectLight):
-            settings = replace(settings, indirect=replace(settings.indirect, samples=finer * settings.indirect.samples))
-        images = simulated.radiance(scene, world_from_sensor, camera, settings, seed=seed + offset, roi=roi)
-        selected: NDArray[np.float32] = images[chosen]
+        images = radiance(offset, finer)
+        # the first pattern is often the coarsest and the last the finest
+        last = len(images) - 1 - sensor.ambient_image
+        selected: NDArray[np.float32] = images[np.unique(np.linspace(0, last, IMAGES).astype(int))]
         del images  # frees up to 164 MB, for a sensor of 3 megapixels
         selected *= np.float32(scale)
         return selected

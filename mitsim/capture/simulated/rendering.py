@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -53,6 +53,15 @@ class Rendering:
         filter.
         """
         return cls(samples, depth, IndirectLight(samples, smoothing_px) if smoothing_px > 0 and depth > 1 else None)
+
+    def finer(self, factor: int) -> Rendering:
+        """Return settings with a ``factor`` times as many paths."""
+        indirect, kept = self.indirect, self.kept
+        if isinstance(indirect, IndirectLight):
+            indirect = replace(indirect, samples=factor * indirect.samples)
+        if kept is not None:
+            kept = replace(kept, samples=factor * kept.samples, kept=factor * kept.kept)
+        return replace(self, samples=factor * self.samples, indirect=indirect, kept=kept)
 
     @property
     def prerendered(self) -> IndirectImages | None:

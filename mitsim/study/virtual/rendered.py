@@ -27,13 +27,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.point_cloud import PointCloud
+from characterisation.region_of_interest import Roi
 from characterisation.tasks.evaluation import measure
 from characterisation.tasks.result import Result
 from characterisation.tasks.task_file import Task
 from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.exposing import LightOnImagers
 from mitsim.capture.simulated.image_motion import image_motion, moved_images
-from mitsim.capture.simulated.kept_light import can_be_kept, keep_light
+from mitsim.capture.simulated.kept_light import KeptLight, can_be_kept, keep_light
+from mitsim.capture.simulated.render_residual import RenderResidual, residual_of
 from mitsim.capture.simulated.rendering import IndirectImages, Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decoding.cloud import capture_cloud, sensor_geometry
@@ -203,6 +205,27 @@ class RenderedMeasurements:
         redrawn = unit > 0 and self.unknowns.table.unit.mask == "another"
         return another_mask(pattern, unit) if redrawn and isinstance(pattern, DotPattern) else None
 
+    def residual(self, view: View) -> RenderResidual:
+        """Return the errors of the light of a view's trials, at the best estimates, in its first camera."""
+        best = replace(self.unknowns, varied=()).draw(Trial(0))
+        camera, simulated, pose = next(iter(self.study.sensor.rig.cameras)), self.simulated, view.world_from_sensor
+
+        rois = {camera: self._view_light(view).rois[camera]}
+
+        def radiance(offset: int, finer: int) -> NDArray[np.float32]:
+            other = self.rendered_as(self.rendering.finer(finer))
+            other.unknowns = replace(self.unknowns, seed=self.unknowns.seed + offset)
+            shared = ViewLight(rois, {}, other._kept(simulated, pose, view, rois) if self._keeps_paths else {})
+            scene, _ = self.part.in_finish(best.finish)  # after the paths are kept, which tries other finishes
+            images = other._indirect(simulated, scene, pose, view, best, shared)
+            settings = other.rendering.indirect_settings
+            assert settings is not None  # rendering_of a study
+            indirect = IndirectImages(images, rois, settings, self.rendering.depth)
+            rendering = replace(other.rendering, indirect=indirect)
+            return simulated.radiance(scene, pose, camera, rendering, seed=other.unknowns.seed, roi=rois[camera])
+
+        return residual_of(radiance, self.study.sensor)
+
     def exposed(self, lit: TracedLight, planned: PlannedExposure | None, seed: int, keep: bool = False) -> Capture:
         """Expose light as planned, or by the sensor's own rule.
 
@@ -267,13 +290,17 @@ class RenderedMeasurements:
         """Return regions and seen surfaces from a pose of a view, and the paths of interreflections."""
         scene = self.study.scene
         rois = regions(simulated, view.world_from_sensor.inverse(), self.corners, self.turned_corners)
-        kept = {}
-        if keeps_paths:
-            numbers = (-1, *_PROBING_FINISHES) if "finish" in self.unknowns.varied else (-1,)
-            finishes = [self.part.bsdfs(number) for number in numbers]
-            seed = _seed_of(self.unknowns.seed, view.number)
-            kept = keep_light(simulated, scene, pose, rois, self.rendering, finishes, seed)
+        kept = self._kept(simulated, pose, view, rois) if keeps_paths else {}
         return ViewLight(rois, seen_surfaces(simulated, scene, pose, rois), kept)
+
+    def _kept(
+        self, simulated: SimulatedSensor, pose: Transform, view: View, rois: dict[str, Roi]
+    ) -> dict[str, KeptLight]:
+        """Return the paths of interreflections in regions of the images, from a pose of a view."""
+        numbers = (-1, *_PROBING_FINISHES) if "finish" in self.unknowns.varied else (-1,)
+        finishes = [self.part.bsdfs(number) for number in numbers]
+        seed = _seed_of(self.unknowns.seed, view.number)
+        return keep_light(simulated, self.study.scene, pose, rois, self.rendering, finishes, seed)
 
     def _indirect(
         self,

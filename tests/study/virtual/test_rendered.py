@@ -583,3 +583,13 @@ def test_shared_interreflections_follow_the_part(coarse_n10, monkeypatch):
                 squares.append(((whole[0] - whole[1])[both] ** 2).mean())
         errors[follows] = np.sqrt(np.mean(squares))
     assert errors[True] < 0.6 * errors[False]
+
+
+def test_the_render_noise_of_trials_falls_with_the_paths_that_they_keep(coarse_n10):
+    study = study_of(coarse_n10, scene="two_pillars.xml", measure={"light_path_depth": 2})
+    maker = measurements_of(study, study_unknowns(study))
+    view = min(study.views, key=lambda one: abs(one.elevation_deg - 45))
+    few = replace(maker.rendering, kept=replace(maker.rendering.kept, samples=4, kept=8))
+    noise, less = (maker.rendered_as(few.finer(factor)).residual(view).noise for factor in (1, 9))
+    assert 1.5 < noise / less < 6  # 3, but for the heavy tails of light between metal faces
+    assert maker.rendered_as(replace(few, depth=1)).residual(view).noise == 0
