@@ -101,7 +101,10 @@ function rim(names) {
   const centre = onAxis(face.point_mm, along(face), tube).map((value) => Math.round(value * 1e4) / 1e4);
   const ends = (tube.outline_mm ?? []).map((one) => Math.abs(dot(less(one, centre), along(tube))));
   if (ends.length && Math.min(...ends) > 0.05 * tube.radius_mm + 0.05) return null; // it ends elsewhere
-  return { name: cut(`${round}_rim_${plane}`), feature: { kind: 'circle', of: [plane], point_mm: centre, radius_mm: tube.radius_mm } };
+  const alike = (one) => one.kind === 'circle' && one.of[0] === plane && length(less(one.point_mm, centre)) < 1e-3;
+  const there = [...features].find(([, one]) => alike(one))?.[0], base = cut(`${round}_rim`);
+  const name = there ?? (features.has(base) ? cut(`${base}_${plane}`) : base);
+  return { name, feature: { kind: 'circle', of: [plane], point_mm: centre, radius_mm: tube.radius_mm } };
 }
 
 // Return a name that the page and a task allow with a number after it: 80 characters, 100 bytes.

@@ -281,7 +281,7 @@ function measurePanel() {
     if (allowed === null) return say(wrongTolerance(tolerance.value, zone), true);
     const before = already(offer.kind, offer.features);
     if (before) return say(`${before} measures the same: change its tolerance in the list below`, true);
-    const base = cut(`${offer.features.slice(0, 2).join('_to_')}_${offer.kind}`);
+    const base = cut(`${offer.features.slice(0, 2).join('_to_')}_${offer.kind.split('_').at(-1)}`);
     let name = base, n = 1;
     while (measurements.has(name)) name = `${base}_${++n}`;
     measurements.set(name, { kind: offer.kind, features: offer.features, nominal: offer.nominal, unit: offer.unit, ...(allowed === undefined ? {} : { tolerance: allowed }) });
@@ -320,7 +320,7 @@ function measurementList() {
       else one.tolerance = allowed;
       touched();
     }, { 'aria-label': `tolerance of ${name}`, size: 9 });
-    return element('tr', {}, element('td', {}, nameBox), element('td', {}, one.kind.replaceAll('_', ' ')), element('td', {}, one.features.join(', ')),
+    return element('tr', {}, element('td', {}, nameBox), element('td', {}, one.kind.replaceAll('_', ' ')), element('td', { class: 'au-names' }, one.features.join(', ')),
       element('td', { class: 'au-number' }, data.kinds[one.kind].zone ? 'zone' : `${short(one.nominal)} ${one.unit}`), element('td', {}, tolerance),
       element('td', {}, button('Remove', () => { measurements.delete(name); touched(); }, { 'aria-label': `remove ${name}` })));
   });

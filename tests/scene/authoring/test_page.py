@@ -133,7 +133,7 @@ def test_a_bracket_from_step_to_a_study_without_an_editor(served, folder, browse
     assert "seat_18mm exists already" in page.says
     page.choose("datum_bore", "bore_12mm_right")
     page.measure("axis_distance", "0,1")
-    assert page.says == "Added datum_bore_to_bore_12mm_right_axis_distance: 70 ±0.1"
+    assert page.says == "Added datum_bore_to_bore_12mm_right_distance: 70 ±0.1"
     page.choose("seat_18mm")
     for wrong in ("0.1 0.1", "+0.1 -0.1 0", "wide", "-0.1"):
         page.measure("radius", wrong)
@@ -169,7 +169,7 @@ def test_a_bracket_from_step_to_a_study_without_an_editor(served, folder, browse
     assert {url.split("/")[2] for url in browser.requests if url.startswith("http")} == {address.split("/")[2]}
     made = folder / "made"
     task = tomllib.loads((made / "task.toml").read_text())
-    assert task["measurements"]["datum_bore_to_bore_12mm_right_axis_distance"] == {
+    assert task["measurements"]["datum_bore_to_bore_12mm_right_distance"] == {
         "kind": "axis_distance",
         "features": ["datum_bore", "bore_12mm_right"],
         "nominal": 70,
@@ -257,11 +257,16 @@ def test_rims_tolerance_classes_and_a_coat_are_given_by_a_click(step_file, step_
 
     page.choose("bore_12mm_left", "top_at_z12mm")
     browser.tell("document.getElementById('author-rim').click()")
-    assert page.faces()[-1] == "◯ bore_12mm_left_rim_top_at_z12mm"
+    assert page.faces()[-1] == "◯ bore_12mm_left_rim"
     page.measure("diameter", "")
+    page.type("#author-name", "hole")
     page.choose("bore_12mm_left", "top_at_z12mm")
-    browser.tell("document.getElementById('author-rim').click()")  # it is chosen, not made again
-    assert len([name for name in page.faces() if "_rim_" in name]) == 1
+    browser.tell("document.getElementById('author-rim').click()")  # it is chosen under its new name, not made again
+    assert [name for name in page.faces() if "◯" in name] == ["◯ hole"]
+    page.type("#author-name", "bore_12mm_left_rim")
+    page.choose("bore_12mm_left", "bottom")
+    browser.tell("document.getElementById('author-rim').click()")  # the other end of the same bore
+    assert page.faces()[-1] == "◯ bore_12mm_left_rim_bottom"
     page.choose("bore_12mm_left", "left")  # a face along the axis has no rim
     assert browser.tell("document.getElementById('author-rim')") is None
 
@@ -281,7 +286,7 @@ def test_rims_tolerance_classes_and_a_coat_are_given_by_a_click(step_file, step_
     browser.tell("document.getElementById('author-spray').click()")
     scene, task, *_ = page.downloaded()
     written = tomllib.loads(task)
-    assert written["features"]["bore_12mm_left_rim_top_at_z12mm"] == {
+    assert written["features"]["bore_12mm_left_rim"] == {
         "kind": "circle", "of": ["top_at_z12mm"], "point_mm": [-35, -8, 12], "radius_mm": 6
     }  # fmt: skip
     tolerances = {one["kind"]: (one["nominal"], one["tolerance"]) for one in written["measurements"].values()}
@@ -427,12 +432,20 @@ def test_tables_are_whole_on_a_narrow_screen(step_file, step_here, browser, tmp_
     browser.call("Emulation.setDeviceMetricsOverride", width=400, height=800, deviceScaleFactor=1, mobile=False)
     try:
         page = Author(browser, (tmp_path / "p.html").as_uri())
-        page.choose("boss_20mm")
-        page.measure("diameter", "0.1")
+        for bore in ("bore_12mm_left", "bore_12mm_right"):
+            page.choose(bore, "top_at_z12mm")
+            browser.tell("document.getElementById('author-rim').click()")
+        page.choose("◯ bore_12mm_left_rim", "◯ bore_12mm_right_rim")
+        page.measure("point_distance", "0.1")
+        assert page.says == "Added bore_12mm_left_rim_to_bore_12mm_right_rim_distance: 70 ±0.1"
         # every cell lies within the page, below its head, and neither page nor table scrolls sideways
         labels = browser.tell("[...document.querySelectorAll('td[data-label]')].map((one) => one.dataset.label)")
         assert {"Name", "Kind", "Faces", "Nominal", "Tolerance", "Metal", "Process", "Ra [um]"} <= set(labels)
         wide = "[...document.querySelectorAll('html, .au-scroll')].map((one) => one.scrollWidth - one.clientWidth)"
+        assert max(browser.tell(wide)) <= 0
+        cells = "[...document.querySelectorAll('td')].map((one) => one.scrollWidth - one.clientWidth)"
+        assert max(browser.tell(cells)) <= 0  # no word reaches into the next column
+        browser.call("Emulation.setDeviceMetricsOverride", width=1100, height=800, deviceScaleFactor=1, mobile=False)
         assert max(browser.tell(wide)) <= 0
     finally:
         browser.reset()
