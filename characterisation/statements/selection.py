@@ -15,6 +15,9 @@ the variance is also for few trials (:func:`log_of_mean`). Few trials lack the r
 too small, and views differ in it: k - 1 is log-normal with the prior :data:`EXCESS`. Views with trials in the same
 worlds (common random numbers) correlate as their squared errors do; so do the measurements of one trial.
 
+An error of exactly 0 is that of a zone whose form is lost in the noise. Its size is unknown, and counts as the map's u:
+its logarithm would outweigh the prior and the trials of all views.
+
 The prior is the map's u with two errors: a factor common to all views, and another for each view. Trials update it
 (normal update, e.g. Gelman et al., Bayesian Data Analysis, 3.5).
 """
@@ -176,7 +179,8 @@ def posterior(
     counted = np.flatnonzero(counts)
     if not len(counted):
         return prior_mean + loss, prior + np.diag(loss_variance)
-    square = np.where(valued, np.where(valued, every, 0.0) ** 2, np.nan)[counted]
+    sized = np.where(every == 0, np.asarray(prior_risk, float)[:, None], every)
+    square = np.where(valued, np.where(valued, sized, 0.0) ** 2, np.nan)[counted]
     moment = np.maximum(np.nanmean(square, axis=1), 1e-300)
     low, spread = log_of_mean(counts[counted], _excess(square / moment[:, None], counts[counted]))
     data = np.outer(spread, spread) * _correlation(square / moment[:, None])

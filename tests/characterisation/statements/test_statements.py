@@ -256,3 +256,12 @@ def test_an_error_that_is_always_the_same_is_settled():
     stated = statement("height", "mm", [0.25] * 20)
     assert stated.numerical_tolerance == 0 and stated.settled
     assert not statement("height", "mm", [0.25]).settled
+
+
+def test_a_form_that_is_lost_in_the_noise_does_not_make_its_view_certain():
+    """One trial with a flatness of exactly 0 gave its view a risk of 2e-32 mm, and made it the best for certain."""
+    errors = np.full((3, 4), np.inf)
+    errors[0, 0], errors[1, 0], errors[2, :] = 0.0, 0.02, 0.01  # mm; the third is known well, and twice as good
+    of_views = standing(errors, [0.02, 0.02, 0.01], [0.9, 0.9, 0.9])
+    assert 0.002 < of_views.risk[0] < 0.2
+    assert of_views.near[0] < 0.9
