@@ -269,4 +269,4 @@ def _edit(scene: Path, sensor: str | None, port: int) -> None:
         server.serve()
     except KeyboardInterrupt:
         say("ended")
-    say(f"saved {server.saved} times to {scene.parent}")
+    say(f"saved {'once' if server.saved == 1 else f'{server.saved} times'} to {scene.parent}")

@@ -198,8 +198,8 @@ function finishRemark(finish) {
   if (usual && (Ra < usual[0] || Ra > usual[1])) return `▲ ${finish.process} metal usually has Ra ${usual[0]} to ${usual[1]} um`;
   const known = data.known?.[`${finish.metal}/${finish.process}`];
   if (!data.known || (known && (!known.length || (Ra >= known[0] && Ra <= known[1])))) return '';
-  const has = known ? `${finish.metal}/${finish.process} of Ra ${known[0]} to ${known[1]} um alone` : `no ${finish.metal}/${finish.process}`;
-  return `● the map of ${data.sensor} has ${has}: its nearest finish ranks the views; virtual measurements have this one`;
+  const has = known ? `${finish.metal}/${finish.process} only of Ra ${known[0]} to ${known[1]} um` : `no ${finish.metal}/${finish.process}`;
+  return `● the map of ${data.sensor} has ${has}: views are ranked by its nearest finish; virtual measurements use this one`;
 }
 
 // Say what a feature without a face of its own is.

@@ -48,6 +48,7 @@ FINEST_MM = 1e-4
 
 _SECONDS = 3600
 _INSTALL = 'pip install "cadquery-ocp-novtk<8" (or "mitsim[step]"), or save the part as STL'
+_MESHES = "an STL, OBJ, PLY, OFF, 3MF or glTF file"
 
 
 @dataclass(frozen=True)
@@ -99,7 +100,7 @@ def read_step(path: str | Path, fineness: Fineness = _DEFAULT, units: str | None
     """
     path = Path(path)
     if not step_installed():
-        raise InputError(path, "", "a STEP file, which needs OpenCASCADE", "an STL, PLY or OBJ file", _INSTALL)
+        raise InputError(path, "", "a STEP file, which needs OpenCASCADE", _MESHES, _INSTALL)
     text = read_step_text(path)
     check_placements(path, text)
     scale, unit_remarks = _scale(path, text, units)
@@ -119,7 +120,7 @@ def read_step(path: str | Path, fineness: Fineness = _DEFAULT, units: str | None
         done = run_worker(command, path)
         if "ImportError" in done.stderr or "ModuleNotFoundError" in done.stderr:
             found = "a STEP file, and an unsupported version of OpenCASCADE"
-            raise InputError(path, "", found, "an STL, PLY or OBJ file", _INSTALL)
+            raise InputError(path, "", found, _MESHES, _INSTALL)
         if done.returncode != 0 or not out.exists():
             raise InputError(path, "", "a file that OpenCASCADE cannot read", "a STEP file (AP203, AP214 or AP242)")
         with np.load(out) as data:

@@ -452,7 +452,7 @@ def test_garbage_in_a_step_file_is_told(tmp_path):
 def test_without_opencascade_the_message_says_what_to_install(tmp_path, monkeypatch):
     (tmp_path / "part.step").write_text("ISO-10303-21;")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"pip install .*cadquery-ocp"):
+    with pytest.raises(InputError, match=r"OBJ, PLY, OFF, 3MF or glTF file\. pip install .*cadquery-ocp"):
         read_step(tmp_path / "part.step")
 
 
