@@ -32,7 +32,7 @@ from mitsim.report.unknowns_words import unknowns_in_words
 from mitsim.study.choice_document import CHOICE, ChoiceDocument, PoseEntry, SensorEntry, best_statement, read_choice
 from mitsim.study.run_folder import Run, read_run
 from mitsim.study.scene_geometry import SceneGeometry
-from mitsim.study.statement_file import InfluenceEntry, StatedMeasurement, StatementDocument
+from mitsim.study.statement_file import InfluenceEntry, StatedMeasurement, StatementDocument, roughness_in_words
 
 #: how the software was verified (ISO/TS 15530-4), in words; docs/explanation/validity.md, criteria 10 and 11
 VERIFIED = "closed forms, examples of JCGM 101 and 106, another renderer; not by a metal part with calibrated values"
@@ -103,7 +103,8 @@ def read_declaration(folder: Path, geometry: SceneGeometry | None) -> Declaratio
 
 def _of_run(run: Run, geometry: SceneGeometry | None) -> Declaration:
     first, document = of_run(run, geometry), run.statement
-    facts = [("Part", _part(run.about.scene, list(run.about.features.values()))), ("Sensor", run.about.sensor)]
+    part = _part(run.about.scene, list(run.about.features.values()), document)
+    facts = [("Part", part), ("Sensor", run.about.sensor)]
     if document is not None:
         facts.append(("Pose of the sensor", pose_in_full(pose_of_view(run, document.view))))
         facts += _of_statement(document, "" if document.exposure else run.about.exposure_rule)
@@ -123,11 +124,11 @@ def _of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None, folder: P
     first = of_choice(choice, geometry, shown)
     if best is None:
         title = f"No sensor measures {Path(choice.scene).stem}"
-        return _declared(folder, title, _day(folder / CHOICE), first, None, [("Part", _part(choice.scene, []))])
+        return _declared(folder, title, _day(folder / CHOICE), first, None, [("Part", _part(choice.scene, [], None))])
     own = folder / best.name
     about = read_run(own).about if (own / "run.json").exists() else None
     finishes = [] if about is None else list(about.features.values())
-    facts = [("Part", _part(choice.scene, finishes)), ("Sensor", best.name)]
+    facts = [("Part", _part(choice.scene, finishes, document)), ("Sensor", best.name)]
     facts += [("Pose of the sensor", pose_in_full(pose)) for pose in best.poses[:1]]
     for pose in best.poses[1:]:
         names = [name for name, cell in best.measurements.items() if cell.view == pose.view]
@@ -209,6 +210,11 @@ def _notes(document: StatementDocument | None) -> list[Note]:
         ],
         ("*", "not settled after JCGM 101, 7.9: more virtual measurements may change a digit."): not_settled,
     }
+    rough: dict[str, list[str]] = {}
+    for name, one in known.items():
+        if few := roughness_in_words(round(one.trials * (1 - one.without_value))):
+            rough.setdefault(few, []).append(name)
+    of_some |= {("§" * (k + 1), f"{few}."): rough[few] for k, few in enumerate(rough)}
     notes = [
         Note(text, tuple(names), mark) if len(names) < len(known) else Note(f"All: {text}")
         for (mark, text), names in of_some.items()
@@ -217,10 +223,14 @@ def _notes(document: StatementDocument | None) -> list[Note]:
     return [Note(words), *notes, *(Note(f"{one}.") for one in document.doubts("the influences listed below"))]
 
 
-def _part(scene: str, finishes: Sequence[str]) -> str:
-    kinds = list(dict.fromkeys(finish.replace(" um", " µm") for finish in finishes))
-    name = Path(scene).name
-    return f"{name}; finish: {listed(kinds)}" if kinds else name
+def _part(scene: str, finishes: Sequence[str], document: StatementDocument | None) -> str:
+    kinds = list(dict.fromkeys(finish.replace(" um", " µm").replace("_", " ") for finish in finishes))
+    name, coat = Path(scene).name, ", sprayed on" * (document is not None and _is_sprayed(document))
+    return f"{name}; finish: {listed(kinds)}{coat}" if kinds else name
+
+
+def _is_sprayed(document: StatementDocument) -> bool:
+    return any("spray" in influence.name for influence in document.influences if influence.included)
 
 
 def pose_in_full(pose: PoseEntry) -> str:
@@ -259,7 +269,7 @@ def _influences(document: StatementDocument, lay_open: bool) -> list[tuple[str, 
     missing = _names(left_out) + marks * (not document.draws_lay)
     # a map has its own finish, light and decoder; another unit has no size
     idle = {"unit", "finish", "light", "decoder"} if document.measured_by == "map" else {"unit"}
-    idle |= set() if any("spray" in name for name in _names(varied)) else {"coat"}
+    idle |= set() if _is_sprayed(document) else {"coat"}
     drawn = {group: table for group, table in document.unknowns.items() if group not in idle}
     out = [
         ("Varied", ", ".join(_names(varied) + marks * document.draws_lay)),

@@ -6,12 +6,10 @@ screening alone.
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Literal
 
 from pydantic import Field, model_validator
-from scipy.stats import chi2
 
 from characterisation.files.checked_files import read_json_object
 from characterisation.files.documents import validate
@@ -19,7 +17,7 @@ from characterisation.files.errors import InputError
 from characterisation.statements.verdict_words import Judged, fits_in_words
 from characterisation.tasks.task_file import tolerance_size
 from characterisation.words.numbers import or_nan, two_digits
-from mitsim.study.statement_file import PartialDocument, StatementDocument, read_statement
+from mitsim.study.statement_file import PartialDocument, StatementDocument, read_statement, roughness_in_words
 
 #: name of the file in the folder
 CHOICE = "choice.json"
@@ -76,10 +74,6 @@ class CellEntry(PartialDocument):
         return f"{text}: {self.reason}" if self.reason else text
 
 
-#: trials of the first round of a comparison; with as many, a standard uncertainty may be 1.4 times as large, and one of
-#: fewer is called rough; chosen
-FEW_TRIALS = 24
-
 #: reason why a sensor that may win has no virtual measurements
 TIME_OVER = "time was over"
 
@@ -134,15 +128,10 @@ class SensorEntry(PartialDocument):
 
     @property
     def roughness_in_words(self) -> str:
-        """Return how much larger standard uncertainties may be, if few trials stand behind them; otherwise empty.
-
-        The factor is that of normal errors with 97.5 % confidence, from the chi-square distribution.
-        """
-        trials = min((cell.trials for cell in self.measurements.values() if cell.by == "statement"), default=0)
-        if not 2 <= trials < FEW_TRIALS:
-            return ""
-        factor = math.sqrt((trials - 1) / chi2.ppf(0.025, trials - 1))
-        return f"{trials} virtual measurements only: standard uncertainties may be {factor:.1f} times as large"
+        """Return how much larger standard uncertainties may be, if few trials stand behind them; otherwise empty."""
+        return roughness_in_words(
+            min((cell.trials for cell in self.measurements.values() if cell.by == "statement"), default=0)
+        )
 
     @property
     def possible_in_words(self) -> str:

@@ -140,6 +140,25 @@ def test_notes_on_some_rows_mark_them_and_have_the_names_elsewhere(run_folder, t
     assert any(text.startswith("† errors for a part at the limit") for text in shown)
 
 
+def test_a_sheet_says_how_rough_a_number_of_few_virtual_measurements_is(run_folder, tmp_path):
+    """It stated u and a verdict of four virtual measurements without a word; the page of a comparison warned."""
+    folder = shutil.copytree(run_folder, tmp_path / "run")
+    with_rows(folder, 3)
+    statement = json.loads((folder / "statement.json").read_text(encoding="utf-8"))
+    one, other, third = statement["measurements"].values()
+    statement["measurements"] = {
+        "distance_0": one | {"trials": 8, "without_value": 0.5},
+        "distance_1": other | {"trials": 200, "without_value": 0.1},
+        "distance_2": third | {"trials": 10, "without_value": 0.0},
+    }
+    (folder / "statement.json").write_text(json.dumps(statement), encoding="utf-8")
+    notes = [note.in_full for note in read_declaration(folder, None).notes]
+    # the 2.5 % points of chi-square of 3 and 9 degrees are 0.216 and 2.700
+    assert "distance_0: 4 virtual measurements only: standard uncertainties may be 3.7 times as large." in notes
+    assert "distance_2: 10 virtual measurements only: standard uncertainties may be 1.8 times as large." in notes
+    assert not any("distance_1" in note and "only" in note for note in notes)
+
+
 def test_a_sheet_has_what_iso_ts_15530_4_and_jcgm_101_ask_for(run_folder, tmp_path):
     folder = shutil.copytree(run_folder, tmp_path / "run")
     statement = json.loads((folder / "statement.json").read_text(encoding="utf-8"))
@@ -318,7 +337,8 @@ def test_a_coat_is_declared_where_the_part_is_sprayed(run_folder, tmp_path, spra
     statement["influences"] = [{"name": spray, "included": True, "how": "drawn", "simulated": True}]
     statement["unknowns"] = {"coat": {"thickness_um": [5.0, 20.0]}}
     (folder / "statement.json").write_text(json.dumps(statement), encoding="utf-8")
-    assert ("5 to 20 µm" in dict(read_declaration(folder, None).facts)["with sizes of"]) == shown
+    facts = dict(read_declaration(folder, None).facts)
+    assert ("5 to 20 µm" in facts["with sizes of"]) == facts["Part"].endswith(", sprayed on") == shown
 
 
 def test_lines_fit_and_lose_no_character():

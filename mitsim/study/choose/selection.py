@@ -30,7 +30,6 @@ from characterisation.words.numbers import two_digits
 from characterisation.words.progress import say
 from mitsim.running.executor import Executor, giving_up
 from mitsim.running.time_limit import TimeLimit
-from mitsim.study.choice_document import FEW_TRIALS
 from mitsim.study.choose.candidates import CandidateSensor
 from mitsim.study.choose.ranking import rank_keys, unpromising
 from mitsim.study.choose.rounds import able_to_win, race_and_state, race_as_stated, refine_leader, state_by_screening
@@ -38,6 +37,7 @@ from mitsim.study.choose.screened_sensor import screen_sensor
 from mitsim.study.choose.sensor_result import SensorResult, ordered
 from mitsim.study.run_record import complete_winner
 from mitsim.study.session import Session
+from mitsim.study.statement_file import FEW_TRIALS
 from mitsim.study.virtual.race import ALL
 
 #: factor of the trials from round to round; chosen
