@@ -1,4 +1,4 @@
-"""Compute the viewer's frame, the edges between shapes, and the places for names in pictures of parts."""
+"""Compute the viewer's frame, what is seen, the edges between shapes, and places for names in pictures of parts."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from characterisation.files.arrays import Floats
 
 #: share of its colour that remains on the edge of a shape
 EDGE_SHADE = 0.55
+
+#: number of pixels of boxes around triangles that are tested at once
+_AT_ONCE = 1 << 20
 
 
 def viewer_frame(azimuth: float, elevation: float) -> Floats:
@@ -36,3 +39,40 @@ def innermost_pixel(mask: NDArray[np.bool_]) -> tuple[int, int]:
     inside = distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
     row, column = np.unravel_index(int(inside.argmax()), inside.shape)
     return int(row), int(column)
+
+
+def depth_buffer(vertices: Floats, depth: Floats, size: tuple[int, ...]) -> tuple[NDArray[np.int64], Floats]:
+    """Return the nearest triangle of every pixel, -1 for none, and its depth, both (rows, columns).
+
+    ``vertices`` (n, 3, 2) [px] of the triangles, ``depth`` (n, 3), larger is nearer; ``size`` is (columns, rows).
+    """
+    columns, rows = size
+    index, nearest = np.full(rows * columns, -1, np.int64), np.full(rows * columns, -np.inf)
+    low = np.maximum(np.ceil(vertices.min(axis=1)), 0).astype(int)
+    high = np.minimum(np.floor(vertices.max(axis=1)), [columns - 1, rows - 1]).astype(int)
+    (ax, ay), (bx, by), (cx, cy) = vertices.transpose(1, 2, 0)
+    area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
+    width = np.where((high >= low).all(axis=1) & (np.abs(area) >= 1e-12), high[:, 0] - low[:, 0] + 1, 0)
+    candidates = np.flatnonzero(width)  # most triangles of a fine mesh lie between pixels
+    counts = width[candidates] * (high[candidates, 1] - low[candidates, 1] + 1)
+    ends = np.cumsum(counts)
+    for part in np.split(candidates, np.flatnonzero(np.diff(ends // _AT_ONCE)) + 1):
+        # every pixel of the box around every triangle
+        count = width[part] * (high[part, 1] - low[part, 1] + 1)
+        t = np.repeat(part, count)
+        offset = np.arange(len(t)) - np.repeat(np.cumsum(count) - count, count)
+        x, y = low[t, 0] + offset % width[t], low[t, 1] + offset // width[t]
+        first = ((bx[t] - x) * (cy[t] - y) - (cx[t] - x) * (by[t] - y)) / area[t]
+        second = ((cx[t] - x) * (ay[t] - y) - (ax[t] - x) * (cy[t] - y)) / area[t]
+        third = 1 - first - second
+        inside = np.minimum(np.minimum(first, second), third) >= -1e-9
+        here, t, pixel = (
+            (first * depth[t, 0] + second * depth[t, 1] + third * depth[t, 2])[inside],
+            t[inside],
+            (y * columns + x)[inside],
+        )
+        order = np.lexsort((-t, here, pixel))
+        last = order[np.diff(pixel[order], append=-1) != 0]  # the nearest of each pixel
+        won = last[here[last] > nearest[pixel[last]]]
+        nearest[pixel[won]], index[pixel[won]] = here[won], t[won]
+    return index.reshape(rows, columns), nearest.reshape(rows, columns)

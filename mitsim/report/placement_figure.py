@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from characterisation.files.arrays import Floats
 from characterisation.plots.labels import label_columns
-from characterisation.plots.part_pictures import EDGE_SHADE, innermost_pixel, viewer_frame
+from characterisation.plots.part_pictures import EDGE_SHADE, depth_buffer, innermost_pixel, viewer_frame
 from characterisation.plots.style import INK, MUTED, PAPER, drawing
 from mitsim.study.scene_geometry import SceneGeometry
 
@@ -47,8 +47,8 @@ _LEGEND = {"no tolerance": "measured, without tolerance"}
 _PIXELS = 900
 _LABEL_PIXELS = 240
 
-#: number of pixels of boxes around triangles that are tested at once
-_AT_ONCE = 1 << 20
+#: share of a face's pixels from the better side, over which it counts as seen; its outline alone has 1 %; chosen
+_SEEN_SHARE = 0.25
 
 #: azimuth of the picture's viewpoint relative to the sensor [deg]; chosen
 _ASIDE_DEG = 62.0
@@ -138,7 +138,7 @@ def draw_placement(
     matrices = [np.asarray(pose, float) for _, pose in poses]
     with drawing():
         middle = (geometry.corners.min(axis=(0, 1)) + geometry.corners.max(axis=(0, 1))) / 2
-        turn = _viewpoint(matrices[0], middle)
+        turn = _viewpoint(geometry, matrices[0], middle, verdicts)
         flat, depth = _projected(geometry.corners - middle, turn)
         foot = _legend(figure, verdicts, geometry.camera, 2 if stacked else None) + _ABOVE_LEGEND
         whole, near = (
@@ -159,13 +159,28 @@ def draw_placement(
             _make_room_for_texts(axes)
 
 
-def _viewpoint(part_from_sensor: Floats, middle: Floats) -> Floats:
-    """Return rows (3, 3): right, up and toward the viewer, who looks from the side of the sensor's line of sight."""
+def _viewpoint(
+    geometry: SceneGeometry, part_from_sensor: Floats, middle: Floats, verdicts: Mapping[str, str]
+) -> Floats:
+    """Return rows (3, 3): right, up and toward the viewer, who looks from a side of the sensor's line of sight.
+
+    Of both sides it is that from which more faces with a verdict are seen.
+    """
     away = part_from_sensor[:3, 3] - middle
     azimuth = math.atan2(away[1], away[0]) if np.hypot(away[0], away[1]) > 1e-6 else -math.pi / 2
     elevation = math.atan2(away[2], math.hypot(away[0], away[1]))
     low = max(math.radians(_LOWEST_DEG), min(math.radians(28.0), elevation * 0.6))
-    return viewer_frame(azimuth + math.radians(_ASIDE_DEG), low)
+
+    turns = [viewer_frame(azimuth + side * math.radians(_ASIDE_DEG), low) for side in (1, -1)]
+    pixels = np.stack([_pixels_by_face(geometry, *_projected(geometry.corners - middle, turn)) for turn in turns])
+    asked = [name in verdicts for name in geometry.names]
+    shown = (pixels > _SEEN_SHARE * pixels.max(axis=0))[:, asked].sum(axis=1)
+    return turns[int(shown.argmax())]
+
+
+def _pixels_by_face(geometry: SceneGeometry, flat: Floats, depth: Floats) -> NDArray[np.int64]:
+    index = _raster(flat, depth, _LABEL_PIXELS)[0]
+    return np.bincount(geometry.shape[index[index >= 0]], minlength=len(geometry.names))
 
 
 def _projected(points: Floats, turn: Floats) -> tuple[Floats, Floats]:
@@ -205,43 +220,6 @@ def _raster(flat: Floats, depth: Floats, pixels: int) -> tuple[NDArray[np.int64]
     scale = pixels / max(float((high - low).max()), 1e-9)
     size = tuple(np.ceil((high - low) * scale).astype(int) + 1)
     return depth_buffer((flat - low) * scale, depth, size)[0], low, high, scale
-
-
-def depth_buffer(vertices: Floats, depth: Floats, size: tuple[int, ...]) -> tuple[NDArray[np.int64], Floats]:
-    """Return the nearest triangle of every pixel, -1 for none, and its depth, both (rows, columns).
-
-    ``vertices`` (n, 3, 2) [px] of the triangles, ``depth`` (n, 3), larger is nearer; ``size`` is (columns, rows).
-    """
-    columns, rows = size
-    index, nearest = np.full(rows * columns, -1, np.int64), np.full(rows * columns, -np.inf)
-    low = np.maximum(np.ceil(vertices.min(axis=1)), 0).astype(int)
-    high = np.minimum(np.floor(vertices.max(axis=1)), [columns - 1, rows - 1]).astype(int)
-    (ax, ay), (bx, by), (cx, cy) = vertices.transpose(1, 2, 0)
-    area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
-    width = np.where((high >= low).all(axis=1) & (np.abs(area) >= 1e-12), high[:, 0] - low[:, 0] + 1, 0)
-    candidates = np.flatnonzero(width)  # most triangles of a fine mesh lie between pixels
-    counts = width[candidates] * (high[candidates, 1] - low[candidates, 1] + 1)
-    ends = np.cumsum(counts)
-    for part in np.split(candidates, np.flatnonzero(np.diff(ends // _AT_ONCE)) + 1):
-        # every pixel of the box around every triangle
-        count = width[part] * (high[part, 1] - low[part, 1] + 1)
-        t = np.repeat(part, count)
-        offset = np.arange(len(t)) - np.repeat(np.cumsum(count) - count, count)
-        x, y = low[t, 0] + offset % width[t], low[t, 1] + offset // width[t]
-        first = ((bx[t] - x) * (cy[t] - y) - (cx[t] - x) * (by[t] - y)) / area[t]
-        second = ((cx[t] - x) * (ay[t] - y) - (ax[t] - x) * (cy[t] - y)) / area[t]
-        third = 1 - first - second
-        inside = np.minimum(np.minimum(first, second), third) >= -1e-9
-        here, t, pixel = (
-            (first * depth[t, 0] + second * depth[t, 1] + third * depth[t, 2])[inside],
-            t[inside],
-            (y * columns + x)[inside],
-        )
-        order = np.lexsort((-t, here, pixel))
-        last = order[np.diff(pixel[order], append=-1) != 0]  # the nearest of each pixel
-        won = last[here[last] > nearest[pixel[last]]]
-        nearest[pixel[won]], index[pixel[won]] = here[won], t[won]
-    return index.reshape(rows, columns), nearest.reshape(rows, columns)
 
 
 def _sensor(

@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from characterisation.plots.labels import cut, spread
-from mitsim.report.placement_figure import depth_buffer, draw_placement, face_verdicts, placement_figure
-from mitsim.study.scene_geometry import read_scene_geometry
+from characterisation.plots.part_pictures import depth_buffer
+from mitsim.report.placement_figure import draw_placement, face_verdicts, placement_figure
+from mitsim.study.scene_geometry import SceneGeometry, read_scene_geometry
 from tests.report.conftest import write_scene_geometry
 
 
@@ -23,6 +25,27 @@ def test_the_nearer_triangle_hides_the_farther():
 def test_a_face_has_the_worst_verdict_that_rests_on_it():
     found = face_verdicts({"a": (["plane", "pin"], "fits"), "b": (["pin"], "undecidable"), "c": (["pin"], "fits")})
     assert found == {"plane": "fits", "pin": "undecidable"}
+
+
+@pytest.mark.parametrize("azimuth_deg", [-126, -54, 54])
+def test_the_picture_shows_a_measured_face_that_the_sensor_sees_at_a_slant(azimuth_deg):
+    """From one side of the sensor the measured front of a wall was hidden by the wall itself."""
+    wall = trimesh.creation.box((80, 8, 50))
+    sensor_side = -1 if azimuth_deg < 0 else 1
+    geometry = SceneGeometry(
+        corners=wall.triangles,
+        names=("rest", "front"),
+        shape=(wall.face_normals[:, 1] * sensor_side > 0.5).astype(int),
+        centres=np.zeros((2, 3)),
+        rays=np.array([[[-0.3, -0.2, 0.93], [0.3, -0.2, 0.93], [0.3, 0.2, 0.93], [-0.3, 0.2, 0.93]]] * 2),
+        reach=(400.0, 700.0),
+    )
+    c, s = np.cos(np.radians(azimuth_deg)), np.sin(np.radians(azimuth_deg))
+    pose = np.eye(4)
+    pose[:3] = [[-s, 0, -c, 600 * c], [c, 0, -s, 600 * s], [0, -1, 0, 0]]
+    figure = placement_figure(geometry, [("view 1", pose)], {"front": "fits"})
+    red, green, _, shown = np.moveaxis(np.asarray(figure.axes[1].images[0].get_array()), -1, 0)
+    assert (green > red + 0.1).sum() > 0.5 * (shown > 0).sum()
 
 
 def test_labels_stand_apart_and_are_moved_least():
