@@ -9,6 +9,7 @@ from characterisation.plots.statements import GROUPS
 from characterisation.words.numbers import percent
 from mitsim.report.choice_page import write_choice_page
 from mitsim.report.page import write_report
+from tests.report import choice_run
 from tests.report.choice_run import write_choice
 from tests.report.chromium import BROWSER
 from tests.report.conftest import plain_pictures
@@ -92,6 +93,20 @@ def test_no_column_is_lost_and_no_cell_covers_another(browser, pages, page, widt
     browser.tell("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
     assert browser.tell(LOST) == {"wide": 0, "lost": []}
     assert browser.tell(OVERLAPS) == []
+
+
+def test_a_name_of_80_letters_stays_within_its_cell_on_a_telephone(browser, pages, monkeypatch, tmp_path):
+    """It is the head beside every cell of its column, and an entry of the list of the interactive views."""
+    name = "_".join(["bore_10mm_left_rim"] * 4) + "_dist"
+    monkeypatch.setattr(choice_run, "NAMES", (name, f"{name}_2", "angle"))
+    with plain_pictures():
+        choice = write_choice_page(write_choice(tmp_path / "choice"))
+    set_size(browser, 400, "screen", "light")
+    browser.open(choice)
+    assert browser.tell(LOST) == {"wide": 0, "lost": []}
+    browser.open(pages["run"])
+    browser.tell(f"document.querySelector('#sphere-measurement option').textContent = '{name}'")
+    assert browser.tell(LOST)["wide"] == 0
 
 
 @pytest.mark.parametrize("page", ["run", "choice"])
