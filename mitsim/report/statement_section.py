@@ -36,6 +36,7 @@ def statement_section(document: StatementDocument) -> dict[str, Any]:
         "tolerances": any(one.tolerance is not None for one in measured.values()),
         "legend": [{"colour": GROUPS[group][0], "name": GROUPS[group][1]} for group in shown],
         "bars": [_bar(name, one) for name, one in measured.items() if one.budget],
+        "without_bar": [name for name, one in measured.items() if not one.budget],
         "budget_groups": [GROUPS[group][1] for group in shown],
         "budget_rows": [_budget_row(name, one, shown) for name, one in measured.items() if one.budget],
         "included": [influence.model_dump() for influence in document.influences if influence.included],

@@ -137,6 +137,7 @@ def test_the_statement_is_told_first_with_its_budget_and_what_it_leaves_out(text
     assert "too few trials 32 to 90 %" in " ".join(cells.split()) and section.count('class="open"') == 1
     assert "0.10 mm" in cells and "36 %; 25 to 48 %" in cells
     assert re.search(r">dirt</th><td[^>]*>no</td>", section) and re.search(r">noise</th><td[^>]*>yes</td>", section)
+    assert "Too few virtual measurements have a value for a bar of radius" in text
 
 
 def test_what_would_make_a_measurement_fit_stands_below_the_result(run_folder, tmp_path, written):
