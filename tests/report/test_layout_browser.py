@@ -107,6 +107,9 @@ def test_a_name_of_80_letters_stays_within_its_cell_on_a_telephone(browser, page
     browser.open(pages["run"])
     browser.tell(f"document.querySelector('#sphere-measurement option').textContent = '{name}'")
     assert browser.tell(LOST)["wide"] == 0
+    set_size(browser, 703, "print", "light")  # the bars of the budget left the paper
+    browser.tell(f"document.querySelector('.bar-name').innerHTML = '{name.replace('_', '_<wbr>')}'")
+    assert browser.tell("document.querySelector('.bar').getBoundingClientRect().right <= 703")
 
 
 @pytest.mark.parametrize("page", ["run", "choice"])
