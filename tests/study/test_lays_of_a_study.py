@@ -13,7 +13,7 @@ def test_a_study_names_the_features_whose_marks_have_no_direction(scenes, capsys
     }
     report_doubts(study)
     told = capsys.readouterr().err
-    assert told.startswith("plane and 2 more: lay not given") and told.count("\n") == 1 and len(told) < 120
+    assert told.startswith("plane and 2 more: no lay, the direction of") and told.count("\n") == 1 and len(told) < 120
 
 
 def test_a_study_of_matt_faces_says_nothing(scenes, capsys):

@@ -29,4 +29,5 @@ def lays_in_words(scatters: Mapping[str, Scatter | None]) -> list[str]:
     if not left_out:
         return []
     faces = left_out[0] if len(left_out) == 1 else f"{left_out[0]} and {len(left_out) - 1} more"
-    return [f"{faces}: lay not given (lay = u, v or none): virtual measurements draw it, maps are round"]
+    words = "no lay, the direction of machining marks (u, v or none): virtual measurements draw it, maps omit it"
+    return [f"{faces}: {words}"]

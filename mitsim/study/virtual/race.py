@@ -354,8 +354,8 @@ def _say_state(raced: Raced, counts: dict[int, int], seconds: float) -> None:
 
 
 def in_words(standing: Standing, margin: float) -> str:
-    """Return how good a choice is: ``with an error expected 4 % above the least (90 % sure to be within 10 %)``."""
+    """Return how good a choice is: ``with an error expected 4 % above that of the best view (90 % sure ...)``."""
     loss = "expected to be the best"
     if standing.loss >= 0.005:
-        loss = f"with an error expected {100 * standing.loss:.0f} % above the least"
-    return f"{loss} ({100 * standing.confidence:.0f} % sure to be within {100 * margin:.0f} %)"
+        loss = f"with an error expected {100 * standing.loss:.0f} % above that of the best view"
+    return f"{loss} ({100 * standing.confidence:.0f} % sure to be within {100 * margin:.0f} % of it)"

@@ -32,7 +32,7 @@ def test_lays_that_are_not_given_take_one_line():
     turned, marked = (machined(MachinedFace("brass", "turned", 0.8, lay=lay), 850.0) for lay in (None, "u"))
     scatters = {"top": turned, "rim": marked, "plate": matt_white()}
     (line,) = lays_in_words(scatters)
-    assert line.startswith("top: lay not given") and "draw it" in line and "maps are round" in line
+    assert line.startswith("top: no lay, the direction of") and "draw it" in line and "maps omit it" in line
     (line,) = lays_in_words(scatters | {f"bore{i}": turned for i in range(40)})
     assert line.startswith("top and 40 more: ") and len(line) < 120
     assert lays_in_words({"plate": matt_white()}) == []
