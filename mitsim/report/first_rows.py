@@ -199,10 +199,10 @@ def _share(share: float) -> str:
 
 
 def _interval(ends: tuple[float | None, float | None] | None, limit: float) -> str:
-    """Return the interval of a share from that of the demand: ``22 to 130 %``."""
-    if ends is None or ends[0] is None or ends[1] is None:
+    """Return the interval of a share from that of the demand: ``22 to 130 %``; few trials leave its upper end open."""
+    if ends is None or ends[0] is None:
         return ""
-    low, high = _share(ends[0] * limit), _share(ends[1] * limit)
+    low, high = _share(ends[0] * limit), _share(math.inf if ends[1] is None else ends[1] * limit)
     return f"{low.removesuffix('%').rstrip()} to {high}"
 
 

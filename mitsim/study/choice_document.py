@@ -53,7 +53,7 @@ class CellEntry(PartialDocument):
     bias: float | None = None
     share_of_tolerance: float | None = None
     demand: float | None = None
-    demand_interval: tuple[float, float] | None = None
+    demand_interval: tuple[float | None, float | None] | None = None
     verdict: Literal["fits", "no tolerance", "not decided", "does not fit", "undecidable"] = "undecidable"
     fits_corrected: bool = False
     accepted: tuple[float | None, float] | None = None

@@ -97,6 +97,8 @@ def test_a_share_is_given_with_its_limit_and_its_interval():
     assert row.share_interval.replace("\N{NO-BREAK SPACE}", " ") == "22 to 130 %"
     far = values(share=4.0, demand=16.0, demand_interval=(8.0, 1e280)).texts()
     assert far.share_interval.endswith("over 1000\N{NO-BREAK SPACE}%")
+    few = values(share=0.61, demand=2.43, demand_interval=(0.88, None)).texts()  # of four trials
+    assert few.share_interval.replace("\N{NO-BREAK SPACE}", " ") == "22 to over 1000 %"
 
 
 @pytest.mark.parametrize(

@@ -270,10 +270,9 @@ def _stated(row: tuple[int, float, Statement]) -> CellEntry:
     decided = one.decided
     if decided is None:
         return cell
-    low, high = decided.demand_interval
     return cell.model_copy(
         update={
-            "demand_interval": (low, high) if math.isfinite(low) and high < 1e30 else None,
+            "demand_interval": tuple(json_values(decided.demand_interval)),
             "fits_corrected": decided.fits_corrected,
             "accepted": None if decided.accepted is None else tuple(json_values(decided.accepted)),
             "needed": json_values(decided.needed),

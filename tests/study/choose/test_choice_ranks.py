@@ -292,6 +292,15 @@ def test_views_are_raced_for_the_measurements_that_are_possible():
     assert possible_measurements(np.full((2, 3), np.nan), np.full((2, 3, 1), np.nan)).all()
 
 
+def test_the_interval_of_a_share_from_few_trials_is_open_and_not_left_out(candidates):
+    """The page said "below it, its own 95 % interval" above shares without one, and "not decided" without a reason."""
+    one = with_tolerances(candidates[0], 1.0)
+    cells = documented([measured(one, [0.1, 0.1, 0.1], trials=2, tolerance=1.0)]).sensors[0].measurements
+    for cell in cells.values():
+        low, high = cell.demand_interval  # of two trials the upper end is infinite, which JSON lacks
+        assert 0 < low < cell.demand and high is None
+
+
 def test_a_sensor_of_few_trials_is_called_rough(tmp_path):
     """Nine sensors in five minutes: 0.0019 mm from four virtual measurements stood in bold beside one of a hundred."""
     made = made_choice()
