@@ -273,7 +273,7 @@ def _influences(document: StatementDocument, lay_open: bool) -> list[tuple[str, 
     drawn = {group: table for group, table in document.unknowns.items() if group not in idle}
     out = [
         ("Varied", ", ".join(_names(varied) + marks * document.draws_lay)),
-        ("Sizes: 1 σ, or range", unknowns_in_words(drawn)),
+        ("Sizes (σ or range)", unknowns_in_words(drawn)),
     ]
     out += [("Fixed", ", ".join(_names(fixed)))] if fixed else []
     return [*out, ("Left out", ", ".join(missing))]

@@ -70,7 +70,7 @@ def test_no_text_overlaps_another_or_leaves_the_page(run_folder, tmp_path, rows,
     folder = shutil.copytree(run_folder, tmp_path / "run")
     with_rows(folder, rows, long)
     declaration = read_declaration(folder, read_scene_geometry(folder))
-    forms = [("Sizes: 1 σ, or range", ", ".join(f"form of the face_{k} of the housing 0.02 mm" for k in range(sizes)))]
+    forms = [("Sizes (σ or range)", ", ".join(f"form of the face_{k} of the housing 0.02 mm" for k in range(sizes)))]
     declaration = replace(declaration, facts=[*declaration.facts, *forms])
     figures = sheet_figures(declaration, read_scene_geometry(folder))
     assert len(figures) == pages
@@ -172,7 +172,7 @@ def test_a_sheet_has_what_iso_ts_15530_4_and_jcgm_101_ask_for(run_folder, tmp_pa
     declaration = read_declaration(folder, None)
     facts = dict(declaration.facts)
     assert facts["Varied"] == "noise" and facts["Fixed"] == "form" and facts["Left out"] == "coatings"
-    assert facts["Sizes: 1 σ, or range"] == "pose: placement 1 mm"
+    assert facts["Sizes (σ or range)"] == "pose: placement 1 mm"
     assert {"Part", "Sensor", "Pose of the sensor", "Method", "Calibration", "Exposure", "Decision rule"} <= set(facts)
     assert "not by a metal part with calibrated values" in facts["Verified by"]
     assert "200 virtual measurements" in facts["Method"] and "seed 7" in facts["Made with"]
@@ -338,7 +338,7 @@ def test_a_coat_is_declared_where_the_part_is_sprayed(run_folder, tmp_path, spra
     statement["unknowns"] = {"coat": {"thickness_um": [5.0, 20.0]}}
     (folder / "statement.json").write_text(json.dumps(statement), encoding="utf-8")
     facts = dict(read_declaration(folder, None).facts)
-    assert ("5 to 20 µm" in facts["Sizes: 1 σ, or range"]) == facts["Part"].endswith(", sprayed on") == shown
+    assert ("5 to 20 µm" in facts["Sizes (σ or range)"]) == facts["Part"].endswith(", sprayed on") == shown
 
 
 def test_lines_fit_and_lose_no_character():
