@@ -29,7 +29,7 @@ _NAMES = {
     "StudyFile": "mitsim.study",
     "Task": "characterisation.tasks.task_file",
     "Transform": "mitsim.sensor.transforms",
-    "Truth": "mitsim.capture.simulated.truth",
+    "Truth": "mitsim.capture.truth",
     "characterise": "mitsim.maps.use",
     "decode": "mitsim.decoding.decode",
     "label": "mitsim.study.task_measurement",
@@ -43,7 +43,7 @@ _NAMES = {
     "read_capture": "mitsim.capture.folder",
     "read_cloud": "mitsim.decoding.decode",
     "read_task": "characterisation.tasks.task_reading",
-    "read_truth": "mitsim.capture.simulated.truth",
+    "read_truth": "mitsim.capture.truth",
     "render": "mitsim.capture.simulated.render",
     "run_study": "mitsim.study.run",
     "score": "mitsim.study.session",
@@ -67,7 +67,7 @@ if TYPE_CHECKING:
     from mitsim.capture.capture import Capture
     from mitsim.capture.folder import read_capture, write_capture
     from mitsim.capture.simulated.render import load_scene, render
-    from mitsim.capture.simulated.truth import Truth, read_truth
+    from mitsim.capture.truth import Truth, read_truth
     from mitsim.decoding.decode import decode, read_cloud
     from mitsim.decoding.own_code import triangulate
     from mitsim.maps.campaign.plan import CampaignFile

@@ -38,6 +38,7 @@ from mitsim.capture.decoding import read_settings
 from mitsim.capture.npy import decode_npy
 from mitsim.capture.packed_files import SAFE_NAME, check_image, packed
 from mitsim.capture.recordings.json_fields import parsed_json
+from mitsim.capture.truth import Truth
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.png import Image, decode_png
 from mitsim.sensor.transforms import Transform
@@ -52,7 +53,7 @@ def write_capture(
     *,
     overwrite: bool = False,
     vendor: Mapping[str, bytes] | None = None,
-    truth: Mapping[str, bytes] | None = None,
+    truth: Mapping[str, Truth] | None = None,
 ) -> Path:
     """Write a capture as a folder: images as PNG, calibration, settings and pose as JSON; completely or not at all.
 
@@ -67,7 +68,7 @@ def write_capture(
     vendor
         The maker's own files by name, kept unchanged.
     truth
-        OpenEXR images by camera, see :func:`mitsim.capture.simulated.truth.encode_exr`.
+        True values by camera, from :func:`mitsim.render` or :func:`mitsim.read_truth`.
 
     Returns
     -------
@@ -84,6 +85,7 @@ def write_capture(
     See Also
     --------
     read_capture : the inverse
+    mitsim.capture.truth.read_truth : the inverse for the true values
 
     Examples
     --------

@@ -28,6 +28,7 @@ from mitsim.capture.capture import DERIVED_UNITS, Capture
 from mitsim.capture.capture_document import FRAME, SCHEMA_VERSION, UNITS, CaptureDocument
 from mitsim.capture.decoding import settings_table
 from mitsim.capture.npy import encode_npy
+from mitsim.capture.truth import FOLDER, Truth, encode_exr
 from mitsim.sensor.png import LONGEST_SIDE_PX, encode_png
 
 #: allowed names of cameras and files
@@ -39,7 +40,7 @@ def packed(
     folder: str | Path,
     *,
     vendor: Mapping[str, bytes] | None = None,
-    truth: Mapping[str, bytes] | None = None,
+    truth: Mapping[str, Truth] | None = None,
 ) -> dict[str, bytes]:
     """Return the bytes of every file of a capture's folder, by path in the folder, ``capture.json`` last.
 
@@ -48,7 +49,7 @@ def packed(
     capture, folder, vendor
         Capture to write, folder that messages name, and the maker's files by name.
     truth
-        OpenEXR images by camera.
+        True values by camera.
 
     Raises
     ------
@@ -61,7 +62,7 @@ def packed(
     """
     folder = Path(folder)
     extra = {("vendor", name): data for name, data in (vendor or {}).items()}
-    extra |= {("truth", f"{camera}.exr"): data for camera, data in (truth or {}).items()}
+    extra |= {(FOLDER, f"{camera}.exr"): encode_exr(one) for camera, one in (truth or {}).items()}
     calibration = calibration_table(capture.rig)
     pose = pose_table(capture.world_from_sensor)
     validate(folder / "calibration.json", calibration, CalibrationDocument)

@@ -105,7 +105,7 @@ def render(
     from mitsim.capture.simulated.render import render as render_capture
     from mitsim.capture.simulated.render_residual import advice, checked_rendering
     from mitsim.capture.simulated.rendering import Rendering
-    from mitsim.capture.simulated.truth import encode_exr, true_images
+    from mitsim.capture.simulated.truth import true_images
     from mitsim.scene.surface.scatter import Deviation
     from mitsim.sensor.preset import load_sensor
 
@@ -128,10 +128,7 @@ def render(
     residual, unseen = checked_rendering(capture, simulated, loaded, pose, rendering, seed)
     capture.settings["deviation"] = asdict(moved)
     capture.settings["render"] = {"digest": digest}
-    known = {}
-    if truth:
-        every = true_images(simulated, loaded, pose, samples=samples, depth=depth, seed=seed)
-        known = {name: encode_exr(one) for name, one in every.items()}
+    known = true_images(simulated, loaded, pose, samples=samples, depth=depth, seed=seed) if truth else None
     write_capture(capture, output, truth=known)
     if deviation:
         finishes = [finish for finish in loaded.finishes if finish and finish.scatter]

@@ -27,7 +27,7 @@ from mitsim.capture.folder import write_packed
 from mitsim.capture.packed_files import packed
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.capture.simulated.truth import encode_exr, true_images
+from mitsim.capture.simulated.truth import true_images
 from mitsim.maps.campaign.orders import prepared_sensor
 from mitsim.running.executor import check_same_file
 from mitsim.scene.load import Scene, load_scene
@@ -222,10 +222,9 @@ def _taken(job: CaptureJob, simulated: SimulatedSensor) -> dict[str, bytes]:
     capture.settings["deviation"] = asdict(deviation)
     about = {"scene": job.scene, "parameters": parameters, "finish": job.finish, "view": job.view}
     capture.settings["many"] = {"digest": job.digest(), **about}
-    every = (
+    truth = (
         true_images(simulated, scene, pose, samples=samples, depth=settings.depth, seed=seed) if settings.truth else {}
     )
-    truth = {name: encode_exr(image) for name, image in every.items()}
     return packed(capture, job.folder, truth=truth)
 
 

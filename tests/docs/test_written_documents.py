@@ -12,7 +12,7 @@ from characterisation.statements.statement import statement
 from characterisation.statements.tolerance import plus_minus
 from characterisation.tasks.result import Repeatability, Result
 from mitsim.capture.devices.stage_connection import BAUD
-from mitsim.capture.simulated.truth import Truth, encode_exr
+from mitsim.capture.truth import Truth, encode_exr
 from mitsim.decoding.measured_document import measured_document
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.transforms import Transform

@@ -14,7 +14,7 @@ from characterisation.cloud_files import read_cloud
 from characterisation.files.atomic_io import HOST
 from characterisation.words.progress import be_quiet, say, say_progress, track
 from mitsim.capture.folder import read_capture
-from mitsim.capture.simulated.truth import read_truth
+from mitsim.capture.truth import read_truth
 from mitsim.cli import doctor
 from tests.shell import ROOT, mitsim, mitsim_here
 from tests.smaller_sensors import coarse_sensor

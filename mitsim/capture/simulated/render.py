@@ -14,7 +14,8 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.render_residual import advice, checked_rendering
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.capture.simulated.truth import Truth, true_images
+from mitsim.capture.simulated.truth import true_images
+from mitsim.capture.truth import Truth
 from mitsim.scene import load
 from mitsim.scene.load import Scene
 from mitsim.scene.surface.scatter import NOMINAL, Deviation

@@ -13,7 +13,8 @@ import mitsim as ms
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.capture.simulated.truth import encode_exr, read_truth, true_images
+from mitsim.capture.simulated.truth import true_images
+from mitsim.capture.truth import encode_exr, read_truth
 from mitsim.decoding.matching.stereo import stereo_geometry
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
@@ -108,6 +109,17 @@ def test_the_image_keeps_every_channel(ball, tmp_path):
     for name in ("distance", "depth", "normal", "feature", "projector", "lit", "indirect"):
         kept, known = getattr(again["left"], name), getattr(ball, name)
         assert kept.dtype == known.dtype and np.array_equal(kept, known, equal_nan=True), name
+
+
+def test_a_rendered_capture_is_written_with_its_truth_and_copied_with_it(n10, tmp_path):
+    capture, truth = ms.render(ball_on_a_floor(), n10, POSE, samples=1, depth=1, check=False, truth=True)
+    ms.write_capture(capture, tmp_path / "first", truth=truth)
+    read = ms.read_truth(tmp_path / "first")
+    ms.write_capture(ms.read_capture(tmp_path / "first"), tmp_path / "copy", truth=read)
+    for folder in ("first", "copy"):
+        again = ms.read_truth(tmp_path / folder)
+        assert sorted(again) == ["left", "right"]
+        assert all(np.array_equal(again[name].depth, truth[name].depth, equal_nan=True) for name in truth)
 
 
 def test_a_folder_without_truth_and_damaged_files_are_told(ball, tmp_path):
