@@ -230,7 +230,7 @@ def parse_window(
         numbers = [float(word) for word in numbers_text.split(",")] if numbers_text.strip() else []
     except ValueError:
         numbers = [float("nan")]
-    if not name.strip() or len(numbers) not in counts or not np.isfinite(numbers).all():
+    if not name.strip() or "," in name or len(numbers) not in counts or not np.isfinite(numbers).all():
         raise InputError(option, "", repr(text), allowed)
     try:
         name = checked_name(name.strip())

@@ -106,6 +106,7 @@ def test_what_is_not_possible_ends_with_one(clouds, rng):
     [
         ((), "nothing to measure"),
         (("--plane", "top=1,2,3"), "NAME=COLUMN,ROW,WIDTH,HEIGHT"),
+        (("--plane", "1,2,30,40"), "NAME=COLUMN,ROW,WIDTH,HEIGHT"),  # before, the whole cloud was measured
         (("--plane", "top=1,2,3,x"), "NAME=COLUMN,ROW,WIDTH,HEIGHT"),
         (("--plane", "top=1,2,0,4"), "width and height over 0"),
         (("--plane", "top=1.5,2,5,4"), "whole pixels"),
