@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
+from mitsim.sensor.calibration_qualifiers import LENGTHS_MM
 
 #: longest baseline [mm] that is plausible in a unit that the file does not state. Chosen: the 1.8 cm of a RealSense
 #: D405, read in metres, are longer
@@ -17,6 +18,9 @@ _LONGEST_MM = 1500.0
 #: shortest baseline [mm] that is plausible in mm if nothing tells the unit. Chosen: rigs whose eyes stand over 40 cm
 #: apart seldom state them in cm; those of a RealSense D435 stand 50 mm apart
 _SHORTEST_MM = 40.0
+
+#: shortest baseline [mm] of a unit that the message proposes. Chosen: that of a RealSense D405 has 18 mm
+_LEAST_MM = 10.0
 
 #: tangential coefficients of a lens are smaller
 _LARGEST_TANGENTIAL = 0.02
@@ -53,7 +57,12 @@ def check_unit(where: str | Path, name: str, baseline: float, unit_mm: float | N
         return
     limits = f"{low:g} to {_LONGEST_MM:g} mm" if low else f"up to {_LONGEST_MM / (unit_mm or 1.0):g}, as in its format"
     found = f"a baseline of {baseline:.4g} in a unit that the file does not state"
-    hint = 'state it: unit: "cm" (mm, m, inch) beside the translation, or to_mm = 10 in [calibration] of a sensor file'
+    sizes = {
+        unit: size for unit, size in LENGTHS_MM.items() if _LEAST_MM <= baseline * size <= _LONGEST_MM
+    } or LENGTHS_MM
+    units = ", ".join(f'unit: "{unit}" ({baseline * size:.4g} mm)' for unit, size in sizes.items())
+    factors = ", ".join(f"{size:g}" for size in sizes.values())
+    hint = f"state it beside the translation: {units}; or in [calibration] of a sensor file as to_mm: {factors}"
     raise InputError(where, f"translation of {name}", found, f"{limits}, or a stated unit", hint)
 
 

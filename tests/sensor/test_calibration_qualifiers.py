@@ -340,9 +340,12 @@ def test_units_of_length(tmp_path):
     pair = {"K1": K, "D1": D, "K2": K2, "D2": D, "R": R}
     read = read_calibration(opencv_file(tmp_path / "a.yml", **pair, T=T), SIZE)
     assert read.notes == ()
-    for factor in (1e-3, 1e-1, 1e3):  # m, cm and um
-        with pytest.raises(InputError, match=r"baseline of .* the file does not state.*unit: \"cm\".*to_mm"):
+    for factor, unit, others in ((1e-3, "m", ("mm", "cm")), (1e-1, "cm", ("m",)), (1e3, "um", ("mm", "m"))):
+        with pytest.raises(InputError, match=r"baseline of .* the file does not state.*to_mm") as refused:
             read_calibration(opencv_file(tmp_path / "b.yml", **pair, T=T * factor), SIZE)
+        # before, cm was proposed for all: of metres that are 0.05 to 1.5, it makes less than 15 mm
+        assert f'unit: "{unit}" ({np.linalg.norm(T):.4g} mm)' in str(refused.value)
+        assert all(f'unit: "{other}"' not in str(refused.value) for other in others)
     read = read_calibration(opencv_file(tmp_path / "b.yml", **pair, T=T / 10, unit="cm"), SIZE)
     sees(read.rig.cameras["right"], K2, D, R, T)
     read = read_calibration(opencv_file(tmp_path / "c.yml", **pair, T=T / 25.4, unit="inch"), SIZE)
