@@ -299,7 +299,8 @@ def _parse(data: bytes, where: Path) -> dict[str, Any]:
 def _read_index(folder: Path) -> tuple[CaptureDocument, Path]:
     """Return the checked index of a folder, and its path; raise an InputError if it is damaged, changed or too new."""
     where = folder / "capture.json"
-    table = _parse(read_bounded(where, "a complete capture folder"), where)
+    hint = f"mitsim import {folder} -o CAPTURE makes one of a recording or of images"
+    table = _parse(read_bounded(where, "a complete capture folder", hint), where)
     version = table.get("schema_version")
     if type(version) is int and version > SCHEMA_VERSION:
         raise InputError(

@@ -303,7 +303,7 @@ def test_missing_folder_and_files(tmp_path):
     with pytest.raises(InputError, match="no such folder"):
         read_capture(tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match=r"capture\.json: found no such file"):
+    with pytest.raises(InputError, match=r"capture\.json: found no such file.* mitsim import .*empty"):
         read_capture(tmp_path / "empty")
     path = write_capture(example(), tmp_path / "c")
     (path / "images" / "right_001.png").unlink()

@@ -259,6 +259,8 @@ def _row(
     if quantity.factor > 1 and np.isfinite(real):  # symmetric: either capture may have the larger value
         margin = abs(real) * (quantity.factor - 1 if simulated >= real else 1 - 1 / quantity.factor)
     verdict, why = _verdict(simulated - real, uncertainty, margin, reasons.get(quantity.name, ""))
+    if verdict == "differs" and quantity.factor > 1 and min(real, simulated) > 0:
+        why = f"real is {two_digits(real / simulated)} times simulated, {why}"
     if verdict == "agrees" and quantity.factor > 1 and COVERAGE * uncertainty > _TOO_UNCERTAIN * abs(real):
         verdict, why = "not comparable", f"2 u is over {100 * _TOO_UNCERTAIN:.0f} % of it"
     return [

@@ -188,6 +188,8 @@ def test_a_change_shows_in_the_right_quantity(n10_module, real, specimen, change
     found = rows(compared(real, taken(changed[change], 2), specimen, n10_module))
     differing = {name for name, row in found.items() if row.verdict == "differs"}
     assert MOVED[change] <= differing
+    for name in differing & {"contrast", "finest detail", "run length", "sigma in disparity"}:  # by their ratio
+        assert f"real is {found[name].real / found[name].simulated:.2g} times simulated" in found[name].why
     others = set().union(*(names for other, names in MOVED.items() if other != change)) - MOVED[change]
     if change == "power":  # a ratio does not know it
         assert "contrast" not in differing or found["contrast"].difference < 0
