@@ -144,7 +144,8 @@ def patch_figures(image: Floats, field: SpecimenField, window_px: int) -> Floats
     inside = field.patches(field.mask)
 
     def mean_of(values: Floats, where: NDArray[np.bool_] = inside) -> Floats:
-        return np.asarray(np.where(where, values, 0.0).sum(axis=1) / where.sum(axis=1))
+        # no pixel is brighter than the median of a patch that is saturated for the larger part: no detail there
+        return np.asarray(np.where(where, values, 0.0).sum(axis=1) / np.maximum(where.sum(axis=1), 1))
 
     level, spread, near, fine = (field.patches(values) for values in (mean, deviation, near, fine))
     rising, count = np.sort(np.where(inside, near, np.inf), axis=1), inside.sum(axis=1, keepdims=True)

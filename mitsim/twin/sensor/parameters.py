@@ -158,7 +158,7 @@ FLUX = Parameter(
     spread=4.0,
     step=0.1,
     scale="inverse",
-    determined_by="a capture with the projector on",
+    determined_by="a capture with the projector on, of an even sheet",
 )
 
 CORNER_BLUR = Parameter(

@@ -124,7 +124,7 @@ def fit_sensor(
     first = groups[0][0]
     base = _check_exposure(like(first.capture, chosen, first.name), first)
     say(
-        f"{len(input_captures)} captures: "
+        f"captures: {len(input_captures)}: "
         + ", ".join(f"{g[0].name} {g[0].kind}" + (f" x {len(g)}" if len(g) > 1 else "") for g in groups)
     )
     lit = [group[0] for group in groups if group[0].kind != "dark"]

@@ -79,11 +79,11 @@ def verdict_of(agreements: tuple[DotAgreement, ...]) -> Verdict:
         return Verdict("not tested", "no capture shows dots, so nothing tests the fitted numbers against an image")
     worst = max(agreements, key=lambda agreement: (("good", "fair", "bad").index(agreement.word), agreement.reduced))
     numbers = f"chi-square {worst.chi_square:.1f} of {worst.freedom} for {worst.capture}"
-    most = f"{worst.feature} by {percent(math.expm1(worst.misfit))}"
+    most = f"{worst.feature} differs most, by {percent(math.expm1(worst.misfit))}"
     why = {
         "good": "the simulated dots agree with the recorded ones",
-        "fair": f"the dots differ a little, most their {most}; the intervals contain it",
-        "bad": f"no numbers of this file reproduce the dots; most differs their {most}. Start from another preset, or "
+        "fair": f"the dots differ a little: their {most}; the intervals contain it",
+        "bad": f"no numbers of this file reproduce the dots: their {most}. Start from another preset, or "
         "check --window, the sheet, the exposure, and that repeats differ in nothing but noise; F and sigma of this "
         "file are not those of the camera",
     }[worst.word]

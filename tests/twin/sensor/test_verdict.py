@@ -35,7 +35,7 @@ ENTRIES = {
 def test_the_verdict_follows_from_chance_and_ratio_or_the_margin_of_compare(chi_square, freedom, misfit, word):
     found = verdict_of((DotAgreement("sheet", chi_square, freedom, misfit, "sharpness"),))
     assert found.word == word
-    assert ("sharpness by " in found.why) == (word != "good")
+    assert ("their sharpness differs most, by " in found.why) == (word != "good")
 
 
 def test_the_worst_capture_decides_and_is_named():
