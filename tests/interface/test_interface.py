@@ -128,10 +128,11 @@ def test_a_rendering_that_is_noisier_than_the_sensor_or_empty_is_told(workplace)
     sensor = ms.load_sensor("small.toml")
     scene = ms.load_scene("two_pillars.xml", sensor)
     with pytest.warns(
-        UserWarning, match=r"^render noise .* of the sensor's noise.*over 0.2: about [0-9]+ samples are needed, or"
+        UserWarning,
+        match=r"^render noise .* times the sensor's noise.*about [0-9]+ samples reduce the noise to 0.2 times, or",
     ):
         capture = ms.render(scene, sensor, POSE, samples=1, depth=3)
-    with pytest.warns(UserWarning, match=r"over 0.2: about [0-9]+ samples are needed$"):
+    with pytest.warns(UserWarning, match=r"about [0-9]+ samples reduce the noise to 0.2 times$"):
         smoothed = ms.render(scene, sensor, POSE, samples=1, depth=3, smoothing_px=1.5)
     noise = [each.settings["render_residual"]["noise"] for each in (capture, smoothed)]
     # white noise of a pixel over a Gaussian of 1.5 px: a factor of 2 sqrt(pi) 1.5, less where shapes end

@@ -65,8 +65,8 @@ class RenderResidual:
         if not self.noise >= 0:
             return "render noise: not known, since no pixel is lit"
         return (
-            f"render noise {self.noise:.3f}, quadrature error {self.quadrature:.3f} of the sensor's noise; "
-            f"either exceeds it in {100 * self.outliers:.1f} % of the pixels"
+            f"render noise {self.noise:.3f} times the sensor's noise, quadrature error {self.quadrature:.3f} times; "
+            f"one of them exceeds it in {100 * self.outliers:.1f} % of the pixels"
         )
 
 
@@ -178,10 +178,10 @@ def advice(residual: RenderResidual, rendering: Rendering) -> str:
     if not residual.worst > LIMIT:
         return ""
     if not residual.noise > LIMIT:
-        return f"over {LIMIT}: increase the samples"
+        return f"more samples reduce the error to {LIMIT} times"
     needed = two_digits(rendering.samples * (residual.noise / LIMIT) ** 2)
     fewer = ", or fewer with smoothed interreflections" if rendering.indirect is None and rendering.depth > 1 else ""
-    return f"over {LIMIT}: about {needed} samples are needed{fewer}"
+    return f"about {needed} samples reduce the noise to {LIMIT} times{fewer}"
 
 
 def warn_above_limit(subject: str, residual: RenderResidual) -> RenderResidual:

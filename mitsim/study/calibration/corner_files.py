@@ -95,7 +95,8 @@ def _together(
         lacking = [eye for eye in sizes if eye not in by_eye]
         common = sorted(set.intersection(*[set(by_eye[eye]) for eye in sizes])) if not lacking else []
         if len(common) < _LEAST_CORNERS:
-            why = f"no board in {', '.join(lacking)}" if lacking else f"{len(common)} corners that all cameras see"
+            few = f"{len(common)} of at least {_LEAST_CORNERS} corners that all cameras see"
+            why = f"no board in {', '.join(lacking)}" if lacking else few
             left_out.append(f"{pose}: {why}")
             continue
         pixels = {eye: np.array([by_eye[eye][corner] for corner in common]) for eye in sizes}
