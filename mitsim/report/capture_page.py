@@ -81,7 +81,8 @@ def capture_figure(real: Shown, simulated: Shown) -> Figure:
             field.set_facecolor(FIELD)
             for panel in (image, field):
                 panel.set(xticks=[], yticks=[])
-        colour_scale(figure, drawn, axes[1].tolist(), "residual along V [mm]")
+        # the residuals stay below their image
+        colour_scale(figure, drawn, axes[1].tolist(), "residual along V [mm]", panchor=False)
         _histograms(axes[2, 0], sides)
         _statuses(axes[2, 1], sides)
     return figure
