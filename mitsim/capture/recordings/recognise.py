@@ -185,11 +185,12 @@ def _kind_of_folder(path: Path, sensor: str | None, calibration: str | None) -> 
     described = [file for file in _down_to(path, 1) if file.is_file()]
     if described and all(file.suffix.lower() in _DESCRIPTIONS for file in described):
         raise _no_recording(path, described[0])
+    entries = [entry.name + "/" * entry.is_dir() for entry in _down_to(path, 1)]
     alone = next((file.name for file in _down_to(path, 1) if file.suffix.lower() in _RECORDED_ALONE), None)
     raise InputError(
         path,
         "",
-        f"a folder with {', '.join(top[:4]) or 'nothing in it'}",
+        f"a folder with {', '.join(entries[:4]) or 'nothing in it'}",
         "a recording of an Ensenso, of DepthAI or ROS; or images, with --sensor or --calibration",
         "" if alone is None else f"name the recording in it: {path / alone}",
     )

@@ -345,3 +345,13 @@ def test_a_folder_around_a_recording_says_what_to_name(tmp_path):
     (tmp_path / "camera.zip").write_bytes(b"PK\x03\x04")
     with pytest.raises(InputError, match=r"name the recording in it: .*camera\.zip"):
         kind_of(tmp_path)
+
+
+def test_a_folder_that_is_no_recording_is_told_by_the_names_in_it(tmp_path):
+    """Before, names were in small letters, and a folder of folders had "nothing in it"."""
+    (tmp_path / "Frames").mkdir()
+    with pytest.raises(InputError, match=r"found a folder with Frames/; allowed: a recording"):
+        read_recording(tmp_path, ReadOptions())
+    (tmp_path / "CamA.png").touch()
+    with pytest.raises(InputError, match=r"found a folder with CamA\.png, Frames/; allowed: a recording"):
+        read_recording(tmp_path, ReadOptions())
