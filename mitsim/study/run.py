@@ -162,6 +162,7 @@ def run_within(
         for name, share in faces_in_sight(session.predictor, study.scene, study.view(number).world_from_sensor).items()
         if name in study.task.shapes
     }
+    lacks = lacking(study, scores, measured.raced, stated, measured.tried, limit)
     write_record(
         session,
         performance_map,
@@ -174,8 +175,8 @@ def run_within(
         view_sets=[] if measured.chosen is None else [_set_record(study, measured.chosen, measured.tried)],
         remedies=None if measured.remedies is None else remedies_document(measured.remedies),
         seconds=clock.steps,
-        lacks=lacking(study, scores, measured.raced, stated, measured.tried, limit),
-        finished=not limit.over(),
+        lacks=lacks,
+        finished=not lacks and not limit.over(),
     )
     return [] if stated is None else stated.statements
 

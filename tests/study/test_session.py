@@ -19,6 +19,7 @@ from mitsim.study.run import run_study, run_within
 from mitsim.study.run_folder import read_run
 from mitsim.study.session import Session
 from mitsim.study.statement_document import statement_document
+from mitsim.study.time_plan import TimePlan
 from mitsim.study.virtual import stated as state
 from mitsim.study.virtual.screening import effects_of
 from mitsim.study.virtual.stated import BATCH, MOST, TrialsOfView, batches
@@ -207,6 +208,18 @@ def test_a_run_within_a_limit_says_what_it_lacks_and_goes_on_without_one(study, 
     assert whole[0].trials == 2 and about.finished and not about.lacks
     with pytest.raises(InputError, match="finished run"):
         keep_finished(tmp_path / "other", False, "run.json")
+
+
+def test_a_run_that_kept_its_time_for_the_page_goes_on_with_the_same_command(study, tmp_path, monkeypatch):
+    """It ends before its limit, without a statement. Before, it said "The same command goes on", and was refused."""
+    monkeypatch.setattr(TimePlan, "closing", lambda *_: True)
+    rules = {"race": RaceTable(shortlist=1, trials=4), "statement": StatementTable(trials=2)}
+    limited = TimeLimit(3600.0)
+    run_within(replace(study, file=study.file.model_copy(update=rules)), tmp_path, limited)
+    assert not limited.over()
+    about = read_run(tmp_path).about
+    assert "no statement of uncertainty" in about.lacks and not about.finished
+    keep_finished(tmp_path, False, "run.json")  # no error
 
 
 def test_a_map_of_ones_own_is_still_there_when_workers_and_changes_open_the_study_again(tmp_path):
