@@ -169,6 +169,8 @@ def _stepped(tree: dict[str, Any], name: str) -> tuple[str, Any, dict[str, Any]]
     parts = [name] if name in tree else name.split(".")
     written = []
     for part in parts:
+        if isinstance(table, list):  # of cameras, say: a number steps into it
+            table = {str(index): value for index, value in enumerate(table)}
         if not isinstance(table, dict):
             return name, None, {}
         holder = table

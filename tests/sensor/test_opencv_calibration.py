@@ -82,11 +82,13 @@ def test_metres_become_millimetres(tmp_path):
     np.testing.assert_allclose(centre, -R.T @ T, atol=1e-9)
 
 
-def test_names_can_be_mapped_and_plain_lists_are_read(tmp_path):
+@pytest.mark.parametrize("beamer", ["beamer", "rig.0"])  # in a map, or in a list
+def test_names_can_be_mapped_and_plain_lists_are_read(tmp_path, beamer):
     names = {
         "optics": {"cam": K.tolist(), "dist": D.tolist(), "size": [640, 480]},
         "beamer": {"K": KP.tolist(), "size": [912, 570], "pose": {"R": R.tolist(), "t": T.tolist()}},
     }
+    names["rig"] = [names["beamer"]]
     (tmp_path / "rig.json").write_text(json.dumps(names), encoding="utf-8")
     table = """file = "rig.json"
 [calibration.keys.camera]
@@ -98,7 +100,7 @@ matrix = "beamer.K"
 size = "beamer.size"
 rotation = "beamer.pose.R"
 translation = "beamer.pose.t"
-"""
+""".replace("beamer.", f"{beamer}.")
     (tmp_path / "my.toml").write_text(sensor_text(table), encoding="utf-8")
     rig = load_sensor(tmp_path / "my.toml").rig
     np.testing.assert_array_equal(rig.cameras["camera"].distortion, D)
