@@ -78,7 +78,7 @@ def draw_scene(scene: Any, names: tuple[str, ...], bounds: Floats, ax: Any, pose
         scale_bar(axes, (extent[0], bottom), length, f"{length:g} mm", 0.015 * (extent[1] - extent[0]))
         _directions(axes, frame, (extent[1], bottom), 0.09 * (extent[1] - extent[0]))
         hidden = len(names) - len(np.unique(shape[shape >= 0]))
-        view = "from the front and above" if pose is None else "as the sensor sees it, to scale"
+        view = "from the front and above" if pose is None else "as the sensor sees them, to scale"
         if ax is None:
             across, tall = np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())
             figure_of(axes).set_figheight(min(_WIDTH_IN * tall / across, 9.0) + 0.4)
