@@ -131,7 +131,8 @@ def parse_board(text: str) -> Board:
     if grade not in GRADES:
         raise InputError("--board", "grade", repr(grade), ", ".join(GRADES), nearest(grade, list(GRADES)))
     if not (columns % 1 == 0 and rows % 1 == 0 and 4 <= columns <= 30 and 4 <= rows <= 30 and 0.5 <= square <= 500):
-        raise InputError("--board", "", repr(text), "4 to 30 squares a side, of 0.5 to 500 mm")
+        hint = "squares are one more than inner corners, along either side"
+        raise InputError("--board", "", repr(text), "4 to 30 squares a side, of 0.5 to 500 mm", hint)
     return Board(int(columns), int(rows), square, grade)
 
 

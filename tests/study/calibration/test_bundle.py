@@ -70,7 +70,7 @@ def test_boards_are_read_from_a_command_line():
     for bad, message in (
         ("11x8:glass", "COLUMNSxROWS"),
         ("11x8x30:glas", "did you mean 'glass'"),
-        ("2x8x30:glass", "4 to 30"),
+        ("2x8x30:glass", "4 to 30.*one more than inner corners"),
         ("11x8xa:glass", "COLUMNS"),
     ):
         with pytest.raises(InputError, match=message):
