@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -162,3 +163,10 @@ def test_a_measurement_that_hardly_any_world_makes_is_in_no_mean_of_regrets(case
     judged = {one.measurement: one.judged for one in choices_of(found[0])}
     assert judged == {NAMES[0]: False} | dict.fromkeys(NAMES[1:], True)
     assert page.read_text().count(f"{NAMES[0]} (not judged)") == 1
+
+
+def test_the_trials_that_come_with_the_cases_are_as_they_were_written():
+    files = sorted((Path(__file__).parents[2] / "scenes" / "parts" / "measured").glob("*.nc"))
+    assert len(files) >= 29
+    for path in files:
+        assert take_up_trials(path, {}) == {}  # refuses a file that was changed since
