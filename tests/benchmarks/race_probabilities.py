@@ -62,7 +62,7 @@ def print_kurtosis(cases: list[PartCase]) -> None:
             for m, name in enumerate(trials.measurements):
                 shown = []
                 for view in range(case.file.candidates):
-                    made = [trial for trial in trials.known(view) if not trial.capture and not trial.swapped]
+                    made = [trial for trial in trials.known(view) if not trial.capture]
                     one = trials.errors(view, made)[m] if made else np.empty(0)
                     square = one[np.isfinite(one)] ** 2
                     if len(square) >= 100:
