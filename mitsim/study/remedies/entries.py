@@ -127,9 +127,11 @@ def _unsolved(remedies: RemediesEntry, name: str) -> tuple[str, str]:
         return name, ""
     demand, best = min(rows, key=lambda row: math.inf if math.isnan(row[0]) else row[0])
     helps = math.isfinite(demand) and (measurement.demand is None or demand < measurement.demand)
-    nearest = best.measurements[name].standard_uncertainty if helps else measurement.standard_uncertainty
-    needed = "" if measurement.needed is None else f", {_plain(measurement.needed, measurement.unit)} needed"
-    told = name if nearest is None else f"{name} (u {_plain(nearest, measurement.unit)}{needed})"
+    before, unit = measurement.standard_uncertainty, measurement.unit
+    nearest = best.measurements[name].standard_uncertainty if helps else before
+    was = f", before {_plain(before, unit)}" if helps and before is not None else ""
+    needed = "" if measurement.needed is None else f", {_plain(measurement.needed, unit)} needed"
+    told = name if nearest is None else f"{name} (u {_plain(nearest, unit)}{was}{needed})"
     if best.measurements[name].verdict == "not decided" and demand <= 1:
         return told, f"perhaps {best.words}, not decided by {best.trials} virtual measurements"
     if len(rows) == 1:

@@ -199,7 +199,8 @@ def test_the_nearest_of_insufficient_changes_is_named() -> None:
     lines = remedies_in_words(
         RemediesEntry.model_validate(remedies_document(find_remedies(missed("a"), [far.change, near.change], 40)))
     )
-    assert lines == ["a (u 0.40 mm, 0.12 mm needed): none of 2 changes tried suffices; nearest is with spray"]
+    a = "a (u 0.40 mm, before 0.80 mm, 0.12 mm needed)"
+    assert lines == [f"{a}: none of 2 changes tried suffices; nearest is with spray"]
     worse, worst = Fake("view", ("a",), a=0.9), Fake("spray", ("a",), a=1.4)
     lines = remedies_in_words(
         RemediesEntry.model_validate(remedies_document(find_remedies(missed("a"), [worse.change, worst.change], 40)))
