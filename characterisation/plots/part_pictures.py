@@ -13,7 +13,7 @@ from characterisation.files.arrays import Floats
 #: share of its colour that remains on the edge of a shape
 EDGE_SHADE = 0.55
 
-#: number of pixels of boxes around triangles that are tested at once
+#: number of pixels of boxes around triangles that are tested at once; chosen
 _AT_ONCE = 1 << 20
 
 

@@ -112,16 +112,6 @@ class ExpectedPoints:
     shared: Floats | None = None
     shown: Floats | None = None
 
-    @property
-    def count(self) -> float:
-        """Return the expected number of points."""
-        return float(self.fraction.sum() * self.thinning)
-
-    @property
-    def mean_sigma(self) -> float:
-        """Return the mean of sigma over the expected points [mm]; NaN where there are none."""
-        return float(np.average(self.sigma, weights=self.fraction)) if len(self.sigma) else math.nan
-
 
 @dataclass(frozen=True)
 class ExpectedFit:

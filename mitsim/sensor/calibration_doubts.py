@@ -20,7 +20,7 @@ _LONGEST_MM = 1500.0
 _SHORTEST_MM = 40.0
 
 #: shortest baseline [mm] of a unit that the message proposes. Chosen: that of a RealSense D405 has 18 mm
-_LEAST_MM = 10.0
+_SHORTEST_PROPOSED_MM = 10.0
 
 #: tangential coefficients of a lens are smaller
 _LARGEST_TANGENTIAL = 0.02
@@ -58,7 +58,7 @@ def check_unit(where: str | Path, name: str, baseline: float, unit_mm: float | N
     limits = f"{low:g} to {_LONGEST_MM:g} mm" if low else f"up to {_LONGEST_MM / (unit_mm or 1.0):g}, as in its format"
     found = f"a baseline of {baseline:.4g} in a unit that the file does not state"
     sizes = {
-        unit: size for unit, size in LENGTHS_MM.items() if _LEAST_MM <= baseline * size <= _LONGEST_MM
+        unit: size for unit, size in LENGTHS_MM.items() if _SHORTEST_PROPOSED_MM <= baseline * size <= _LONGEST_MM
     } or LENGTHS_MM
     units = ", ".join(f'unit: "{unit}" ({baseline * size:.4g} mm)' for unit, size in sizes.items())
     factors = ", ".join(f"{size:g}" for size in sizes.values())

@@ -121,17 +121,18 @@ def test_a_table_of_long_names_is_legible_and_has_its_head_on_each_page(run_fold
     assert all("Tolerance" in page for page in texts) and "Sensor" not in texts[0] and "Sensor" in texts[1]
 
 
+def with_rows_of(folder, *changes):
+    """Give a run a row distance_K for each change of its statement."""
+    with_rows(folder, len(changes))
+    statement = json.loads((folder / "statement.json").read_text(encoding="utf-8"))
+    rows = zip(statement["measurements"].values(), changes, strict=True)
+    statement["measurements"] = {f"distance_{k}": one | change for k, (one, change) in enumerate(rows)}
+    (folder / "statement.json").write_text(json.dumps(statement), encoding="utf-8")
+
+
 def test_notes_on_some_rows_mark_them_and_have_the_names_elsewhere(run_folder, tmp_path):
     folder = shutil.copytree(run_folder, tmp_path / "run")
-    with_rows(folder, 3)
-    statement = json.loads((folder / "statement.json").read_text(encoding="utf-8"))
-    one, other, third = statement["measurements"].values()
-    statement["measurements"] = {
-        "distance_0": one | {"settled": False, "errors_of": AT_THE_LIMIT},
-        "distance_1": other | {"settled": True},
-        "distance_2": third | {"settled": False},
-    }
-    (folder / "statement.json").write_text(json.dumps(statement), encoding="utf-8")
+    with_rows_of(folder, {"settled": False, "errors_of": AT_THE_LIMIT}, {"settled": True}, {"settled": False})
     declaration = read_declaration(folder, None)
     notes = {note.mark: note.in_full for note in declaration.notes if note.mark}
     assert notes["*"].startswith("distance_0 and distance_2: not settled after JCGM 101")
@@ -143,15 +144,8 @@ def test_notes_on_some_rows_mark_them_and_have_the_names_elsewhere(run_folder, t
 def test_a_sheet_says_how_rough_a_number_of_few_virtual_measurements_is(run_folder, tmp_path):
     """It stated u and a verdict of four virtual measurements without a word; the page of a comparison warned."""
     folder = shutil.copytree(run_folder, tmp_path / "run")
-    with_rows(folder, 3)
-    statement = json.loads((folder / "statement.json").read_text(encoding="utf-8"))
-    one, other, third = statement["measurements"].values()
-    statement["measurements"] = {
-        "distance_0": one | {"trials": 8, "without_value": 0.5},
-        "distance_1": other | {"trials": 200, "without_value": 0.1},
-        "distance_2": third | {"trials": 10, "without_value": 0.0},
-    }
-    (folder / "statement.json").write_text(json.dumps(statement), encoding="utf-8")
+    rows = [(8, 0.5), (200, 0.1), (10, 0.0)]
+    with_rows_of(folder, *({"trials": trials, "without_value": lost} for trials, lost in rows))
     notes = [note.in_full for note in read_declaration(folder, None).notes]
     # the 2.5 % points of chi-square of 3 and 9 degrees are 0.216 and 2.700
     assert "distance_0: 4 virtual measurements only: standard uncertainties may be 3.7 times as large." in notes

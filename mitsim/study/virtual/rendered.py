@@ -34,6 +34,7 @@ from characterisation.tasks.task_file import Task
 from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.exposing import LightOnImagers
 from mitsim.capture.simulated.image_motion import image_motion, moved_images
+from mitsim.capture.simulated.indirect_light import IndirectLight
 from mitsim.capture.simulated.kept_light import KeptLight, can_be_kept, keep_light
 from mitsim.capture.simulated.render_residual import RenderResidual, residual_of
 from mitsim.capture.simulated.rendering import IndirectImages, Rendering
@@ -186,14 +187,11 @@ class RenderedMeasurements:
         }
         images = self._indirect(sensor, scene, pose, view, drawn, shared)
         images = {name: moved_images(stack, motions.get(name)) for name, stack in images.items()}
-        settings = self.rendering.indirect_settings
-        assert settings is not None  # rendering_of a study
-        indirect = IndirectImages(images, shared.rois, settings, self.rendering.depth)
         room = {}
         for name, surfaces in shared.seen.items():
             image = moved_images(surfaces.room_radiance(albedos)[None], motions.get(name))[0]
             room[name] = sensor.apply_lens(image, name, shared.rois[name])
-        light = sensor.light(scene, true, seed=drawn.seed, rendering=replace(self.rendering, indirect=indirect))
+        light = sensor.light(scene, true, seed=drawn.seed, rendering=self._with_indirect(images, shared.rois))
         if self.study.sensor.room is None:
             exposures = exposures_in_room(self.study.sensor, light.exposures, view.standoff, drawn.room)
             light = replace(light, exposures=exposures)
@@ -209,8 +207,7 @@ class RenderedMeasurements:
         """Return the errors of the light of a view's trials, at the best estimates, in its first camera."""
         best = replace(self.unknowns, varied=()).draw(Trial(0))
         camera, simulated, pose = next(iter(self.study.sensor.rig.cameras)), self.simulated, view.world_from_sensor
-
-        rois = {camera: self._view_light(view).rois[camera]}
+        rois = {camera: regions(simulated, pose.inverse(), self.corners, self.turned_corners)[camera]}
 
         def radiance(offset: int, finer: int) -> NDArray[np.float32]:
             other = self.rendered_as(self.rendering.finer(finer))
@@ -218,10 +215,7 @@ class RenderedMeasurements:
             shared = ViewLight(rois, {}, other._kept(simulated, pose, view, rois) if self._keeps_paths else {})
             scene, _ = self.part.in_finish(best.finish)  # after the paths are kept, which tries other finishes
             images = other._indirect(simulated, scene, pose, view, best, shared)
-            settings = other.rendering.indirect_settings
-            assert settings is not None  # rendering_of a study
-            indirect = IndirectImages(images, rois, settings, self.rendering.depth)
-            rendering = replace(other.rendering, indirect=indirect)
+            rendering = other._with_indirect(images, rois)
             return simulated.radiance(scene, pose, camera, rendering, seed=other.unknowns.seed, roi=rois[camera])
 
         return residual_of(radiance, self.study.sensor)
@@ -286,6 +280,17 @@ class RenderedMeasurements:
     def _keeps_paths(self) -> bool:
         return self.rendering.depth > 1 and self.rendering.kept is not None and can_be_kept(self.study.scene)
 
+    @property
+    def _indirect_settings(self) -> IndirectLight:
+        settings = self.rendering.indirect_settings
+        assert settings is not None  # rendering_of a study
+        return settings
+
+    def _with_indirect(self, images: dict[str, NDArray[np.float32]], rois: dict[str, Roi]) -> Rendering:
+        """Return the settings for the other light of a draw whose interreflections are rendered."""
+        indirect = IndirectImages(images, rois, self._indirect_settings, self.rendering.depth)
+        return replace(self.rendering, indirect=indirect)
+
     def _shared(self, simulated: SimulatedSensor, pose: Transform, view: View, keeps_paths: bool) -> ViewLight:
         """Return regions and seen surfaces from a pose of a view, and the paths of interreflections."""
         scene = self.study.scene
@@ -312,8 +317,6 @@ class RenderedMeasurements:
         shared: ViewLight,
     ) -> dict[str, NDArray[np.float32]]:
         """Return the interreflections (P, h, w) of a draw by camera: on the kept paths, or rendered from a pose."""
-        settings = self.rendering.indirect_settings
-        assert settings is not None  # rendering_of a study
         images = {}
         for index, (name, roi) in enumerate(shared.rois.items()):
             if self.rendering.depth == 1:
@@ -324,7 +327,7 @@ class RenderedMeasurements:
                 seed = drawn.seed if self.separate_light else self.unknowns.seed
                 seed = _seed_of(seed, view.number, drawn.finish + 1, index)
                 images[name] = simulated.indirect_radiance(
-                    scene, pose, name, settings, seed=seed, depth=self.rendering.depth, roi=roi
+                    scene, pose, name, self._indirect_settings, seed=seed, depth=self.rendering.depth, roi=roi
                 )
         return images
 
