@@ -53,8 +53,9 @@ _MOST_PIXELS = 400_000
 #: with 16 times as many paths differ from one another as much as from these
 _KEPT_MATCHER = KeptSettings(49, 4.0, 40, 1.5, _MOST_PIXELS)
 
-#: the same for fringes and time of flight. Render noise 0.44 to 0.99 of the sensor's (David), by the same benchmark
-_KEPT = KeptSettings(16, 4.0, 8, 2.5, _MOST_PIXELS)
+#: the same for fringes and time of flight, with more of them: their noise is common to all trials of a view, and with a
+#: quarter of them u of the angle between sprayed pillars (Zivid) scattered by 1.6 from one set of paths to another
+_KEPT = KeptSettings(64, 4.0, 32, 2.5, _MOST_PIXELS)
 
 #: rays per pixel of direct light for fringes. Root mean square error 0.03 (PhoXi), 0.09 (David) and 0.08 (Zivid) of the
 #: sensor's noise, but for the hundredth of the pixels at edges: tests/benchmarks/direct_samples.py
@@ -65,11 +66,15 @@ _FRINGE_SAMPLES = 4
 _SAMPLES = 16
 
 
-#: factor by which the race has fewer paths of interreflections: most of its views get one or two trials, and tracing
-#: all paths of a view takes as long as six to ten trials. With this factor, errors of trials change by 0.02 to 0.41 of
-#: their root mean square, and the smallest, of the angle between pillars with fringes, by 0.3 to 0.8; the root mean
-#: square of 12 trials is 0.7 to 1.46 of that with all paths, median 1.0: tests/benchmarks/race_paths.py
-_FEWER_IN_RACE = 4
+#: factor by which the race of a matcher has fewer paths of interreflections: most of its views get one or two trials,
+#: and tracing all paths of a view takes as long as six to ten trials. With this factor, errors of trials change by 0.02
+#: to 0.41 of their root mean square; the root mean square of 12 trials is 0.7 to 1.46 of that with all paths, median
+#: 1.0: tests/benchmarks/race_paths.py
+_FEWER_OF_MATCHER_IN_RACE = 4
+
+#: the same for fringes and time of flight, whose errors react more: by 0.3 to 0.8 of the smallest, of the angle between
+#: pillars
+_FEWER_IN_RACE = 16
 
 
 def rendering_of(study: Study) -> Rendering:
@@ -98,9 +103,9 @@ def race_rendering(study: Study) -> Rendering:
     rendering = rendering_of(study)
     kept = rendering.kept
     assert kept is not None  # of every study
-    side = math.isqrt(kept.samples // _FEWER_IN_RACE)  # of the square of samples in a pixel
-    fewer = replace(kept, samples=side**2, kept=kept.kept // _FEWER_IN_RACE)
-    return replace(rendering, kept=fewer)
+    fewer = _FEWER_OF_MATCHER_IN_RACE if isinstance(study.sensor.settings, MatcherSettings) else _FEWER_IN_RACE
+    side = math.isqrt(kept.samples // fewer)  # of the square of samples in a pixel
+    return replace(rendering, kept=replace(kept, samples=side**2, kept=kept.kept // fewer))
 
 
 def measured_by(study: Study) -> str:
