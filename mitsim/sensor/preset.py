@@ -13,8 +13,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from characterisation.files.documents import Document, Name, missing_error, missing_keys, read_toml_table, validate
+from characterisation.files.documents import Document, Name, missing_error, missing_keys, validate
 from characterisation.files.errors import InputError, nearest
+from characterisation.files.toml_tables import read_toml_table
 from characterisation.words.progress import say
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.exposure import exposure_policy

@@ -22,8 +22,9 @@ import numpy as np
 from pydantic import Field
 
 from characterisation.files.checked_files import read_bounded
-from characterisation.files.documents import Document, read_toml_table, validate
+from characterisation.files.documents import Document, validate
 from characterisation.files.errors import InputError
+from characterisation.files.toml_tables import read_toml_table
 from mitsim.capture.calibration import CalibrationDocument, rig_of
 from mitsim.capture.recordings.depthai_calibration import is_depthai_calibration, read_depthai_calibration
 from mitsim.capture.recordings.json_fields import parsed_json

@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from characterisation.files.documents import read_toml_table
 from characterisation.files.errors import InputError
+from characterisation.files.toml_tables import read_toml_table
 from mitsim.capture.exr import EXR_MAGIC
 from mitsim.capture.npy import NPY_MAGIC
 from mitsim.capture.recordings.recording_files import BAG_MAGIC, MCAP_MAGIC, SQLITE_MAGIC
