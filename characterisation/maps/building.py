@@ -23,7 +23,8 @@ import xarray as xr
 
 from characterisation.files.arrays import Floats
 from characterisation.maps.light import Light, light_variables
-from characterisation.maps.performance_map import SCHEMA_VERSION, PerformanceMap
+from characterisation.maps.map_file import SCHEMA_VERSION
+from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.pooled_offsets import pool_offsets
 from characterisation.maps.pooling import pool
 

@@ -20,70 +20,27 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from characterisation.files.arrays import Floats
-from characterisation.files.atomic_io import write_netcdf
 from characterisation.files.checked_files import dataset_digest
-from characterisation.files.datasets import Schema, Variable, read_dataset
 from characterisation.files.errors import InputError
-from characterisation.lambert_projection import inverse_lambert_projection, lambert_projection
-from characterisation.maps.lay import LAY_FIELDS, LAY_NODES, between_directions, directions_of
-from characterisation.maps.lay import SCHEMA as LAY_SCHEMA
-from characterisation.maps.light import SCHEMA as LIGHT_SCHEMA
+from characterisation.lambert_projection import inverse_lambert_projection
+from characterisation.maps.lay import between_directions, directions_of
 from characterisation.maps.light import Light, lights_of
+from characterisation.maps.map_file import read_map, write_map
 from characterisation.maps.samples import Samples
 from characterisation.maps.tables import FIELDS, Surface, between_samples
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = [
-    "Performance",
-    "PerformanceMap",
-    "inverse_lambert_projection",
-    "lambert_projection",
-]
-
-#: version of the files
-SCHEMA_VERSION = 2
-
-#: bits of the mantissa of values that a compact file keeps: relative errors of at most 2^-11
-VALUE_BITS = 10
-
-#: bits of the mantissa of errors that a compact file keeps: relative errors of at most 2^-6
-ERROR_BITS = 5
-
 #: largest difference from 1 of the length of a normal; chosen: rounding to four digits stays below
 UNIT_TOLERANCE = 1e-3
-
-_NODES = ("sample", "distance", "b", "a")
-
-_ROUNDED_FINELY = (*FIELDS[:2], *(LAY_FIELDS[name] for name in FIELDS[:2]))
-
-_SCHEMA = Schema(
-    "a performance map (map.nc) made by mitsim map make",
-    {
-        **{
-            name: Variable(_NODES, low=0.0, high=1e9, gaps=True, needed=name in FIELDS[:4])
-            for name in (*FIELDS, "false_fraction", "patches", "noise_area", "persistent_share")
-        },
-        "recovered_fraction": Variable(_NODES, low=0.0, high=1.0 + 1e-6, gaps=True),
-        "bias_share": Variable(_NODES, low=-1e9, high=1e9, gaps=True, needed=False),
-        "finish": Variable(("sample",), "text"),
-        "roughness": Variable(("sample",), low=1e-6, high=1e6, gaps=True),
-        "distance": Variable(("distance",), low=1e-3, high=1e9),
-        "a": Variable(("a",), low=-2.0, high=2.0),
-        "b": Variable(("b",), low=-2.0, high=2.0),
-        **LIGHT_SCHEMA,
-        **LAY_SCHEMA,
-    },
-    {"sample": (1, 10_000), "distance": (1, 10_000), "a": (2, 10_000), "b": (2, 10_000), "lay": (2, 180)},
-)
 
 
 @dataclass(frozen=True)
@@ -309,26 +266,13 @@ class PerformanceMap:
         path
             Path of the file.
         compact
-            Compress the file, after rounding values to ``VALUE_BITS`` and errors to ``ERROR_BITS`` of the mantissa
-            (Zender, Geosci. Model Dev. 9 (2016) 3199-3211; rounded to nearest). Such a file is read like any other.
+            Compress the file, after rounding as :func:`characterisation.maps.map_file.write_map` does.
 
         See Also
         --------
         load : the inverse
         """
-        data = self.data
-        # most samples of a map have no lay, and NaN there
-        encoding: dict[str, dict[str, Any]] = {
-            name: {"zlib": True, "complevel": 1} for name in LAY_FIELDS.values() if name in data
-        }
-        if compact:
-            data = data.copy()
-            for name, values in self.data.data_vars.items():
-                if values.dims in (_NODES, LAY_NODES):
-                    bits = VALUE_BITS if name in _ROUNDED_FINELY else ERROR_BITS
-                    data[name] = (values.dims, _rounded(values.values, bits), values.attrs)
-                    encoding[str(name)] = {"zlib": True, "complevel": 9, "shuffle": True}
-        write_netcdf(data, path, encoding)
+        write_map(self.data, path, compact)
 
     @staticmethod
     def load(path: str | Path) -> PerformanceMap:
@@ -339,14 +283,7 @@ class PerformanceMap:
         InputError
             If the file is missing, damaged, not a performance map, or has another schema.
         """
-        path = Path(path)
-        data = read_dataset(path, _SCHEMA)
-        version = data.attrs.get("schema_version")
-        if str(version) != str(SCHEMA_VERSION):
-            hint = "read it with the version of mitsim that wrote it"
-            raise InputError(path, "schema_version", repr(version), str(SCHEMA_VERSION), hint)
-        _check_axes(path, data)
-        return PerformanceMap(data)
+        return PerformanceMap(read_map(path))
 
 
 def _matched(distance: Floats, normals: NDArray[np.floating]) -> tuple[Floats, NDArray[np.floating]]:
@@ -363,36 +300,3 @@ def _matched(distance: Floats, normals: NDArray[np.floating]) -> tuple[Floats, N
         found, allowed = f"{normals[off][0].tolist()}, and {off.sum() - 1} more", "vectors of length 1"
         raise InputError("query", "normals", found, allowed, "divide them by their length")
     return np.broadcast_to(distance, shape), np.broadcast_to(normals, (*shape, 3))
-
-
-def _check_axes(path: Path, data: xr.Dataset) -> None:
-    """Reject a map whose distances do not increase, or whose nodes are not equally spaced on both axes."""
-    distance, a, b = (data[name].values.astype(float) for name in ("distance", "a", "b"))
-    if (np.diff(distance) <= 0).any():
-        raise InputError(path, "distance", "distances that do not increase", "increasing distances [mm]")
-    step = np.diff(a)
-    if len(a) != len(b) or not np.allclose(a, b, atol=1e-6) or not (step > 0).all() or np.ptp(step) > 1e-3 * step[0]:
-        allowed = "equally spaced nodes, the same for a and b"
-        raise InputError(path, "a", "nodes that are unequally spaced or differ from those of b", allowed)
-    if "lay" in data.dims:
-        lays = data["lay"].values.astype(float) if "lay" in data.variables else np.full(1, np.nan)
-        if not np.allclose(lays, np.arange(len(lays)) * 180.0 / len(lays), atol=1e-6):
-            raise InputError(path, "lay", f"directions of {lays} deg", "equally spaced directions, 0 to 180 deg")
-    roughness, finish, lights = data["roughness"].values, data["finish"].values, lights_of(data)
-    if len({(name, str(ra), str(light)) for name, ra, light in zip(finish, roughness, lights, strict=True)}) < len(
-        finish
-    ):
-        raise InputError(path, "finish", "a finish and Ra twice", "each sample once")
-    for name in data["finish"].values:
-        if len({math.isnan(ra) for ra in roughness[finish == name]}) > 1:
-            raise InputError(
-                path, "roughness", f"{name} with and without Ra", "all samples of a finish with Ra, or all without"
-            )
-
-
-def _rounded(values: NDArray[np.floating], bits: int) -> NDArray[np.float32]:
-    """Return floats rounded to nearest with ``bits`` of the 23 bits of the mantissa, the rest 0."""
-    whole = np.ascontiguousarray(values, np.float32)
-    drop = 23 - bits
-    kept = ((whole.view(np.uint32) + np.uint32(1 << (drop - 1))) >> np.uint32(drop)) << np.uint32(drop)
-    return np.where(np.isfinite(whole), kept.view(np.float32), np.float32(np.nan))

@@ -21,7 +21,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from characterisation.maps.performance_map import PerformanceMap, lambert_projection
+from characterisation.lambert_projection import lambert_projection
+from characterisation.maps.performance_map import PerformanceMap
 from characterisation.plots.discs import disc_image, disc_view, noise_limits, plain_log_ticks
 from characterisation.plots.style import FIELD, NOISE, SEQUENTIAL, drawing
 from characterisation.words.numbers import count, finish_name

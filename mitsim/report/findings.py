@@ -14,7 +14,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.files.arrays import Floats
-from characterisation.maps.performance_map import PerformanceMap, inverse_lambert_projection
+from characterisation.lambert_projection import inverse_lambert_projection
+from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud, Status
 from characterisation.words.numbers import finish_name, quantity, rounded, two_digits
 

@@ -22,7 +22,8 @@ import xarray as xr
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import map_coordinates
 
-from characterisation.maps.performance_map import PerformanceMap, lambert_projection
+from characterisation.lambert_projection import lambert_projection
+from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.tables import FIELDS
 
 DISTANCES, ROUGHNESS, NODES, REACH = np.array([400.0, 565.7, 800.0]), np.array([0.1, 0.4, 1.6]), 97, 1.0

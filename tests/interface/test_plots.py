@@ -140,7 +140,7 @@ def test_a_map_is_drawn_as_it_is_queried():
     left, right, bottom, _ = shown.get_extent()
     step = (right - left) / len(axis)
     np.testing.assert_allclose((left + (column + 0.5) * step, bottom + (row + 0.5) * step), (axis[column], axis[row]))
-    normal = characterisation.maps.performance_map.inverse_lambert_projection(np.array([[axis[column], axis[row]]]))
+    normal = characterisation.lambert_projection.inverse_lambert_projection(np.array([[axis[column], axis[row]]]))
     answer = one.query("aluminium/ground", 0.5, 550, normal)
     np.testing.assert_allclose(shown.get_array()[row, column], answer.fraction[0])
     np.testing.assert_allclose(of_sigma.images[0].get_array()[row, column], answer.sigma[0])

@@ -14,7 +14,8 @@ import xarray as xr
 from characterisation.cloud_files import write_cloud
 from characterisation.coupon.patch_table import patch_table
 from characterisation.files.atomic_io import write_netcdf
-from characterisation.maps.performance_map import SCHEMA_VERSION, PerformanceMap
+from characterisation.maps.map_file import SCHEMA_VERSION
+from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.scores.view_score import score_views, view_statistics
 from characterisation.tasks.task_file import Feature, Measurement, Task

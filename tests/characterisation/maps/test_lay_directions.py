@@ -13,7 +13,8 @@ from characterisation.lambert_projection import inverse_lambert_projection
 from characterisation.maps.joined import mean_over, with_directions, with_samples
 from characterisation.maps.lay import LAY_FIELDS, lay_angle_deg, mirror_direction, tangent_at, turned
 from characterisation.maps.light import Light, light_variables
-from characterisation.maps.performance_map import SCHEMA_VERSION, PerformanceMap
+from characterisation.maps.map_file import SCHEMA_VERSION
+from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.tables import FIELDS
 
 AXIS = np.linspace(-1.2, 1.2, 121)

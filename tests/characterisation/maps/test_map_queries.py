@@ -12,13 +12,10 @@ from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
 
 from characterisation.files.errors import InputError
+from characterisation.lambert_projection import inverse_lambert_projection, lambert_projection
 from characterisation.maps.building import NODES
-from characterisation.maps.performance_map import (
-    SCHEMA_VERSION,
-    PerformanceMap,
-    inverse_lambert_projection,
-    lambert_projection,
-)
+from characterisation.maps.map_file import SCHEMA_VERSION
+from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.tables import FIELDS, from_probit, to_probit
 
 AXIS = np.linspace(-1, 1, NODES)

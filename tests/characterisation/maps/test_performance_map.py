@@ -13,12 +13,9 @@ from hypothesis import strategies as st
 from characterisation.coupon.orientations import cap_directions, sphere_directions
 from characterisation.coupon.patch_table import patch_table
 from characterisation.files.errors import InputError
+from characterisation.lambert_projection import inverse_lambert_projection, lambert_projection
 from characterisation.maps.building import SampleTable, build_map
-from characterisation.maps.performance_map import (
-    PerformanceMap,
-    inverse_lambert_projection,
-    lambert_projection,
-)
+from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.tables import from_probit, to_probit
 
 LARGEST = math.radians(50)

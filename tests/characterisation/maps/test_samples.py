@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from characterisation.files.errors import InputError
 from characterisation.maps.joined import mean_over, with_samples
 from characterisation.maps.light import NUMBERS, Light, lies_between, light_variables, lights_of, same_light
-from characterisation.maps.performance_map import SCHEMA_VERSION, PerformanceMap
+from characterisation.maps.map_file import SCHEMA_VERSION
+from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.tables import FIELDS
 
 AXIS = np.linspace(-1, 1, 21)

@@ -14,7 +14,8 @@ from characterisation.coupon.offsets import noise_area, own_area
 from characterisation.coupon.patches import Coupon, measure_patches
 from characterisation.coupon.residual_field import autocorrelation
 from characterisation.maps.building import NODES
-from characterisation.maps.performance_map import SCHEMA_VERSION, PerformanceMap
+from characterisation.maps.map_file import SCHEMA_VERSION
+from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.tables import FIELDS
 from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.prediction import CharacterisedScene, Predictor

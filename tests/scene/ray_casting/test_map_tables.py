@@ -10,12 +10,9 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from characterisation.maps.performance_map import (
-    SCHEMA_VERSION,
-    PerformanceMap,
-    inverse_lambert_projection,
-    lambert_projection,
-)
+from characterisation.lambert_projection import inverse_lambert_projection, lambert_projection
+from characterisation.maps.map_file import SCHEMA_VERSION
+from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import shipped_maps
 from characterisation.maps.tables import FIELDS
 from mitsim.scene.backend import mi
