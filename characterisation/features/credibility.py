@@ -31,7 +31,8 @@ from characterisation.features.figures import Circle, EdgePoint
 from characterisation.features.fits import COVERAGE, GATE, LEAST_GATE_MM, check_radius
 from characterisation.features.fitted import CircleFit, ConeFit, CylinderFit, EdgePointFit, Fit, PlaneFit, SphereFit
 from characterisation.features.robust_fit import CLIP, FitError, UndeterminedError, rays_from
-from characterisation.features.surfaces import GRAZING_COSINE, Surface, distances, tangents
+from characterisation.features.surfaces import GRAZING_COSINE, Surface, distances
+from characterisation.features.vectors import tangents
 
 Array = NDArray[np.float64]
 

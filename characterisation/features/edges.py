@@ -37,7 +37,7 @@ from characterisation.features.credibility import check_figure
 from characterisation.features.figures import ACROSS_THE_EDGE, Circle, EdgePoint
 from characterisation.features.fitted import CircleFit, EdgePointFit, PlaneFit
 from characterisation.features.robust_fit import FitError, covariance_of, robust_fit
-from characterisation.features.surfaces import tangents
+from characterisation.features.vectors import tangents
 from characterisation.point_cloud import PointCloud
 
 Array = NDArray[np.float64]

@@ -23,7 +23,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from characterisation.features.surfaces import Plane, moved_rigidly, tangents, unit
+from characterisation.features.surfaces import Plane
+from characterisation.features.vectors import moved_rigidly, tangents, unit
 
 Array = NDArray[np.float64]
 
@@ -51,7 +52,7 @@ class Circle:
     centre, or the normal while the viewpoint is unknown.
 
     Parameters of a small change: shifts [mm] of the centre along e1 and e2 of the normal's
-    :func:`~characterisation.features.surfaces.tangents`, change of radius [mm].
+    :func:`~characterisation.features.vectors.tangents`, change of radius [mm].
     """
 
     centre: Array

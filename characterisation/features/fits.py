@@ -27,16 +27,8 @@ from characterisation.features.robust_fit import (
     usable,
 )
 from characterisation.features.starts import plane_start, rounding_scale, sphere_start
-from characterisation.features.surfaces import (
-    Cone,
-    Cylinder,
-    Plane,
-    Sphere,
-    Surface,
-    distances,
-    lengths,
-    unit,
-)
+from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere, Surface, distances
+from characterisation.features.vectors import lengths, unit
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE
 

@@ -44,7 +44,8 @@ from numpy.polynomial.legendre import legvander
 from numpy.typing import ArrayLike, NDArray
 
 from characterisation.features.robust_fit import CHOICES, CLIP, FitError, rays_from, robust_std, usable
-from characterisation.features.surfaces import GRAZING_COSINE, Cylinder, Meeting, Plane, tangents
+from characterisation.features.surfaces import GRAZING_COSINE, Cylinder, Meeting, Plane
+from characterisation.features.vectors import tangents
 
 Array = NDArray[np.float64]
 

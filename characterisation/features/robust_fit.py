@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
-from characterisation.features.surfaces import GRAZING_COSINE, lengths
+from characterisation.features.surfaces import GRAZING_COSINE
+from characterisation.features.vectors import lengths
 from characterisation.files.arrays import MEDIAN_TO_STD
 
 Array = NDArray[np.float64]

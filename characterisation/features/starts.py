@@ -20,7 +20,8 @@ from scipy.linalg import eig
 from scipy.spatial import cKDTree
 
 from characterisation.features.robust_fit import SMALLEST_SCALE, FitError, usable
-from characterisation.features.surfaces import Cylinder, Plane, Sphere, tangents
+from characterisation.features.surfaces import Cylinder, Plane, Sphere
+from characterisation.features.vectors import tangents
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,9 @@ orthogonal distance divided by N.V. On a curved surface it is the exact root, be
 where N.V is small. Without rays, the residual is the orthogonal distance.
 
 All surfaces share one convention. Parameters are a small change of the given surface, at its given point, in the
-directions e1 and e2 of :func:`tangents`. Let g(q) be the signed orthogonal distance of a fixed place q from the
-surface, N its gradient and q the foot. Implicit differentiation gives d eps / d p = (dg/dp) / (N.V).
+directions e1 and e2 of :func:`characterisation.features.vectors.tangents`. Let g(q) be the signed orthogonal distance
+of a fixed place q from the surface, N its gradient and q the foot. Implicit differentiation gives d eps / d p = (dg/dp)
+/ (N.V).
 """
 
 from __future__ import annotations
@@ -22,51 +23,13 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from characterisation.features.vectors import dots, lengths, moved_rigidly, tangents, unit
+
 Array = NDArray[np.float64]
 
 #: A fit with a viewpoint excludes points at more than 80 deg incidence. There eps is an orthogonal distance magnified
 #: more than 5.8 times. The ray of a good point may miss a trial surface, and real sensors give mixed (edge) pixels.
 GRAZING_COSINE = float(np.cos(np.deg2rad(80.0)))
-
-
-def tangents(direction: ArrayLike) -> Array:
-    """Return two unit vectors (2, 3) that complete a direction (3,) to a right-handed frame e1, e2, direction.
-
-    The covariance of a fit is expressed in this frame, so the choice follows a fixed rule. e1 is the coordinate axis
-    least aligned with the direction, made perpendicular to it.
-    """
-    along = unit(direction)
-    least = np.argmin(np.abs(along))
-    first = 0.0 - along[least] * along
-    first[least] += 1.0
-    first = unit(first)
-    return np.array([first, cross(along, first)])
-
-
-def cross(first: Array, second: Array) -> Array:
-    """Return the vector product of two vectors (3,); np.cross is ten times slower."""
-    (a, b, c), (x, y, z) = first, second
-    product: Array = np.array([b * z - c * y, c * x - a * z, a * y - b * x])
-    return product
-
-
-def unit(vector: ArrayLike) -> Array:
-    """Return the vector (3,) of length 1 in the same direction."""
-    array: Array = np.asarray(vector, float)
-    of_length_one: Array = array / np.sqrt(array.dot(array))  # np.linalg.norm takes three times as long
-    return of_length_one
-
-
-def dots(a: Array, b: Array) -> Array:
-    """Return the scalar products of the rows of two arrays (n, 3)."""
-    products: Array = np.einsum("ij,ij->i", a, b)  # np.sum over a short last axis is five times slower
-    return products
-
-
-def lengths(vectors: Array) -> Array:
-    """Return the lengths of the rows of an array (n, 3)."""
-    out: Array = np.sqrt(dots(vectors, vectors))
-    return out
 
 
 class Meeting(NamedTuple):
@@ -90,7 +53,7 @@ class Plane:
     """Plane through ``point`` (3,) [mm] with unit ``normal`` (3,).
 
     Parameters of a small change: shift along the normal [mm], tilts [rad] of the normal toward e1 and e2 of
-    :func:`tangents` about ``point``.
+    ``tangents`` about ``point``.
     """
 
     point: Array
@@ -101,7 +64,7 @@ class Plane:
 
     @cached_property
     def _basis(self) -> Array:
-        """Return e1 and e2 of :func:`tangents`, (2, 3), of the normal."""
+        """Return e1 and e2 of ``tangents``, (2, 3), of the normal."""
         return tangents(self.normal)
 
     def moved(self, parameters: Array) -> Plane:
@@ -150,7 +113,7 @@ class Plane:
 class Cylinder:
     """Cylinder about the line through ``point`` (3,) [mm] along unit ``axis`` (3,), ``radius`` [mm].
 
-    Parameters of a small change: shifts [mm] of the point along e1 and e2 of :func:`tangents`, tilts [rad] of the axis
+    Parameters of a small change: shifts [mm] of the point along e1 and e2 of ``tangents``, tilts [rad] of the axis
     toward e1 and e2 about ``point``, change of radius [mm].
     """
 
@@ -163,7 +126,7 @@ class Cylinder:
 
     @cached_property
     def _basis(self) -> Array:
-        """Return e1 and e2 of :func:`tangents`, (2, 3), of the axis."""
+        """Return e1 and e2 of ``tangents``, (2, 3), of the axis."""
         return tangents(self.axis)
 
     def moved(self, parameters: Array) -> Cylinder:
@@ -241,7 +204,7 @@ class Cone:
     be a poor reference point: far from the visible surface, shift of the apex, half-angle and tilts are strongly
     correlated.
 
-    Parameters of a small change: shifts [mm] of the point along e1 and e2 of :func:`tangents`, tilts [rad] of the axis
+    Parameters of a small change: shifts [mm] of the point along e1 and e2 of ``tangents``, tilts [rad] of the axis
     toward e1 and e2 about ``point``, change of radius at the point [mm], change of the half-angle [rad].
     """
 
@@ -255,7 +218,7 @@ class Cone:
 
     @cached_property
     def _basis(self) -> Array:
-        """Return e1 and e2 of :func:`tangents`, (2, 3), of the axis."""
+        """Return e1 and e2 of ``tangents``, (2, 3), of the axis."""
         return tangents(self.axis)
 
     @property
@@ -369,9 +332,3 @@ def _met_round(points: Array, rays: Array | None, radial: Array, across: Array |
 def _guarded(cosine: Array) -> Array:
     """Keep N.V away from 0, by a limit well below :data:`GRAZING_COSINE`, which affects hardly any point used."""
     return np.copysign(np.maximum(np.abs(cosine), GRAZING_COSINE / 4), cosine)
-
-
-def moved_rigidly(motion: ArrayLike, point: Array, *directions: Array) -> tuple[Array, ...]:
-    """Move a point (3,) and directions (3,) by a (4, 4) matrix."""
-    matrix = np.asarray(motion, float)
-    return matrix[:3, :3] @ point + matrix[:3, 3], *(matrix[:3, :3] @ direction for direction in directions)

@@ -41,7 +41,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from characterisation.features.figures import Circle, EdgePoint
-from characterisation.features.surfaces import tangents
+from characterisation.features.vectors import tangents
 from characterisation.files.arrays import Floats
 from characterisation.scores.view_sets import NOTHING
 

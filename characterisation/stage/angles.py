@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, field_validator, model_validator
 
-from characterisation.features.surfaces import unit
+from characterisation.features.vectors import unit
 from characterisation.files.arrays import Floats
 from characterisation.files.documents import Document, Name
 

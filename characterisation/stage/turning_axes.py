@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from characterisation.features.surfaces import tangents
+from characterisation.features.vectors import tangents
 from characterisation.files.arrays import Floats
 
 #: parameters of a small change of one line
@@ -30,7 +30,7 @@ class TurningAxes:
     """Lines with unit ``directions`` (k, 3) through ``points`` (k, 3) [mm].
 
     Parameters of a small change, four for each line: tilts [rad] of the direction toward e1 and e2 of
-    :func:`~characterisation.features.surfaces.tangents`, shifts [mm] of the point along them.
+    :func:`~characterisation.features.vectors.tangents`, shifts [mm] of the point along them.
     """
 
     directions: Floats

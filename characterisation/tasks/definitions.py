@@ -26,7 +26,8 @@ from numpy.typing import ArrayLike, NDArray
 from characterisation.features.figures import Circle
 from characterisation.features.form import zone
 from characterisation.features.pose_fit import Pose
-from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere, cross
+from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
+from characterisation.features.vectors import cross
 from characterisation.tasks.places import Axis, Geometry, PointLike, between_axes, between_planes, on_axis, place
 from characterisation.tasks.zones import (
     angularity,

@@ -37,7 +37,8 @@ from scipy.spatial.transform import Rotation
 from characterisation.features.figures import Circle, EdgePoint
 from characterisation.features.form import NODE_SHARES, node_heights, node_modes
 from characterisation.features.pose_fit import Pose
-from characterisation.features.surfaces import Cone, Cylinder, Plane, unit
+from characterisation.features.surfaces import Cone, Cylinder, Plane
+from characterisation.features.vectors import unit
 from characterisation.tasks.definitions import DEFINITIONS
 from characterisation.tasks.places import between_axes, between_planes, direction, on_axis, place
 from characterisation.tasks.task_file import AT_FOLD, LINE_ANGLES, Measurement

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.features.figures import Circle, EdgePoint, Point
-from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere, unit
+from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
+from characterisation.features.vectors import unit
 
 Array = NDArray[np.float64]
 Axis = Cylinder | Cone

@@ -27,7 +27,8 @@ from characterisation.features.fitted import with_covariance
 from characterisation.features.form import Form, form_modes
 from characterisation.features.pose_fit import PoseFit, pose_jacobian
 from characterisation.features.robust_fit import FitError
-from characterisation.features.surfaces import Cone, Cylinder, Plane, tangents
+from characterisation.features.surfaces import Cone, Cylinder, Plane
+from characterisation.features.vectors import tangents
 from characterisation.files.arrays import Floats
 from characterisation.tasks.covariance import ExpectedFit, ExpectedPoints, expected_fit, expected_sums, solved, usable
 from characterisation.tasks.measurement_model import InputQuantity, evaluate, measurement_model

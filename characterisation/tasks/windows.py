@@ -24,7 +24,8 @@ from characterisation.features.fitted import CylinderFit, PlaneFit, SphereFit
 from characterisation.features.form import fit_form, zone
 from characterisation.features.robust_fit import CLIP, FitError, rays_from
 from characterisation.features.starts import cylinder_start
-from characterisation.features.surfaces import GRAZING_COSINE, distances, lengths
+from characterisation.features.surfaces import GRAZING_COSINE, distances
+from characterisation.features.vectors import lengths
 from characterisation.files.errors import InputError, nearest
 from characterisation.point_cloud import PointCloud
 from characterisation.region_of_interest import Roi

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.features.figures import Circle, EdgePoint
-from characterisation.features.surfaces import Cone, Cylinder, Plane, cross, unit
+from characterisation.features.surfaces import Cone, Cylinder, Plane
+from characterisation.features.vectors import cross, unit
 from characterisation.tasks.places import PARALLEL, Axis, Geometry, PointLike, direction, intersection, on_axis, place
 
 Array = NDArray[np.float64]

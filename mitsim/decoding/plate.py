@@ -34,7 +34,7 @@ from scipy.spatial import cKDTree
 
 from characterisation.features.fits import fit_plane
 from characterisation.features.robust_fit import SMALLEST_SCALE, FitError
-from characterisation.features.surfaces import tangents
+from characterisation.features.vectors import tangents
 from characterisation.point_cloud import PointCloud, ViewGrid
 from characterisation.region_of_interest import Roi
 from characterisation.tasks.result import Result, failed

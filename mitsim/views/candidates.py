@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.coupon.orientations import sphere_directions
-from characterisation.features.surfaces import unit
+from characterisation.features.vectors import unit
 from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.words.progress import track_if_long

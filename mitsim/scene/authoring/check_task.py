@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from characterisation.features.surfaces import Cone, Cylinder, Plane, tangents
+from characterisation.features.surfaces import Cone, Cylinder, Plane
+from characterisation.features.vectors import tangents
 from characterisation.files.arrays import Floats
 from characterisation.files.documents import Document, read_toml
 from characterisation.files.errors import nearest

@@ -8,7 +8,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere, tangents
+from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
+from characterisation.features.vectors import tangents
 from characterisation.files.arrays import Floats
 
 Ints = NDArray[np.int64]
@@ -102,7 +103,7 @@ class Face:
     def corner_places(self) -> Floats | None:
         """Return the triangles (m, 3, 2) [mm], u and v, on the developed surface; None for other surfaces.
 
-        On a plane they are along the two :func:`~characterisation.features.surfaces.tangents` of the normal. On a
+        On a plane they are along the two :func:`~characterisation.features.vectors.tangents` of the normal. On a
         cylinder u is circumferential and v axial. Each triangle is developed separately, so none crosses a seam.
         """
         corners = self.vertices[self.triangles]

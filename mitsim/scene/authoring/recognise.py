@@ -16,7 +16,8 @@ import trimesh
 
 from characterisation.features.fits import fit_cylinder, fit_sphere
 from characterisation.features.robust_fit import FitError
-from characterisation.features.surfaces import Cylinder, Plane, Sphere, tangents
+from characterisation.features.surfaces import Cylinder, Plane, Sphere
+from characterisation.features.vectors import tangents
 from characterisation.files.arrays import Floats
 from mitsim.scene.authoring.face import TOLERANCE_MM, Face, Ints, Surface, outward_normals, surface_distance
 

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere, tangents
+from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
+from characterisation.features.vectors import tangents
 from characterisation.files.arrays import Floats
 from mitsim.scene.authoring.drawing_task import DrawnTask
 from mitsim.scene.authoring.drawn_zones import middle_outline

@@ -28,7 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.features.fits import LEAST_GATE_MM
-from characterisation.features.surfaces import Surface, distances, dots
+from characterisation.features.surfaces import Surface, distances
+from characterisation.features.vectors import dots
 from characterisation.files.arrays import Floats
 from characterisation.point_cloud import ViewGrid
 from characterisation.tasks.definitions import DEFINITIONS

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from characterisation.features.robust_fit import FitError
-from characterisation.features.surfaces import Plane, Sphere, tangents
+from characterisation.features.surfaces import Plane, Sphere
+from characterisation.features.vectors import tangents
 from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, ViewGrid

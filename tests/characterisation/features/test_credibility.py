@@ -7,7 +7,8 @@ from scipy.ndimage import gaussian_filter
 from characterisation.features.credibility import check_surface, places_seen
 from characterisation.features.fits import belonging, fit_surface
 from characterisation.features.robust_fit import FitError, UndeterminedError
-from characterisation.features.surfaces import Cylinder, Plane, Sphere, unit
+from characterisation.features.surfaces import Cylinder, Plane, Sphere
+from characterisation.features.vectors import unit
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.tasks.evaluation import measure, measure_points
 from characterisation.tasks.task_file import Task

@@ -11,7 +11,8 @@ from characterisation.features.figures import Circle, EdgePoint, crossings, edge
 from characterisation.features.fits import fit_plane
 from characterisation.features.fitted import with_covariance
 from characterisation.features.robust_fit import FitError
-from characterisation.features.surfaces import Cylinder, Plane, tangents
+from characterisation.features.surfaces import Cylinder, Plane
+from characterisation.features.vectors import tangents
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 
 FOCAL, DISTANCE = 600.0, 400.0

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from characterisation.features.fits import belonging, fit_cone, fit_cylinder, fit_plane, fit_sphere
 from characterisation.features.robust_fit import FitError, rays_from, robust_fit
-from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere, tangents
+from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
+from characterisation.features.vectors import tangents
 from characterisation.files.errors import InputError
 
 EYE = np.zeros(3)

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 from characterisation.features.fits import fit_cone, fit_surface
 from characterisation.features.fitted import with_covariance
 from characterisation.features.robust_fit import FitError
-from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere, tangents
+from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
+from characterisation.features.vectors import tangents
 
 EYE = np.zeros(3)
 AXIS = np.array([0.1, -0.9, -0.4]) / np.linalg.norm([0.1, -0.9, -0.4])

@@ -6,7 +6,8 @@ import pytest
 from characterisation.features.fits import fit_cylinder, fit_plane
 from characterisation.features.form import NODES, Form, fit_form, form_modes, node_modes, zone, zone_uncertainty
 from characterisation.features.robust_fit import FitError
-from characterisation.features.surfaces import Cylinder, Plane, tangents
+from characterisation.features.surfaces import Cylinder, Plane
+from characterisation.features.vectors import tangents
 from characterisation.tasks.measurement_model import evaluate
 
 EYE = np.zeros(3)

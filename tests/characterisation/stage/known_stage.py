@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from characterisation.features.surfaces import tangents
+from characterisation.features.vectors import tangents
 
 
 def unit(vector):

@@ -13,7 +13,8 @@ from characterisation.features.figures import Circle, EdgePoint, Point
 from characterisation.features.fits import fit_plane
 from characterisation.features.fitted import with_covariance
 from characterisation.features.pose_fit import Pose
-from characterisation.features.surfaces import Cylinder, Plane, Sphere, tangents
+from characterisation.features.surfaces import Cylinder, Plane, Sphere
+from characterisation.features.vectors import tangents
 from characterisation.files.documents import validate
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.tasks.definitions import (

@@ -8,7 +8,8 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from characterisation.features.fitted import with_covariance
-from characterisation.features.surfaces import Cylinder, Plane, tangents
+from characterisation.features.surfaces import Cylinder, Plane
+from characterisation.features.vectors import tangents
 from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
 from characterisation.statements.decision import decide

@@ -10,7 +10,8 @@ from scipy.stats import norm
 
 from characterisation.coupon.offsets import own_area
 from characterisation.features.robust_fit import FitError
-from characterisation.features.surfaces import Cylinder, Plane, tangents
+from characterisation.features.surfaces import Cylinder, Plane
+from characterisation.features.vectors import tangents
 from characterisation.tasks.covariance import ExpectedPoints, expected_fit
 
 ROWS, COLUMNS = 60, 80
