@@ -1,7 +1,7 @@
 """Simulate time of flight: amplitude-modulated light, and the imager that correlates it.
 
 Signal chain: radiance of every correlation 1 + m cos(2 pi f L / c - delta)
-(:class:`mitsim.scene.light_transport.projector_light.ModulatedLight`) -> delays of the pixels -> charge of the two taps
+(:class:`mitsim.scene.light_transport.projected_codes.ModulatedLight`) -> delays of the pixels -> charge of the two taps
 A and B of a pixel -> noise of each (:mod:`mitsim.sensor.image_formation`) -> their difference -> quantisation -> grey
 levels [DN].
 

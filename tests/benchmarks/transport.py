@@ -21,7 +21,7 @@ import numpy as np
 from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.light_transport.light_paths import LightPaths
-from mitsim.scene.light_transport.projector_light import ProjectedPatterns
+from mitsim.scene.light_transport.projected_codes import ProjectedPatterns
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import load_scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays

@@ -21,7 +21,7 @@ from mitsim.maps.campaign.plan import read_campaign
 from mitsim.maps.campaign.run import run_campaign
 from mitsim.scene.backend import mi
 from mitsim.scene.light_transport.light_paths import LightPaths
-from mitsim.scene.light_transport.projector_light import ModulatedLight
+from mitsim.scene.light_transport.projected_codes import ModulatedLight
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays

@@ -40,7 +40,7 @@ from mitsim.capture.simulated.room_image import room_image
 from mitsim.capture.simulated.surface_speckle import draw_speckle
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.plain_scene import has_emitters, single_plane
-from mitsim.scene.light_transport.projector_light import ModulatedLight, ProjectedLight, ProjectedPatterns
+from mitsim.scene.light_transport.projected_codes import ModulatedLight, ProjectedLight, ProjectedPatterns
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays

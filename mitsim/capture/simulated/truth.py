@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.capture.truth import Truth
 from mitsim.scene.light_transport.light_paths import LightPaths
-from mitsim.scene.light_transport.projector_light import ProjectedPatterns
+from mitsim.scene.light_transport.projected_codes import ProjectedPatterns
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.raycast import PixelRays, cast

@@ -43,7 +43,7 @@ from mitsim.maps.prediction.multipath_phase_bias import amplitude, finest_fringe
 from mitsim.maps.prediction.multipath_range_bias import path_amplitudes, path_bias, range_bias
 from mitsim.maps.prediction.perturbation import Perturbation, SceneView
 from mitsim.scene.light_transport.light_paths import LightPaths
-from mitsim.scene.light_transport.projector_light import ModulatedLight, ProjectedPatterns
+from mitsim.scene.light_transport.projected_codes import ModulatedLight, ProjectedPatterns
 from mitsim.scene.light_transport.transport import trace_poses
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays

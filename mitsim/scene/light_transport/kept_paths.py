@@ -37,7 +37,7 @@ from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import to_device
 from mitsim.scene.light_transport.low_discrepancy import z_positions
-from mitsim.scene.light_transport.projector_light import ProjectedLight
+from mitsim.scene.light_transport.projected_codes import ProjectedLight
 
 Floats = NDArray[np.float32]
 

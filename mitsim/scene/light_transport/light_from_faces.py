@@ -18,7 +18,8 @@ from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.first_hits import numbers_met, shape_indices
 from mitsim.scene.light_transport.plain_scene import SceneBsdfs
-from mitsim.scene.light_transport.projector_light import ProjectedPatterns, ProjectorLight
+from mitsim.scene.light_transport.projected_codes import ProjectedPatterns
+from mitsim.scene.light_transport.projector_light import ProjectorLight
 from mitsim.scene.load import Scene, bounds_of
 from mitsim.scene.ray_casting.camera_rays import CameraRays, bilinear
 from mitsim.scene.ray_casting.eye import Eye

@@ -45,7 +45,8 @@ from mitsim.scene.device import opaque, opaque_index
 from mitsim.scene.light_transport.kept_walks import value_and_density
 from mitsim.scene.light_transport.low_discrepancy import r3_point, z_order
 from mitsim.scene.light_transport.plain_scene import SceneBsdfs
-from mitsim.scene.light_transport.projector_light import ProjectedLight, ProjectorLight
+from mitsim.scene.light_transport.projected_codes import ProjectedLight
+from mitsim.scene.light_transport.projector_light import ProjectorLight
 from mitsim.scene.load import Scene, bounds_of
 from mitsim.scene.ray_casting.camera_rays import CameraRays, pixel_area
 from mitsim.scene.ray_casting.eye import Eye, shadow_ray

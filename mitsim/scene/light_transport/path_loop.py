@@ -40,7 +40,8 @@ from mitsim.scene.light_transport.plain_scene import (
     single_bsdf,
     single_plane,
 )
-from mitsim.scene.light_transport.projector_light import ProjectedLight, ProjectorLight
+from mitsim.scene.light_transport.projected_codes import ProjectedLight
+from mitsim.scene.light_transport.projector_light import ProjectorLight
 from mitsim.scene.load import Scene, bounds_of
 from mitsim.scene.ray_casting.camera_rays import CameraRays, bilinear, pixel_area
 from mitsim.scene.ray_casting.eye import Eye

@@ -26,7 +26,7 @@ from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.light_tracing import PHOTONS_AT_ONCE, Photons, add_photons
 from mitsim.scene.light_transport.path_loop import launch
 from mitsim.scene.light_transport.plain_scene import single_plane
-from mitsim.scene.light_transport.projector_light import ProjectedLight
+from mitsim.scene.light_transport.projected_codes import ProjectedLight
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.transforms import Transform
@@ -52,8 +52,8 @@ def trace(
     scene, rays, world_from_sensor
         The scene, the camera's rays, and the pose of the sensor.
     light
-        The projector with its codes: :class:`~mitsim.scene.light_transport.projector_light.ProjectedPatterns` or
-        :class:`~mitsim.scene.light_transport.projector_light.ModulatedLight`.
+        The projector with its codes: :class:`~mitsim.scene.light_transport.projected_codes.ProjectedPatterns` or
+        :class:`~mitsim.scene.light_transport.projected_codes.ModulatedLight`.
     paths
         The light paths.
     roi

@@ -35,7 +35,7 @@ from mitsim.capture.simulated.exposing import LightOnImagers
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decoding.cloud import capture_pattern
-from mitsim.scene.light_transport.projector_light import ProjectedPatterns
+from mitsim.scene.light_transport.projected_codes import ProjectedPatterns
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.pattern import RandomDots

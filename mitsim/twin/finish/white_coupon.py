@@ -21,7 +21,7 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.scene.differentiable import lambertian_coupon
-from mitsim.scene.light_transport.projector_light import ProjectedPatterns
+from mitsim.scene.light_transport.projected_codes import ProjectedPatterns
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.roi import roi_around

@@ -21,7 +21,7 @@ from mitsim.capture.simulated.lens_blur import blur_by_lens
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.capture.simulated.surface_speckle import draw_speckle
-from mitsim.scene.light_transport.projector_light import ProjectedPatterns
+from mitsim.scene.light_transport.projected_codes import ProjectedPatterns
 from mitsim.scene.load import Scene
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.image_formation import expose, fixed_pattern

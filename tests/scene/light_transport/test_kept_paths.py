@@ -13,7 +13,7 @@ from mitsim.scene.light_transport.kept_tracing import camera_paths, photon_paths
 from mitsim.scene.light_transport.kept_walks import Tracer, Tracing, Walk, split_walk
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.plain_scene import distinct_bsdfs
-from mitsim.scene.light_transport.projector_light import ModulatedLight, ProjectedPatterns
+from mitsim.scene.light_transport.projected_codes import ModulatedLight, ProjectedPatterns
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import bsdf_of, scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays

@@ -8,7 +8,7 @@ from characterisation.region_of_interest import Roi
 from mitsim.report.bounce_figure import bounce_figure
 from mitsim.scene.light_transport.light_from_faces import LightFromFaces, light_from_faces
 from mitsim.scene.light_transport.light_paths import LightPaths
-from mitsim.scene.light_transport.projector_light import ProjectedPatterns
+from mitsim.scene.light_transport.projected_codes import ProjectedPatterns
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import load_scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays

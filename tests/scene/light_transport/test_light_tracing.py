@@ -11,7 +11,7 @@ from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import mi
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.light_tracing import Photons, add_photons
-from mitsim.scene.light_transport.projector_light import ModulatedLight, ProjectedPatterns
+from mitsim.scene.light_transport.projected_codes import ModulatedLight, ProjectedPatterns
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays

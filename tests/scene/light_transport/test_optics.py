@@ -14,11 +14,13 @@ from mitsim.scene.backend import dr, mi
 from mitsim.scene.light_transport import transport
 from mitsim.scene.light_transport.aperture_samples import aperture_samples
 from mitsim.scene.light_transport.light_paths import LightPaths
-from mitsim.scene.light_transport.projector_light import LIGHT_MM_S, ModulatedLight, ProjectedPatterns, ProjectorLight
+from mitsim.scene.light_transport.projected_codes import ModulatedLight, ProjectedPatterns
+from mitsim.scene.light_transport.projector_light import ProjectorLight
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.camera import Camera
+from mitsim.sensor.modulation import LIGHT_MM_S
 from mitsim.sensor.projector import Projector
 from mitsim.sensor.transforms import Transform, look_at
 from tests.stock_mitsuba import mitsuba_to_world

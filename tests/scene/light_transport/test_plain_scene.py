@@ -14,7 +14,7 @@ from mitsim.scene.backend import dr, mi
 from mitsim.scene.light_transport import path_loop, transport
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.plain_scene import single_bsdf, single_plane
-from mitsim.scene.light_transport.projector_light import ProjectedPatterns, independent
+from mitsim.scene.light_transport.projected_codes import ProjectedPatterns, independent
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays

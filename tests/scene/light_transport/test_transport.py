@@ -9,7 +9,7 @@ from characterisation.features.fits import fit_sphere
 from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import mi
 from mitsim.scene.light_transport.light_paths import LightPaths
-from mitsim.scene.light_transport.projector_light import ProjectedPatterns
+from mitsim.scene.light_transport.projected_codes import ProjectedPatterns
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays

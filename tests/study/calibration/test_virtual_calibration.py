@@ -16,7 +16,7 @@ from scipy import stats
 from mitsim.capture.simulated.lens_blur import gaussian_blur
 from mitsim.scene.backend import mi
 from mitsim.scene.light_transport.light_paths import LightPaths
-from mitsim.scene.light_transport.projector_light import ProjectedPatterns
+from mitsim.scene.light_transport.projected_codes import ProjectedPatterns
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
