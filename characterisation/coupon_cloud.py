@@ -10,8 +10,6 @@ true surface are unknown and the table leaves them out.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
@@ -225,11 +223,8 @@ def _checked_window(window: tuple[int, int, int, int] | None, grid: ViewGrid) ->
 
 def _cropped(cloud: PointCloud, window: Roi) -> PointCloud:
     """Crop a cloud and its grid to a window."""
-    grid, inside = cloud.grid, window.slices
-    bent = None if grid.normalised is None else grid.normalised[inside]
-    left, top, width, height = window.left, window.top, window.width, window.height
-    part = replace(grid, cx=grid.cx - left, cy=grid.cy - top, width=width, height=height, normalised=bent)
-    return PointCloud(cloud.points[inside], cloud.status[inside], part, cloud.sensor, cloud.source, cloud.baseline)
+    points, status, part = cloud.points[window.slices], cloud.status[window.slices], cloud.grid.cropped(window)
+    return PointCloud(points, status, part, cloud.sensor, cloud.source, cloud.baseline)
 
 
 def _coupon_seen(cloud: PointCloud) -> Coupon:

@@ -22,6 +22,8 @@ from characterisation.files.errors import MissingEnvironmentError
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from characterisation.region_of_interest import Roi
+
 Floats = NDArray[np.floating]
 
 #: a point farther than this share of |V| from the surface that its pixel shows, along its ray, is a false match: it is
@@ -107,6 +109,12 @@ class ViewGrid:
             height=len(rows),
             normalised=None if self.normalised is None else self.normalised[first::step, first::step],
         )
+
+    def cropped(self, roi: Roi) -> ViewGrid:
+        """Return the grid of a region."""
+        bent = None if self.normalised is None else self.normalised[roi.slices]
+        cx, cy = self.cx - roi.left, self.cy - roi.top
+        return replace(self, cx=cx, cy=cy, width=roi.width, height=roi.height, normalised=bent)
 
     def rays(self) -> NDArray[np.float64]:
         """Return unit view directions (height, width, 3) in the sensor frame."""
@@ -236,31 +244,22 @@ class PointCloud:
         """Mask (H, W) of the pixels that have a point."""
         return np.isfinite(self.points[..., 2])
 
-    def of_feature(self, name: str) -> NDArray[np.float64]:
-        """Return the points (n, 3) [mm] of one feature, in the sensor frame."""
+    def _labelled(self, name: str) -> NDArray[np.intp]:
         if self.feature is None:
             raise ValueError("this cloud has no feature labels")
-        labelled = self.points.reshape(-1, 3)[np.flatnonzero(self.feature == self.feature_names.index(name))]
+        return np.flatnonzero(self.feature == self.feature_names.index(name))
+
+    def of_feature(self, name: str) -> NDArray[np.float64]:
+        """Return the points (n, 3) [mm] of one feature, in the sensor frame."""
+        labelled = self.points.reshape(-1, 3)[self._labelled(name)]
         return np.asarray(labelled[np.isfinite(labelled[:, 2])], np.float64)
 
     def rays_of_feature(self, name: str, most: int | None = None) -> NDArray[np.float64]:
-        """Return the unit view directions (n, 3), sensor frame, of all pixels with its label, with or without a point.
+        """Return the unit view directions (n, 3), sensor frame, of a feature's pixels, with or without a point.
 
-        Parameters
-        ----------
-        name
-            Of the feature.
-        most
-            Largest number of directions: of more pixels, evenly chosen ones; None for all.
-
-        Raises
-        ------
-        ValueError
-            If the cloud has no labels.
+        Of more than ``most`` pixels, evenly chosen ones.
         """
-        if self.feature is None:
-            raise ValueError("this cloud has no feature labels")
-        labelled = np.flatnonzero(self.feature == self.feature_names.index(name))
+        labelled = self._labelled(name)
         step = 1 if most is None else max(-(-len(labelled) // most), 1)
         rows, columns = np.divmod(labelled[::step], self.grid.width)
         return self.grid.rays_at(columns, rows)

@@ -31,7 +31,8 @@ from typing import Any
 from characterisation.files.errors import InputError, nearest
 from characterisation.maps.light import Light
 from mitsim.scene.bsdf_descriptions import diffuse_bsdf, gloss_paint_bsdf, metal_bsdf, powder_coat_bsdf
-from mitsim.scene.surface.machined import MachinedFace, machined
+from mitsim.scene.surface.machined import machined
+from mitsim.scene.surface.machined_face import MachinedFace
 from mitsim.scene.surface.measured import HeightMap, Profile, read_height_map, read_profile
 from mitsim.scene.surface.metals import CONSTANTS, refractive_index
 from mitsim.scene.surface.microfacet import fresnel

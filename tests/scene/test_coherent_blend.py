@@ -16,7 +16,8 @@ from mitsim.scene.backend import dr, mi
 from mitsim.scene.bsdf_descriptions import metal_bsdf
 from mitsim.scene.coherent_blend import NAME, register_coherent_blend
 from mitsim.scene.surface.energy import directional_albedo, energy_factors
-from mitsim.scene.surface.machined import MachinedFace, machined
+from mitsim.scene.surface.machined import machined
+from mitsim.scene.surface.machined_face import MachinedFace
 
 ANGLES_DEG = (0, 30, 45, 60, 75)
 

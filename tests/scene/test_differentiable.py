@@ -13,7 +13,8 @@ from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.scene.differentiable import Directions, SpecularLobe
 from mitsim.scene.load import load_scene
-from mitsim.scene.surface.machined import MachinedFace, machined
+from mitsim.scene.surface.machined import machined
+from mitsim.scene.surface.machined_face import MachinedFace
 from mitsim.scene.surface.metals import refractive_index
 from mitsim.scene.surface.microfacet import fresnel, shadowing, slope_density
 from mitsim.sensor.transforms import look_at

@@ -14,7 +14,8 @@ from mitsim.scene.bsdf_descriptions import gloss_paint_bsdf, metal_bsdf, powder_
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.materials import Finish
 from mitsim.scene.surface.energy import directional_albedo, energy_factors
-from mitsim.scene.surface.machined import MachinedFace, machined
+from mitsim.scene.surface.machined import machined
+from mitsim.scene.surface.machined_face import MachinedFace
 from mitsim.scene.surface.metals import normal_reflectance, refractive_index
 from mitsim.scene.surface.paint import ALPHA_RANGE, paint
 from mitsim.scene.surface.processes import LAY_FACTOR, PROCESSES

@@ -12,13 +12,15 @@ same in one kernel on the device, for clouds.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from characterisation.coupon.view_frame import in_frame, view_frame
+from characterisation.files.arrays import Floats
 from characterisation.files.threads import in_threads
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.region_of_interest import Roi
@@ -121,18 +123,11 @@ class Predictor:
         Its pixels are those of the sensor, or every ``step``-th of every ``step``-th row.
         """
         assert self.step == 1, "thinned already"
-        roi, grid = self.view.roi(bounds, world_from_sensor, self.margin), self.grid
-        normalised = None if grid.normalised is None else grid.normalised[roi.slices]
-        part = replace(
-            grid,
-            cx=grid.cx - roi.left,
-            cy=grid.cy - roi.top,
-            width=roi.width,
-            height=roi.height,
-            normalised=normalised,
-        )
+        roi = self.view.roi(bounds, world_from_sensor, self.margin)
         step = math.ceil(math.sqrt(roi.width * roi.height / rays))
-        return Predictor(self.rig, part, self.seen[roi.slices], self.sensor, self.edge_margin_px, step)
+        return Predictor(
+            self.rig, self.grid.cropped(roi), self.seen[roi.slices], self.sensor, self.edge_margin_px, step
+        )
 
     def surfaces(self, scene: Scene, world_from_sensor: Transform) -> Surfaces:
         """Return the ray-cast surfaces of a view, in the sensor frame."""
@@ -154,9 +149,8 @@ class Predictor:
         status[outside] = Status.NO_SURFACE
         frames = view_frame(ray, self.rig.baseline_direction)
         view = in_frame(normal, frames)
-        along = None
-        if surfaces.along is not None:
-            along = in_frame(surfaces.along.reshape(-1, 3)[pixel].astype(float), frames)
+        along = surfaces.along
+        along = None if along is None else in_frame(along.reshape(-1, 3)[pixel].astype(float), frames)
         return Ideal(pixel, point, ray, distance, view, surfaces.shape.ravel()[pixel], status, along)
 
     def labels(self, scene: Scene, world_from_sensor: Transform, surfaces: Surfaces) -> NDArray[np.int16]:
@@ -293,25 +287,14 @@ class Predictor:
             out.reshape(-1)[ideal.pixel] = values
             return out
 
-        seen = MappedView(
-            Roi.whole(size[1], size[0]),
-            image(ideal.status, Status.NO_SURFACE),
-            image(ideal.shape, -1),
-            image(ideal.distance, np.nan),
-            None,
-            image(fraction, np.nan),
-            image(sigma, np.nan),
-        )
+        status, shape = image(ideal.status, Status.NO_SURFACE), image(ideal.shape, -1)
+        distance, fractions, sigmas = (image(values, np.nan) for values in (ideal.distance, fraction, sigma))
+        seen = MappedView(Roi.whole(size[1], size[0]), status, shape, distance, None, fractions, sigmas)
         noise = image(rng.standard_normal(len(fraction)), 0.0)
         return self._cloud(scene, seen, labels, noise, image(rng.random(len(fraction)), 1.0))
 
     def _cloud(
-        self,
-        scene: Scene,
-        seen: MappedView,
-        labels: NDArray[np.int16],
-        noise: NDArray[np.floating],
-        chance: NDArray[np.floating],
+        self, scene: Scene, seen: MappedView, labels: NDArray[np.int16], noise: Floats, chance: Floats
     ) -> PointCloud:
         """Return points with errors ``noise`` (h, w) in units of sigma, kept if ``chance``, R_U (h, w), is below F."""
         part, size = seen.roi.slices, (self.grid.height, self.grid.width)
@@ -327,17 +310,8 @@ class Predictor:
         np.multiply(self.single_directions[part], distance[..., None], out=points[part])
         if self.grid.origin.any():
             points[part] += self.grid.origin.astype(np.float32)
-        return PointCloud(
-            points,
-            status,
-            self.grid,
-            self.sensor,
-            "predicted",
-            self.rig.baseline_direction,
-            labels,
-            scene.names,
-            spread,
-        )
+        baseline, names = self.rig.baseline_direction, scene.names
+        return PointCloud(points, status, self.grid, self.sensor, "predicted", baseline, labels, names, spread)
 
 
 def _deviates(size: tuple[int, ...], rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -364,27 +338,13 @@ def _in_image(eye: Camera, reach: float, point: NDArray[np.float64]) -> NDArray[
     local = eye.sensor_from_camera.inverse().points(point)
     with np.errstate(invalid="ignore", divide="ignore"):
         near = np.hypot(local[:, 0], local[:, 1]) < reach * local[:, 2]
-    return np.asarray(near & np.isfinite(where).all(-1) & (where > -0.5).all(-1) & (where < size - 0.5).all(-1))
+    return np.asarray(near & ((where > -0.5) & (where < size - 0.5)).all(-1))
 
 
 def _away_from_edges(shape: NDArray[np.int16], margin: int) -> NDArray[np.int16]:
     """Return the shapes (h, w) of pixels whose neighbours within ``margin`` all show the same shape, else -1."""
-    least, largest = shape, shape
+    least, largest, size = shape, shape, 2 * margin + 1
     for axis in (0, 1):
-        least, largest = (_running(np.minimum, least, margin, axis), _running(np.maximum, largest, margin, axis))
+        least = minimum_filter1d(least, size, axis, mode="nearest")
+        largest = maximum_filter1d(largest, size, axis, mode="nearest")
     return np.where(least == largest, shape, np.int16(-1))
-
-
-def _running(extreme: np.ufunc, values: NDArray[np.int16], margin: int, axis: int) -> NDArray[np.int16]:
-    """Return the extreme value within ``margin`` on either side, by doubling: log2 passes over the image."""
-    pad = [(0, 0), (0, 0)]
-    pad[axis] = (margin, margin)
-    out = np.moveaxis(np.pad(values, pad, mode="edge"), axis, 0)
-    span, width = 1, 2 * margin + 1
-    while 2 * span <= width:
-        out = extreme(out[:-span], out[span:])
-        span *= 2
-    if span < width:
-        count = values.shape[axis]
-        out = extreme(out[:count], out[width - span : width - span + count])
-    return np.moveaxis(out, 0, axis)

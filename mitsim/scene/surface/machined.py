@@ -20,7 +20,7 @@ from characterisation.files.errors import InputError
 from mitsim.scene.surface.diffraction import Autocorrelation, coherent_share, lobe_alpha, phase_variance
 from mitsim.scene.surface.energy import energy_factors
 from mitsim.scene.surface.gloss import GLOSS_WAVELENGTH_NM, alpha_of_gloss, base_gloss, lobe_gloss
-from mitsim.scene.surface.measured import HeightMap, Profile
+from mitsim.scene.surface.machined_face import MachinedFace, check
 from mitsim.scene.surface.metals import normal_reflectance, refractive_index
 from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN
 from mitsim.scene.surface.processes import LAY_FACTOR, PROCESSES, Process, feed, feed_slope, micro_roughness
@@ -45,60 +45,7 @@ FACTORS = {
     "alpha": 1.0,
 }
 
-#: properties that determine the lobe of a face; at most one may be given
-INPUTS = ("height_map", "profile", "Rdq", "RSm", "gloss", "alpha", "alpha_u")
-
-#: largest ratio of a given Ra to a measured Ra (or Sa): samples and cut-offs differ
-RA_AGREES_WITHIN = 1.25
-
 NOSE_RADIUS_MM = 0.8
-
-
-@dataclass(frozen=True)
-class MachinedFace:
-    """Known properties of a machined face; None if not given.
-
-    - ``Ra``, ``Rq``, ``RSm`` [um]; ``Rdq`` [1].
-    - ``profile`` across the lay and ``profile_along`` it.
-    - ``gloss`` [GU at 60 deg].
-    - ``alpha``, ``alpha_u``, ``alpha_v`` [1] in Beckmann's sense at the sensor's wavelength.
-    - ``lay``: direction of the marks.
-    - ``nose_radius`` of the tool [mm]; ``feed_marks`` "blurred" or "resolved".
-    - ``alpha_factor``: a multiplier on alpha; ``wide_angle`` share.
-    """
-
-    metal: str = "aluminium"
-    process: str | None = None
-    Ra: float | None = None
-    Rq: float | None = None
-    Rdq: float | None = None
-    RSm: float | None = None
-    profile: Profile | None = None
-    profile_along: Profile | None = None
-    height_map: HeightMap | None = None
-    gloss: float | None = None
-    alpha: float | None = None
-    alpha_u: float | None = None
-    alpha_v: float | None = None
-    lay: Lay | None = None
-    nose_radius: float | None = None
-    feed_marks: str | None = None
-    alpha_factor: float = 1.0
-    wide_angle: float | None = None
-
-    @property
-    def process_or_default(self) -> str:
-        """Return the process, by default ground."""
-        return self.process or "ground"
-
-    @property
-    def roughness(self) -> float:
-        """Return Ra [um], measured if not given; NaN without either."""
-        if self.Ra is not None:
-            return self.Ra
-        if self.profile is not None:
-            return self.profile.Ra
-        return self.height_map.Sa if self.height_map is not None else float("nan")
 
 
 @dataclass(frozen=True)
@@ -134,7 +81,7 @@ def machined(
     process = PROCESSES[face.process_or_default]
     sigma = _height(face, process)
     feed_variance = 0.0
-    if process.feed_marks and face.feed_marks != "resolved" and not _said(face):
+    if process.feed_marks and face.feed_marks != "resolved" and not face.said:
         feed_variance = 2 * _feed_slope(face) ** 2
     lobe = _lobe(face, process, sigma, wavelength_nm, where)
     across = np.hypot(lobe.across, np.sqrt(feed_variance))
@@ -148,15 +95,15 @@ def machined(
     beckmann = deviation.beckmann(with_marks(process.beckmann), tails)
     lay: Lay = face.lay or "none"
     along, turn_deg = lobe.along, None
-    if deviation.lay_deg is not None and lay_is_open(face):
+    if deviation.lay_deg is not None and face.lay_is_open:
         # a drawn lay runs along u of a lobe that is turned
         strength = 1.0 if face.height_map is not None else LAY_FACTOR
         lay, turn_deg, along = "u", deviation.lay_deg, deviation.along(along, float(across), strength)
     mirror = float(np.hypot(ALPHA_FORM, np.sqrt(feed_variance)))
-    alpha_u, alpha_v = (
-        min(deviation.width(a * face.alpha_factor, lobe.factor), ALPHA_LARGEST)
-        for a in _directions(lay, float(across), along, face)
-    )
+    alphas = _by_u_and_v(lay, float(across), along)
+    if face.alpha_u is not None and face.alpha_v is not None:
+        alphas = face.alpha_u, face.alpha_v
+    alpha_u, alpha_v = (min(deviation.width(a * face.alpha_factor, lobe.factor), ALPHA_LARGEST) for a in alphas)
     share = process.wide_angle.share(face.roughness) if face.wide_angle is None else face.wide_angle
     ends = process.wide_angle.range(face.roughness) if face.wide_angle is None else (share, share)
     words = _in_words(face, lobe.provenance, turn_deg)
@@ -172,84 +119,11 @@ def machined(
         provenance=deviation.provenance_of(words, lobe.factor, ends, tails),
         lay=face.lay or "none",
         energy_factor=energy_factors(alpha_u, alpha_v, normal_reflectance(face.metal, wavelength_nm)),
-        coherent_alpha=_mirror_directions(lay, mirror),
+        coherent_alpha=_by_u_and_v(lay, mirror, ALPHA_FORM),
         beckmann_range=tails,
         turn_deg=turn_deg,
-        lay_open=lay_is_open(face),
+        lay_open=face.lay_is_open,
     )
-
-
-def lay_is_open(face: MachinedFace) -> bool:
-    """Return whether the process leaves marks whose direction is not given; ``lay = "none"`` says there are none."""
-    width_stated = face.lay is not None or face.alpha is not None or face.alpha_u is not None
-    return not width_stated and PROCESSES[face.process_or_default].lay_ratio < 1
-
-
-def check(face: MachinedFace, where: str) -> None:
-    """Reject properties that contradict one another, do not suffice, or would be unused.
-
-    Raises
-    ------
-    InputError
-        Naming both of two properties that exclude each other.
-    """
-    process_name = face.process_or_default
-    process = PROCESSES[process_name]
-    said = [name for name in INPUTS if getattr(face, name) is not None]
-    if face.alpha_v is not None and face.alpha_u is None:
-        raise InputError(where, "alpha_u", "nothing, beside alpha_v", "both alpha_u and alpha_v, or neither")
-    if face.alpha_u is not None and face.alpha_v is None:
-        raise InputError(where, "alpha_v", "nothing, beside alpha_u", "both alpha_u and alpha_v, or neither")
-    if len(said) > 1:
-        raise InputError(
-            where, said[1], f"{said[1]} beside {said[0]}", "one of them", f"keep {said[0]}, the better source"
-        )
-    if face.Ra is None and face.profile is None and face.height_map is None:
-        hint = "performance maps are looked up by Ra"
-        raise InputError(where, "Ra", "nothing", "a number of um, or a profile or height_map to take it from", hint)
-    measured = face.profile.Ra if face.profile else face.height_map.Sa if face.height_map else None
-    if face.Ra is not None and measured is not None:
-        source = "profile" if face.profile else "height_map"
-        if not 1 / RA_AGREES_WITHIN <= face.Ra / measured <= RA_AGREES_WITHIN:
-            allowed = f"the {measured:.3g} um of the {source}, within a factor {RA_AGREES_WITHIN:g}"
-            raise InputError(
-                where, "Ra", f"{face.Ra:g} um beside a {source}", allowed, "check its unit, or leave Ra out"
-            )
-    if face.Rq is not None:
-        if measured is not None:
-            raise InputError(
-                where, "Rq", "Rq beside a profile or height_map", "one of them", "Rq is taken from the file"
-            )
-        if face.Ra is not None and not 1 <= face.Rq / face.Ra <= 2:
-            raise InputError(where, "Rq", f"{face.Rq:g} um beside Ra {face.Ra:g} um", "1 to 2 times Ra")
-    if face.profile_along is not None and (face.profile is None or face.lay not in ("u", "v")):
-        raise InputError(where, "profile_along", "profile_along alone", "with profile and a lay of u or v")
-    if face.lay in ("u", "v"):
-        if face.alpha is not None or face.alpha_u is not None:
-            name = "alpha" if face.alpha is not None else "alpha_u and alpha_v"
-            raise InputError(
-                where, "lay", f"lay beside {name}", "one of them", "alpha_u and alpha_v already give the directions"
-            )
-        if process.lay_ratio == 1 and face.height_map is None and face.profile_along is None:
-            raise InputError(where, "lay", f"a lay on a {process_name} face", "none: that process leaves no lay")
-    if not process.feed_marks:
-        for name in ("nose_radius", "feed_marks"):
-            if getattr(face, name) is not None:
-                key = "nose_radius_mm" if name == "nose_radius" else name
-                raise InputError(where, key, f"{key} beside process {process_name}", "milled or turned faces only")
-    elif face.Rq is not None:
-        allowed = "none: the height between the feed marks is assumed from Ra"
-        raise InputError(where, "Rq", f"Rq beside process {process_name}", allowed, "leave Rq out")
-    elif face.feed_marks == "resolved" and face.alpha is None and face.alpha_u is None and _said(face):
-        allowed = "feed_marks blurred, or alpha of what lies between the marks"
-        raise InputError(where, said[0], f"{said[0]} beside feed_marks resolved", allowed, "it includes the marks")
-    elif face.nose_radius is not None and _said(face):
-        raise InputError(where, "nose_radius_mm", f"nose_radius_mm beside {said[0]}", "one of them")
-
-
-def _said(face: MachinedFace) -> bool:
-    """Return whether the lobe's width has a source other than Ra and process."""
-    return any(getattr(face, name) is not None for name in INPUTS)
 
 
 def _height(face: MachinedFace, process: Process) -> float:
@@ -363,18 +237,11 @@ def _length_of_alpha(alpha: float, sigma: float, nu: float) -> float | None:
     return float(np.exp(brentq(excess, *ends, xtol=1e-7)))
 
 
-def _directions(lay: Lay, across: float, along: float, face: MachinedFace) -> tuple[float, float]:
-    if face.alpha_u is not None and face.alpha_v is not None:
-        return face.alpha_u, face.alpha_v
+def _by_u_and_v(lay: Lay, across: float, along: float) -> tuple[float, float]:
+    """Return the widths along u and v of a lobe; one without a lay is as wide as across it."""
     if lay == "none":
         return across, across
     return (along, across) if lay == "u" else (across, along)
-
-
-def _mirror_directions(lay: Lay, mirror: float) -> tuple[float, float]:
-    if lay == "none":
-        return mirror, mirror
-    return (ALPHA_FORM, mirror) if lay == "u" else (mirror, ALPHA_FORM)
 
 
 def _prior_in_words(face: MachinedFace, process: Process) -> tuple[str, float]:
@@ -389,6 +256,6 @@ def _in_words(face: MachinedFace, provenance: str, turn_deg: float | None) -> st
     words = provenance
     if turn_deg is not None:
         words = f"{provenance}; lay drawn at {turn_deg:.0f} deg"
-    elif lay_is_open(face):
+    elif face.lay_is_open:
         words = f"{provenance}; lay not given: round, as wide as across the lay"
     return words if face.alpha_factor == 1 else f"{words}; times {face.alpha_factor:g}"

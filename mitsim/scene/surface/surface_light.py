@@ -12,7 +12,8 @@ from dataclasses import replace
 
 from characterisation.files.errors import InputError
 from characterisation.maps.light import Light, same_light
-from mitsim.scene.surface.machined import MachinedFace, machined
+from mitsim.scene.surface.machined import machined
+from mitsim.scene.surface.machined_face import MachinedFace
 from mitsim.scene.surface.metals import CONSTANTS, normal_reflectance
 from mitsim.scene.surface.paint import matt_white, paint
 from mitsim.scene.surface.processes import PROCESSES

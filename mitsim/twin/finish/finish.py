@@ -24,7 +24,8 @@ from characterisation.files.errors import InputError
 from mitsim.scene.materials import Finish
 from mitsim.scene.surface.diffraction import phase_variance
 from mitsim.scene.surface.energy import energy_factors
-from mitsim.scene.surface.machined import MachinedFace, machined
+from mitsim.scene.surface.machined import machined
+from mitsim.scene.surface.machined_face import MachinedFace
 from mitsim.scene.surface.metals import CONSTANTS, normal_reflectance, refractive_index
 from mitsim.scene.surface.processes import PROCESSES
 from mitsim.scene.surface.roughness import ALPHA_LARGEST

@@ -22,7 +22,8 @@ from scipy.optimize import least_squares
 from scipy.special import expit, logit
 from scipy.stats import chi2
 
-from mitsim.scene.surface.machined import FACTORS, MachinedFace, machined
+from mitsim.scene.surface.machined import FACTORS, machined
+from mitsim.scene.surface.machined_face import MachinedFace
 from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN, Distribution, shadowing, slope_density
 from mitsim.scene.surface.processes import LARGEST_WIDE_ANGLE, PROCESSES
 from mitsim.scene.surface.roughness import ALPHA_LARGEST, stylus_slope

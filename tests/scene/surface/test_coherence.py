@@ -7,7 +7,8 @@ import pytest
 
 from mitsim.scene.surface.coherence import coherent_weight
 from mitsim.scene.surface.energy import facets
-from mitsim.scene.surface.machined import MachinedFace, machined
+from mitsim.scene.surface.machined import machined
+from mitsim.scene.surface.machined_face import MachinedFace
 from mitsim.scene.surface.processes import PROCESSES
 from tests.figures_of_surfaces import lobe_factor
 

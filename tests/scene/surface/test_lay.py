@@ -3,7 +3,8 @@
 import pytest
 
 from mitsim.scene.surface.lay import lay_left_out, lays_in_words
-from mitsim.scene.surface.machined import MachinedFace, machined
+from mitsim.scene.surface.machined import machined
+from mitsim.scene.surface.machined_face import MachinedFace
 from mitsim.scene.surface.paint import matt_white
 
 

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from characterisation.files.errors import InputError
 from mitsim.scene.surface.diffraction import lobe_alpha
 from mitsim.scene.surface.gloss import lobe_gloss
-from mitsim.scene.surface.machined import MachinedFace, machined
+from mitsim.scene.surface.machined import machined
+from mitsim.scene.surface.machined_face import MachinedFace
 from mitsim.scene.surface.measured import height_map, profile
 from mitsim.scene.surface.metals import CONSTANTS, refractive_index
 from mitsim.scene.surface.processes import PROCESSES, feed, feed_slope

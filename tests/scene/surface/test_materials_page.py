@@ -10,7 +10,8 @@ from scipy.optimize import brentq
 
 from mitsim.scene.surface.diffraction import coherent_share, lobe_alpha
 from mitsim.scene.surface.energy import directional_albedo, energy_factors
-from mitsim.scene.surface.machined import MachinedFace, machined
+from mitsim.scene.surface.machined import machined
+from mitsim.scene.surface.machined_face import MachinedFace
 from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN
 from mitsim.scene.surface.processes import PROCESSES
 from mitsim.scene.surface.roughness import (

@@ -25,7 +25,8 @@ from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.cli.program import app
 from mitsim.scene.differentiable import Directions, SpecularLobe
 from mitsim.scene.load import load_scene
-from mitsim.scene.surface.machined import MachinedFace, machined
+from mitsim.scene.surface.machined import machined
+from mitsim.scene.surface.machined_face import MachinedFace
 from mitsim.scene.surface.scatter import Deviation
 from mitsim.sensor.image_formation import expose
 from mitsim.sensor.imager import Imager
