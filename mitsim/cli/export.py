@@ -279,3 +279,26 @@ def _counted(cloud: PointCloud) -> str:
 
     with_sigma = 0 if cloud.sigma is None else int(np.isfinite(cloud.sigma[cloud.valid]).sum())
     return f"{int(cloud.valid.sum())} points, {with_sigma} of them with a covariance"
+
+
+def report(
+    folder: Annotated[Path, typer.Argument(help="Folder of mitsim run or mitsim study choose.")],
+    pdf: Annotated[
+        bool, typer.Option("--pdf", help="Write a statement of uncertainty on one A4 sheet, to sign.")
+    ] = False,
+) -> None:
+    """Rewrite the HTML page of a finished run or of a comparison of sensors.
+
+    Example: mitsim report runs/two_pillars --pdf
+    """
+    from mitsim.report.choice_page import write_choice_page
+    from mitsim.report.page import write_report
+    from mitsim.report.sheet import write_sheet
+    from mitsim.study.choice_document import CHOICE
+
+    if pdf:
+        say(f"sheet: {write_sheet(folder)}")
+    elif (folder / CHOICE).exists():
+        say(f"page: {write_choice_page(folder)}")
+    else:
+        say(f"report: {write_report(folder)}")

@@ -84,7 +84,7 @@ def _common(
 for command in (
     machine.doctor,
     studies.run,
-    studies.report,
+    export.report,
     parts.part,
     parts.check,
     render.render,

@@ -1,4 +1,4 @@
-"""Commands on a study: run, choose, score, state, exposures, report."""
+"""Commands on a study: run, choose, score, state, exposures."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mitsim.running.time_limit import TimeLimit, ending_in_order, stopped_by_use
 
 if TYPE_CHECKING:
     from characterisation.statements.statement import Statement
-    from mitsim.study.run_folder import ViewSetEntry
+    from mitsim.study.run_document import ViewSetEntry
 
 
 StudyFile = Annotated[Path, typer.Argument(help="Study TOML file: part, task, sensor and views.")]
@@ -247,15 +247,8 @@ def exposures(
     options.start(variant)
 
     from mitsim.study import ExposureTable, open_study
+    from mitsim.study.exposures import planned
     from mitsim.study.exposures.exposure_plan import PlanRules
-    from mitsim.study.exposures.planned import (
-        plan_document,
-        plan_in_words,
-        plan_table,
-        plan_view,
-        rendered,
-        write_plan_csv,
-    )
     from mitsim.study.session import Session
 
     options.check_folder(output)
@@ -264,13 +257,13 @@ def exposures(
     table = chosen.file.exposure or ExposureTable()
     rules = PlanRules(most or table.most, within or table.within)
     with ending_in_order():
-        plan = plan_view(rendered(Session(chosen).measurements), shown, rules, limit)
+        plan = planned.plan_view(planned.rendered(Session(chosen).measurements), shown, rules, limit)
         stopped = stopped_by_user()
-    document = plan_document(chosen, plan)
+    document = planned.plan_document(chosen, plan)
     write_json(output / "exposures.json", document)
-    write_plan_csv(output / "exposures.csv", plan)
-    print(json.dumps(document, indent=2) if as_json else plan_table(plan))
-    say(f"plan: {output / 'exposures.json'}\n{plan_in_words(plan)}")
+    planned.write_plan_csv(output / "exposures.csv", plan)
+    print(json.dumps(document, indent=2) if as_json else planned.plan_table(plan))
+    say(f"plan: {output / 'exposures.json'}\n{planned.plan_in_words(plan)}")
     if stopped:
         raise KeyboardInterrupt  # exit code 130
     if plan.unseen or not plan.reached:
@@ -349,26 +342,3 @@ def score(
     for name in measurement or chosen.task.measurements:
         print(best_views(scores, name, top, chosen.task.shapes_for(name)))
     say(f"scores: {output / 'scores.csv'}\nposes: {output / 'poses'}")
-
-
-def report(
-    folder: Annotated[Path, typer.Argument(help="Folder of mitsim run or mitsim study choose.")],
-    pdf: Annotated[
-        bool, typer.Option("--pdf", help="Write a statement of uncertainty on one A4 sheet, to sign.")
-    ] = False,
-) -> None:
-    """Rewrite the HTML page of a finished run or of a comparison of sensors.
-
-    Example: mitsim report runs/two_pillars --pdf
-    """
-    from mitsim.report.choice_page import write_choice_page
-    from mitsim.report.page import write_report
-    from mitsim.report.sheet import write_sheet
-    from mitsim.study.choice_document import CHOICE
-
-    if pdf:
-        say(f"sheet: {write_sheet(folder)}")
-    elif (folder / CHOICE).exists():
-        say(f"page: {write_choice_page(folder)}")
-    else:
-        say(f"report: {write_report(folder)}")

@@ -33,7 +33,8 @@ from mitsim.report.pose_texts import expected_texts, pose_of_view, pose_texts
 from mitsim.report.statement_section import rules_in_words, stated_rules, statement_section
 from mitsim.report.templates import write_page
 from mitsim.report.view_sphere import view_sphere
-from mitsim.study.run_folder import Run, RunnerUp, read_run
+from mitsim.study.run_document import RunnerUp
+from mitsim.study.run_folder import Run, read_run
 from mitsim.study.scene_geometry import read_scene_geometry
 from mitsim.study.virtual.race import ALL
 

@@ -2,8 +2,7 @@
 
 Both views are ray cast. The left one is the part of the reference camera's image that shows the part, with lens
 distortion, on finer rays than its pixels, and the whole image as a small map; the right one looks along -z of the part,
-to scale. Shading depends on the normal alone to show the form, not on any lamp. Faces that no measurement needs are
-grey.
+to scale. Shading depends on the normal alone, not on any lamp. Faces that no measurement needs are grey.
 """
 
 from __future__ import annotations
@@ -52,6 +51,9 @@ _OVERVIEW = 0.36
 #: free border around the part, relative to its size in the image
 _MARGIN = 0.06
 
+#: four edges of what a picture shows, [px] or [mm]
+_Window = tuple[float, float, float, float]
+
 _SENSOR_MARK: dict[str, Any] = {"marker": "^", "ms": 6, "mfc": "white", "mec": INK, "mew": 1.1}
 
 #: width of the figure [in]
@@ -94,7 +96,8 @@ def preview_figure(
     colours = _colours(facts, first, measured)
     with drawing():
         camera = sensor.rig.reference
-        rows = max(len(_features(facts, colours, measured)), 6)
+        features = _features(facts, colours, measured)
+        rows = max(len(features), 6)
         height = _TITLE_IN + _PANEL_IN + _ROW_IN * (rows + 1)
         figure = Figure((_WIDTH_IN, height))
         bottom, tall = 1 - (_TITLE_IN + _PANEL_IN) / height, _PANEL_IN / height
@@ -111,10 +114,9 @@ def preview_figure(
         left.set_title(f"from {sensor.name} at ({origin}) mm, {camera.width} × {camera.height} px", loc="left")
         right.set_title("from above, along −z of the part", loc="left")
         under = bottom - 0.1 / height
-        for handles, x in ((_features(facts, colours, measured), 0.008), (_marks(sensor), wide + 0.028)):
-            figure.legend(
-                handles=handles, loc="upper left", bbox_to_anchor=(x, under), borderaxespad=0.0, handlelength=1.8
-            )
+        for handles, x in ((features, 0.008), (_marks(sensor), wide + 0.028)):
+            place: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (x, under), "borderaxespad": 0.0}
+            figure.legend(handles=handles, handlelength=1.8, **place)
     return figure
 
 
@@ -122,16 +124,13 @@ def _colours(facts: SceneFacts, first: Sequence[str], measured: Collection[str])
     """Return one colour for each shape, in the order of the scene; more measured shapes than colours repeat them."""
     shapes = facts.shapes
     if measured:
-        rank = {
-            shape_facts.name: k for k, shape_facts in enumerate(shape for shape in shapes if shape.name in measured)
-        }
+        rank = {name: k for k, name in enumerate(shape.name for shape in shapes if shape.name in measured)}
         return [SHAPES[rank[shape.name] % len(SHAPES)] if shape.name in rank else OTHER_SHAPE for shape in shapes]
     order = sorted(
         range(len(shapes)),
         key=lambda i: (shapes[i].emitter, shapes[i].name not in first, -np.nan_to_num(shapes[i].area), i),
     )
-    coloured = order if len(order) <= len(SHAPES) else order[: len(SHAPES)]
-    by_shape = dict(zip(coloured, SHAPES, strict=False))
+    by_shape = dict(zip(order, SHAPES, strict=False))
     return [by_shape.get(i, OTHER_SHAPE) for i in range(len(shapes))]
 
 
@@ -151,7 +150,7 @@ def _painted(
 
 def _from_sensor(
     axes: Axes, scene: Scene, colours: list[str], sensor: Sensor, pose: Transform, visible: VisibleSurfaces
-) -> tuple[float, float, float, float]:
+) -> _Window:
     """Draw the part in the image; return the part of the image that is shown: left, right, top, bottom [px]."""
     height, width = visible.shape.shape
     seen = visible.shape >= 0
@@ -164,21 +163,19 @@ def _from_sensor(
     hits = first_hits(scene.mitsuba, np.broadcast_to(pose.points(camera.centre), world.shape), world)
     light = np.array([-0.35, -0.45, -0.82])  # from behind the sensor's left shoulder
     lit = np.clip(pose.inverse().directions(hits.normal) @ (light / np.linalg.norm(light)), 0, 1).reshape(size)
-    nearest = tuple(
-        np.clip(np.rint(coordinate).astype(int), 0, end - 1) for coordinate, end in ((rows, height), (columns, width))
-    )
-    clear = (visible.seen_by_all & np.where(seen, _within(sensor, visible), False))[nearest]
+    nearest = np.rint(rows).astype(int).clip(0, height - 1), np.rint(columns).astype(int).clip(0, width - 1)
+    clear = visible.seen_by_all & seen
+    clear[seen] &= in_working_volume(sensor, visible.point[seen])
     source = without_leaks(hits.shape.reshape(size), hits.front.reshape(size))
     shape, front = hits.shape.reshape(-1)[source], hits.front.reshape(-1)[source]
-    image = _painted(shape, front, lit.reshape(-1)[source], colours, clear)
+    image = _painted(shape, front, lit.reshape(-1)[source], colours, clear[nearest])
     axes.imshow(image, extent=(left, right, bottom, top), interpolation="antialiased", zorder=0)
     _frames(axes, sensor)
     axes.set(xlim=(left, right), ylim=(bottom, top))
     bare(axes)
     if not seen.any():
-        axes.text(
-            (left + right) / 2, (top + bottom) / 2, "the image shows no part", ha="center", va="center", color=MUTED
-        )
+        middle = ((left + right) / 2, (top + bottom) / 2)
+        axes.text(*middle, "the image shows no part", ha="center", va="center", color=MUTED)
         return window
     at = float(np.median(depth(sensor, visible.point[seen])))
     pixels = float(camera.matrix[0, 0]) / at
@@ -203,20 +200,25 @@ def without_leaks(shape: NDArray[np.int16], front: NDArray[np.bool_]) -> NDArray
     return index
 
 
-def _part_in_image(axes: Axes, seen: NDArray[np.bool_]) -> tuple[float, float, float, float]:
+def _part_in_image(axes: Axes, seen: NDArray[np.bool_]) -> _Window:
     """Return left, right, top, bottom [px] in the proportions of the axes: the part, or the whole image without one."""
     height, width = seen.shape
     rows, columns = np.nonzero(seen)
     low = np.array([columns.min(), rows.min()]) if len(rows) else np.zeros(2)
     high = np.array([columns.max(), rows.max()]) if len(rows) else np.array([width - 1.0, height - 1.0])
-    box, figure = axes.get_position(), axes.get_figure()
-    assert isinstance(figure, Figure)
-    inches = figure.get_size_inches()
-    shape = box.width * inches[0] / (box.height * inches[1])
+    shape = _proportions(axes)
     extent = (1 + 2 * _MARGIN) * np.maximum(high - low + 1, 8.0)
     across = max(float(extent[0]), shape * float(extent[1]))
     cx, cy = ((low + high) / 2).tolist()
     return cx - across / 2, cx + across / 2, cy - across / shape / 2, cy + across / shape / 2
+
+
+def _proportions(axes: Axes) -> float:
+    """Return the width of axes over their height."""
+    box, figure = axes.get_position(), axes.get_figure()
+    assert isinstance(figure, Figure)
+    width, height = figure.get_size_inches()
+    return float(box.width * width / (box.height * height))
 
 
 def _frames(axes: Axes, sensor: Sensor) -> None:
@@ -228,9 +230,7 @@ def _frames(axes: Axes, sensor: Sensor) -> None:
         axes.contour(columns, rows, region, [0.5], colors=INK, linewidths=0.9, linestyles=style)
 
 
-def _whole_image(
-    small: Axes, sensor: Sensor, seen: NDArray[np.bool_], window: tuple[float, float, float, float]
-) -> None:
+def _whole_image(small: Axes, sensor: Sensor, seen: NDArray[np.bool_], window: _Window) -> None:
     """Draw the whole image of the reference camera as a small map, with the part that the large picture shows."""
     height, width = seen.shape
     small.imshow(np.where(seen, 0.6, 1.0), cmap="gray", vmin=0, vmax=1, interpolation="antialiased")
@@ -240,13 +240,6 @@ def _whole_image(
     small.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
     bare(small)
     small.set_anchor("NE")
-
-
-def _within(sensor: Sensor, visible: VisibleSurfaces) -> NDArray[np.bool_]:
-    inside = np.zeros(visible.shape.shape, bool)
-    seen = visible.shape >= 0
-    inside[seen] = in_working_volume(sensor, visible.point[seen])
-    return inside
 
 
 def _from_above(
@@ -275,13 +268,9 @@ def _from_above(
     _axes_mark(axes)
 
 
-def _window(axes: Axes, low: Floats, high: Floats) -> tuple[float, float, float, float]:
+def _window(axes: Axes, low: Floats, high: Floats) -> _Window:
     """Return left, right, bottom, top [mm] in the proportions of the axes: the part, and space for the overview."""
-    box = axes.get_position()
-    figure = axes.get_figure()
-    assert isinstance(figure, Figure)
-    width, height = figure.get_size_inches()
-    shape = box.width * width / (box.height * height)
+    shape = _proportions(axes)
     part = np.maximum(high - low, 1e-3)
     across = max(1.12 * part[0], shape * part[1] / (1 - _OVERVIEW - 0.17))
     tall = across / shape
@@ -290,9 +279,7 @@ def _window(axes: Axes, low: Floats, high: Floats) -> tuple[float, float, float,
     return cx - across / 2, cx + across / 2, bottom, bottom + tall
 
 
-def _outline(
-    axes: Axes, facts: SceneFacts, sensor: Sensor, pose: Transform, window: tuple[float, float, float, float]
-) -> Floats:
+def _outline(axes: Axes, facts: SceneFacts, sensor: Sensor, pose: Transform, window: _Window) -> Floats:
     """Draw the working volume's outline at the part's half height; return the points (n, 2) of the window inside."""
     x, y = np.linspace(*window[:2], _COARSE), np.linspace(*window[2:], _COARSE)
     grid = np.meshgrid(x, y)
@@ -312,8 +299,9 @@ def _overview(axes: Axes, facts: SceneFacts, sensor: Sensor, pose: Transform) ->
     half = np.maximum(np.abs(high - middle), reach)
     wide = (middle[0] - half[0], middle[0] + half[0], middle[1] - half[1], middle[1] + half[1])
     inside = _outline(axes, facts, sensor, pose, wide)
-    axes.add_patch(Rectangle(_pair(low), *_pair(high - low), facecolor=OTHER_SHAPE, edgecolor="none", zorder=1))
-    axes.plot(*_pair(stand), **_SENSOR_MARK, zorder=6)
+    (left, bottom), (width, height) = low.tolist(), (high - low).tolist()
+    axes.add_patch(Rectangle((left, bottom), width, height, facecolor=OTHER_SHAPE, edgecolor="none", zorder=1))
+    axes.plot(*stand.tolist(), **_SENSOR_MARK, zorder=6)
     shown = np.concatenate([np.stack([low, high, stand]), inside])
     margin = 0.08 * float(np.ptp(shown, axis=0).max())
     axes.set_xlim(shown[:, 0].min() - margin, shown[:, 0].max() + margin)
@@ -323,24 +311,13 @@ def _overview(axes: Axes, facts: SceneFacts, sensor: Sensor, pose: Transform) ->
     axes.set_facecolor("white")
 
 
-def _pair(point: Floats) -> tuple[float, float]:
-    return float(point[0]), float(point[1])
-
-
 def _axes_mark(axes: Axes) -> None:
     """Draw the directions of the part's x and y in the upper left corner."""
     for name, (dx, dy) in {"x": (0.11, 0.0), "y": (0.0, 0.11)}.items():
-        axes.annotate(
-            "",
-            (0.04 + dx, 0.84 + dy),
-            (0.04, 0.84),
-            xycoords="axes fraction",
-            zorder=6,
-            arrowprops={"arrowstyle": "->", "color": INK, "lw": 0.9, "shrinkA": 0, "shrinkB": 0},
-        )
-        axes.text(
-            0.045 + 1.15 * dx, 0.845 + 1.1 * dy, name, transform=axes.transAxes, fontsize=7.5, va="center", zorder=6
-        )
+        arrow = {"arrowstyle": "->", "color": INK, "lw": 0.9, "shrinkA": 0, "shrinkB": 0}
+        end, place = (0.04 + dx, 0.84 + dy), (0.045 + 1.15 * dx, 0.845 + 1.1 * dy)
+        axes.annotate("", end, (0.04, 0.84), xycoords="axes fraction", zorder=6, arrowprops=arrow)
+        axes.text(*place, name, transform=axes.transAxes, fontsize=7.5, va="center", zorder=6)
 
 
 def _features(facts: SceneFacts, colours: list[str], measured: Collection[str]) -> list[Patch | Line2D]:
@@ -349,14 +326,8 @@ def _features(facts: SceneFacts, colours: list[str], measured: Collection[str]) 
         Patch(facecolor=colours[i], edgecolor=MUTED, lw=0.5, label=_label(facts.shapes[i])) for i in named
     ]
     if grey := len(colours) - len(named):
-        handles.append(
-            Patch(
-                facecolor=OTHER_SHAPE,
-                edgecolor=MUTED,
-                lw=0.5,
-                label=f"{grey} {'not measured' if measured else 'more shapes'}",
-            )
-        )
+        label = f"{grey} {'not measured' if measured else 'more shapes'}"
+        handles.append(Patch(facecolor=OTHER_SHAPE, edgecolor=MUTED, lw=0.5, label=label))
     return handles
 
 

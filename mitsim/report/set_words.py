@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from characterisation.statements.verdict_words import OFTEN, Reason, in_words
 from characterisation.words.numbers import two_digits
-from mitsim.study.run_folder import ConfirmedEntry, ViewSetEntry
+from mitsim.study.run_document import ConfirmedEntry, ViewSetEntry
 
 _OUT_OF_REACH = " is out of reach"
 

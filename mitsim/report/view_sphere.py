@@ -25,7 +25,8 @@ from mitsim.report.first_rows import bias_words
 from mitsim.report.pose_texts import expected_texts, pose_of_view, pose_texts
 from mitsim.report.templates import joined_script, script_content
 from mitsim.report.view_data import as_json, solids, view_data
-from mitsim.study.run_folder import Run, TriedEntry, ViewSetEntry
+from mitsim.study.run_document import TriedEntry, ViewSetEntry
+from mitsim.study.run_folder import Run
 
 #: views in the table that replaces the sphere
 TOP = 10

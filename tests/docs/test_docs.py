@@ -40,7 +40,7 @@ from mitsim.sensor.sensor_file import ImagerTable, ProjectorTable, SensorFile
 from mitsim.sensor.unknowns import UnknownsTable
 from mitsim.study import StudyFile
 from mitsim.study.many_captures import ManyFile
-from mitsim.study.run_folder import RunDocument
+from mitsim.study.run_document import RunDocument
 from mitsim.study.scoring import pose_columns
 from mitsim.study.statement_file import StatementDocument
 from mitsim.talk.talk_file import TalkFile

@@ -7,7 +7,8 @@ import pytest
 from characterisation.statements.verdict_words import Reason
 from mitsim.report.first_screen import of_run
 from mitsim.report.set_words import set_result, with_sets
-from mitsim.study.run_folder import ConfirmedEntry, ViewSetEntry, read_run
+from mitsim.study.run_document import ConfirmedEntry, ViewSetEntry
+from mitsim.study.run_folder import read_run
 from tests.report.conftest import MEASUREMENTS, write_run
 
 LIMITS = {"apart": 0.1, "radius": 0.2}
