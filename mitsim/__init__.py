@@ -70,7 +70,7 @@ if TYPE_CHECKING:
     from mitsim.capture.truth import Truth, read_truth
     from mitsim.decoding.decode import decode, read_cloud
     from mitsim.decoding.own_code import triangulate
-    from mitsim.maps.campaign.plan import CampaignFile
+    from mitsim.maps.campaign.campaign_file import CampaignFile
     from mitsim.maps.use import characterise, performance_map, predict
     from mitsim.scene.load import Scene
     from mitsim.scene.ray_casting.true_points import true_points

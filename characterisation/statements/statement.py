@@ -213,15 +213,8 @@ class Statements(list[Statement]):
         for entry in self:
             shares = {line.group: line.share for line in entry.budget}
             unsettled = frozenset(line.group for line in entry.budget if not line.settled)
-            row = ErrorRow(
-                entry.measurement,
-                entry.bias,
-                entry.standard_uncertainty,
-                entry.interval,
-                shares,
-                entry.verdict,
-                unsettled,
-            )
+            u = entry.standard_uncertainty
+            row = ErrorRow(entry.measurement, entry.bias, u, entry.interval, shares, entry.verdict, unsettled)
             rows.setdefault(entry.unit, []).append(row)
         columns = 2 if ax is None and any(entry.budget for entry in self) else 1
         heights = [ROW_IN * len(of_unit) + MARGIN_IN for of_unit in rows.values()]

@@ -58,7 +58,7 @@ def read_journey(
     InputError
         If a file cannot be read, or no campaign is given.
     """
-    from mitsim.maps.campaign.plan import CampaignFile
+    from mitsim.maps.campaign.campaign_file import CampaignFile
     from mitsim.study import StudyFile
 
     named = read_toml(study, StudyFile).characterisation.campaign

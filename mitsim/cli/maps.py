@@ -46,8 +46,9 @@ def make(
     options.start(variant)
     from characterisation.files.documents import read_toml
     from mitsim.maps.campaign.acquire import check_directions, found_shots, found_source, in_turn, out_of_range
+    from mitsim.maps.campaign.campaign_file import CampaignFile
     from mitsim.maps.campaign.live import live_source, place_by_place, plan_live
-    from mitsim.maps.campaign.plan import CampaignFile, plan_campaign
+    from mitsim.maps.campaign.plan import plan_campaign
     from mitsim.maps.campaign.run import measure_captures, run_campaign
     from mitsim.maps.use import simulate_campaign
     from mitsim.report.figures import write_map_figures
@@ -203,6 +204,7 @@ def validate(
     from characterisation.maps.validation import residual_table, within_limits
     from mitsim.capture.simulated.simulate import SimulatedSensor
     from mitsim.maps.campaign.acquire import CaptureSource, simulated_source
+    from mitsim.maps.campaign.campaign_file import CampaignFile
     from mitsim.maps.campaign.hold_out import (
         compare,
         held_out_campaign,
@@ -212,7 +214,6 @@ def validate(
         hold_out_order,
     )
     from mitsim.maps.campaign.live import live_source
-    from mitsim.maps.campaign.plan import CampaignFile
     from mitsim.maps.campaign.run import write_netcdf
     from mitsim.report.style import write_png
     from mitsim.report.validation_figures import agreement_figure, validation_table

@@ -34,7 +34,7 @@ from mitsim.decoding.device_maps import DeviceMapGeometry, roi_of_other_grid
 from mitsim.decoding.exposures import MERGED_FULL_SCALE, companded, merge_exposures
 from mitsim.decoding.grey_levels import MeasuredNoise, with_dark_noise
 from mitsim.decoding.grid_cloud import empty_cloud
-from mitsim.decoding.matching.stereo import StereoGeometry
+from mitsim.decoding.matching.stereo_geometry import StereoGeometry
 from mitsim.sensor.decoder_settings import DecoderSettings, DeviceMapSettings
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.matcher import MatcherSettings

@@ -35,7 +35,8 @@ from mitsim.decoding.matching.reference_matching import (
     reference_geometry,
     unknown_mask,
 )
-from mitsim.decoding.matching.stereo import StereoGeometry, decode_stereo, stereo_geometry
+from mitsim.decoding.matching.stereo import decode_stereo
+from mitsim.decoding.matching.stereo_geometry import StereoGeometry, stereo_geometry
 from mitsim.decoding.structured_light.decoder import decode_structured_light
 from mitsim.decoding.structured_light.geometry import StructuredLightGeometry, structured_light_geometry
 from mitsim.decoding.structured_light.projector_coordinate import ProjectorCoordinate

@@ -16,9 +16,10 @@ from characterisation.point_cloud import PointCloud
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.campaign.acquire import coupon_residuals, in_turn, simulated_source
+from mitsim.maps.campaign.campaign_file import CampaignFile
 from mitsim.maps.campaign.missing_finishes import NeededFinishes, map_with_finishes, seen_finishes
 from mitsim.maps.campaign.orders import worker_source
-from mitsim.maps.campaign.plan import Campaign, CampaignFile, plan_campaign
+from mitsim.maps.campaign.plan import Campaign, plan_campaign
 from mitsim.maps.campaign.run import run_campaign
 from mitsim.maps.prediction import CharacterisedScene, Predictor
 from mitsim.running.executor import Executor

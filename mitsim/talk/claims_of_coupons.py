@@ -13,7 +13,7 @@ from characterisation.files.arrays import Floats
 from characterisation.files.documents import read_toml
 from characterisation.lambert_projection import inverse_lambert_projection
 from characterisation.words.numbers import two_digits
-from mitsim.maps.campaign.plan import CampaignFile
+from mitsim.maps.campaign.campaign_file import CampaignFile
 from mitsim.sensor.sensor import Sensor
 from mitsim.talk import sensor_figures as figures
 from mitsim.talk.coupon_pieces import roughness_of

@@ -23,9 +23,10 @@ from characterisation.files.errors import InputError
 from characterisation.maps.validation import residual_table
 from characterisation.point_cloud import PointCloud
 from mitsim.maps.campaign.acquire import coupon_cloud, in_turn, simulated_source
+from mitsim.maps.campaign.campaign_file import Band, CampaignFile, SampleEntry
 from mitsim.maps.campaign.hold_out import compared, random_normals
 from mitsim.maps.campaign.orders import PreparedSensor, prepared_sensor
-from mitsim.maps.campaign.plan import Band, Campaign, CampaignFile, SampleEntry, Series, Shot, plan_campaign
+from mitsim.maps.campaign.plan import Campaign, Series, Shot, plan_campaign
 from mitsim.maps.campaign.run import run_campaign
 from mitsim.maps.campaign.store import Finished
 from mitsim.maps.prediction import CharacterisedScene

@@ -21,7 +21,7 @@ from pydantic import BaseModel
 from characterisation.files.checked_files import read_bounded
 from characterisation.files.documents import read_toml
 from characterisation.maps.shipped import map_path
-from mitsim.maps.campaign.plan import CampaignFile
+from mitsim.maps.campaign.campaign_file import CampaignFile
 from mitsim.scene import backend
 from mitsim.scene.xml_check import named_digests
 from mitsim.sensor.sensor_text import sensor_checksum

@@ -23,7 +23,7 @@ from scipy.ndimage import binary_dilation, label
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
 from mitsim.decoding.cloud import capture_cloud, decoder_settings
-from mitsim.decoding.matching.stereo import StereoGeometry, stereo_geometry
+from mitsim.decoding.matching.stereo_geometry import StereoGeometry, stereo_geometry
 
 Floats = NDArray[np.float64]
 #: rows and columns of each plate in the rectified left image, and of both plates in the raw right one

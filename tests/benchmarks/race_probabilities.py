@@ -19,7 +19,8 @@ import numpy as np
 
 from characterisation.statements.selection import joint_samples, judge
 from mitsim.scene import backend
-from mitsim.study.virtual.race import BATCH, FIRST, combined_risk, possible_measurements, prior_risk
+from mitsim.study.virtual.race import BATCH, FIRST
+from mitsim.study.virtual.risks import combined_risk, possible_measurements, prior_risk
 from tests.proofs.case_trials import trials_by_kind
 from tests.proofs.judgement import true_risk
 from tests.proofs.part_cases import PartCase, read_part_cases

@@ -31,7 +31,7 @@ from mitsim.capture.capture_document import CaptureDocument
 from mitsim.capture.devices.depthai_settings import DepthaiSettings
 from mitsim.cli.options import DefaultCommandGroup
 from mitsim.cli.program import app
-from mitsim.maps.campaign.plan import CampaignFile
+from mitsim.maps.campaign.campaign_file import CampaignFile
 from mitsim.maps.campaign.run import _all_patches
 from mitsim.maps.campaign.stage_pose import StageCalibrationFile
 from mitsim.scene.surface.surface_light import nominal_light

@@ -90,7 +90,7 @@ def _read_study(path):
 
 def _read_campaign(path):
     from characterisation.files.documents import read_toml
-    from mitsim.maps.campaign.plan import CampaignFile
+    from mitsim.maps.campaign.campaign_file import CampaignFile
 
     read_toml(path, CampaignFile)
 
@@ -410,7 +410,8 @@ def _capture(path):
 
 
 def _patches(folder):
-    from mitsim.maps.campaign.plan import CampaignFile, plan_campaign
+    from mitsim.maps.campaign.campaign_file import CampaignFile
+    from mitsim.maps.campaign.plan import plan_campaign
     from mitsim.maps.campaign.run import run_campaign
     from mitsim.sensor.preset import load_sensor
     from tests.maps.campaign.known_clouds import known_source, smooth

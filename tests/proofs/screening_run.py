@@ -37,7 +37,8 @@ from characterisation.words.progress import say
 from mitsim.maps.prediction import Predictor
 from mitsim.running.executor import Executor
 from mitsim.study import Study
-from mitsim.study.virtual.race import FIRST, combined_cost, first_of_each, prior_risk
+from mitsim.study.virtual.race import FIRST
+from mitsim.study.virtual.risks import combined_cost, first_of_each, prior_risk
 from mitsim.views.view_scores import RAYS, screening_risk
 from tests.proofs.case_trials import days, keep_trials, measure_worlds, measured_truth, trials_by_kind
 from tests.proofs.part_cases import PartCase

@@ -18,7 +18,8 @@ from characterisation.region_of_interest import Roi
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.recordings.ensenso import ensenso_originals, read_ensenso
 from mitsim.decoding.image_context import ImageContext
-from mitsim.decoding.matching.stereo import decode_stereo, stereo_geometry
+from mitsim.decoding.matching.stereo import decode_stereo
+from mitsim.decoding.matching.stereo_geometry import stereo_geometry
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.transforms import Transform
 

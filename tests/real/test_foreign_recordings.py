@@ -19,7 +19,8 @@ from mitsim.decoding.checks.pair_sanity import row_error_warnings
 from mitsim.decoding.checks.sanity import pair_row_error
 from mitsim.decoding.cloud import capture_cloud, decoder_settings
 from mitsim.decoding.image_context import ImageContext
-from mitsim.decoding.matching.stereo import decode_stereo, stereo_geometry
+from mitsim.decoding.matching.stereo import decode_stereo
+from mitsim.decoding.matching.stereo_geometry import stereo_geometry
 from tests.capture.recordings.test_depthai_files import against_the_package
 
 pytestmark = pytest.mark.real

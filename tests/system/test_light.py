@@ -15,7 +15,8 @@ from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.capture.simulated.surface_speckle import finish_contrast
 from mitsim.decoding.cloud import capture_cloud, sensor_geometry
 from mitsim.maps.campaign.acquire import coupon_cloud, simulated_source
-from mitsim.maps.campaign.plan import CampaignFile, plan_campaign
+from mitsim.maps.campaign.campaign_file import CampaignFile
+from mitsim.maps.campaign.plan import plan_campaign
 from mitsim.scene.backend import mi
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.ray_casting.raycast import PixelRays, cast

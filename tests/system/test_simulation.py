@@ -19,9 +19,10 @@ from mitsim.capture.simulated.render_residual import LIMIT, RenderResidual, larg
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decoding.cloud import capture_cloud
-from mitsim.decoding.matching.stereo import stereo_geometry
+from mitsim.decoding.matching.stereo_geometry import stereo_geometry
 from mitsim.maps.campaign.acquire import coupon_cloud, coupon_residuals, in_turn, simulated_source
-from mitsim.maps.campaign.plan import CampaignFile, coupon_pose, plan_campaign, read_campaign
+from mitsim.maps.campaign.campaign_file import CampaignFile
+from mitsim.maps.campaign.plan import coupon_pose, plan_campaign, read_campaign
 from mitsim.maps.campaign.run import run_campaign
 from mitsim.maps.prediction import Predictor, feature_statistics, performance
 from mitsim.scene.coupons import VARIANTS

@@ -25,7 +25,7 @@ from mitsim.decoding.checks.sanity import (
 from mitsim.decoding.cloud import capture_geometry, stored_geometry
 from mitsim.decoding.coded_images import decoded_once
 from mitsim.decoding.depth_range import range_warning, surface_beyond
-from mitsim.decoding.matching.stereo import StereoGeometry
+from mitsim.decoding.matching.stereo_geometry import StereoGeometry
 from mitsim.decoding.noise import sigma_source
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.imager import Imager

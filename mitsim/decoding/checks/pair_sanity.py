@@ -18,7 +18,7 @@ from characterisation.files.arrays import Floats
 from mitsim.decoding.checks.rig_sanity import COARSE, half_stripe
 from mitsim.decoding.checks.row_texture import LARGEST_SPREAD, rectified, textured_row_error, uniform_light_mean
 from mitsim.decoding.coded_images import CodedImages
-from mitsim.decoding.matching.stereo import StereoGeometry
+from mitsim.decoding.matching.stereo_geometry import StereoGeometry
 from mitsim.decoding.matching.texture_matches import LEAST_PAIRS, texture_matches
 from mitsim.decoding.structured_light.projector_coordinate import ProjectorCoordinate
 from mitsim.decoding.structured_light.two_cameras import find_coordinates

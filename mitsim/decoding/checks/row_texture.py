@@ -20,7 +20,7 @@ from scipy.ndimage import map_coordinates
 from characterisation.files.arrays import MEDIAN_TO_STD, Floats
 from characterisation.point_cloud import PointCloud
 from mitsim.decoding.matching.row_error import MAXIMUM_ROWS, row_error
-from mitsim.decoding.matching.stereo import StereoGeometry
+from mitsim.decoding.matching.stereo_geometry import StereoGeometry
 from mitsim.decoding.structured_light.two_cameras import find_coordinates
 from mitsim.sensor.image_role import Role
 

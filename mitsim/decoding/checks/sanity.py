@@ -21,7 +21,7 @@ from mitsim.decoding.checks.rig_sanity import baseline_warning, camera_warnings
 from mitsim.decoding.checks.row_texture import measured_row_error
 from mitsim.decoding.cloud import decoder_settings
 from mitsim.decoding.coded_images import CodedImages
-from mitsim.decoding.matching.stereo import StereoGeometry, stereo_geometry
+from mitsim.decoding.matching.stereo_geometry import StereoGeometry, stereo_geometry
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 

@@ -31,7 +31,8 @@ from scipy.ndimage import map_coordinates
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.decoding.image_context import ImageContext
-from mitsim.decoding.matching.stereo import Raw, StereoGeometry, decode_stereo, stereo_geometry
+from mitsim.decoding.matching.stereo import Raw, decode_stereo
+from mitsim.decoding.matching.stereo_geometry import StereoGeometry, stereo_geometry
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.pattern import DotPattern, dot_frames

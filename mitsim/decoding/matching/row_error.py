@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from characterisation.files.arrays import Floats
-from mitsim.decoding.matching.stereo import StereoGeometry
+from mitsim.decoding.matching.stereo_geometry import StereoGeometry
 
 #: largest offset that is tested, up and down [rows]: farther, a matcher finds hardly a point
 MAXIMUM_ROWS = 2

@@ -37,7 +37,8 @@ from characterisation.region_of_interest import Roi, checked_roi
 from mitsim.decoding.grid_cloud import cloud_on_grid
 from mitsim.decoding.image_context import ImageContext
 from mitsim.decoding.interpolated import needed_region, was_read_out
-from mitsim.decoding.matching.stereo import StereoGeometry, rectified_roi
+from mitsim.decoding.matching.stereo import rectified_roi
+from mitsim.decoding.matching.stereo_geometry import StereoGeometry
 from mitsim.decoding.structured_light.decoder import decode_coordinates
 from mitsim.decoding.structured_light.projector_coordinate import ProjectorCoordinate
 from mitsim.sensor.decoder_settings import DecoderSettings
@@ -69,7 +70,7 @@ def decode_structured_light_stereo(
         (P, H, W) raw images [DN] of the first and of the second camera of the rig, in the order of
         :func:`mitsim.sensor.light_code.roles`.
     geometry
-        From :func:`mitsim.decoding.matching.stereo.stereo_geometry`.
+        From :func:`mitsim.decoding.matching.stereo_geometry.stereo_geometry`.
     code, settings
         The code, and range and limits.
     projector_size

@@ -27,9 +27,10 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.validation import Pair
 from characterisation.point_cloud import PointCloud
 from mitsim.maps.campaign.acquire import CaptureSource, coupon_cloud, coupon_place, own_sensor, simulated_source
+from mitsim.maps.campaign.campaign_file import CampaignFile
 from mitsim.maps.campaign.live import LiveCampaign, plan_live
 from mitsim.maps.campaign.orders import Order, PreparedSensor, order_of, prepared_sensor
-from mitsim.maps.campaign.plan import Campaign, CampaignFile, Shot, plan_campaign
+from mitsim.maps.campaign.plan import Campaign, Shot, plan_campaign
 from mitsim.maps.prediction import performance
 from mitsim.running.executor import check_same_file
 from mitsim.scene.coupons import Sample
@@ -245,11 +246,9 @@ def compared(
             if not pooled.sigma_error > LARGEST_SIGMA_ERROR * pooled.sigma:  # known, or impossible to estimate
                 break
         # keep only one capture and cloud at a time; with many pixels they have 100 MB each
-        measured.append(
-            _measure(
-                coupon_cloud(taken.pop() if taken else take(repetition), coupon, prepared.geometry, sensor), coupon
-            )
-        )
+        capture = taken.pop() if taken else take(repetition)
+        measured.append(_measure(coupon_cloud(capture, coupon, prepared.geometry, sensor), coupon))
+        del capture
         predicted.append(_measure(predictor.draw(sample.scene, ideal, labels, fraction, sigma, rng), coupon))
         if number == 0:
             mapped_patches = np.flatnonzero(_known(measured[0][0], sample, performance_map))

@@ -28,7 +28,8 @@ from mitsim.capture.devices.maker_captures import DepthaiTable, EnsensoTable, Op
 from mitsim.capture.devices.stage import LiveStage, open_stage
 from mitsim.capture.devices.stage_connection import StageConnection
 from mitsim.maps.campaign.acquire import DISTANCE_SLACK, CaptureSource, Source
-from mitsim.maps.campaign.plan import Campaign, CampaignFile, Shot, plan_campaign
+from mitsim.maps.campaign.campaign_file import CampaignFile
+from mitsim.maps.campaign.plan import Campaign, Shot, plan_campaign
 from mitsim.maps.campaign.stage_pose import StageCalibration, StageTable, read_stage_calibration
 from mitsim.sensor.sensor import Sensor
 

@@ -26,17 +26,8 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.words.version import __version__
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.maps.campaign.acquire import in_turn, simulated_source
-from mitsim.maps.campaign.plan import (
-    MEASUREMENT_VERSION,
-    Band,
-    Campaign,
-    CampaignFile,
-    SampleEntry,
-    Series,
-    Shot,
-    half_size,
-    view_axes,
-)
+from mitsim.maps.campaign.campaign_file import Band, CampaignFile, SampleEntry
+from mitsim.maps.campaign.plan import MEASUREMENT_VERSION, Campaign, Series, Shot, half_size, view_axes
 from mitsim.maps.campaign.run import run_campaign
 from mitsim.scene.coupons import CouponRecipe, Sample
 from mitsim.scene.load import flat_coupon

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from characterisation.coupon.view_frame import in_frame, view_frame
-from characterisation.files.arrays import Floats
 from characterisation.files.threads import in_threads
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.region_of_interest import Roi
@@ -149,8 +148,8 @@ class Predictor:
         status[outside] = Status.NO_SURFACE
         frames = view_frame(ray, self.rig.baseline_direction)
         view = in_frame(normal, frames)
-        along = surfaces.along
-        along = None if along is None else in_frame(along.reshape(-1, 3)[pixel].astype(float), frames)
+        u = surfaces.along
+        along = None if u is None else in_frame(u.reshape(-1, 3)[pixel].astype(float), frames)
         return Ideal(pixel, point, ray, distance, view, surfaces.shape.ravel()[pixel], status, along)
 
     def labels(self, scene: Scene, world_from_sensor: Transform, surfaces: Surfaces) -> NDArray[np.int16]:
@@ -294,7 +293,7 @@ class Predictor:
         return self._cloud(scene, seen, labels, noise, image(rng.random(len(fraction)), 1.0))
 
     def _cloud(
-        self, scene: Scene, seen: MappedView, labels: NDArray[np.int16], noise: Floats, chance: Floats
+        self, scene: Scene, seen: MappedView, labels: NDArray[np.int16], noise: NDArray[Any], chance: NDArray[Any]
     ) -> PointCloud:
         """Return points with errors ``noise`` (h, w) in units of sigma, kept if ``chance``, R_U (h, w), is below F."""
         part, size = seen.roi.slices, (self.grid.height, self.grid.width)

@@ -20,7 +20,8 @@ from mitsim.study import StatementTable
 from mitsim.study.choose.ranking import rank_keys
 from mitsim.study.choose.sensor_result import SensorResult, ordered, stated_demand
 from mitsim.study.statement_document import statement_document
-from mitsim.study.virtual.race import ALL, Raced, shortlist, standings
+from mitsim.study.virtual.race import ALL, Raced, standings
+from mitsim.study.virtual.risks import shortlist
 
 #: largest number of views raced for each measurement; chosen
 SHORTLIST = 3

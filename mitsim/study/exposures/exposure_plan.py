@@ -62,6 +62,9 @@ REPORT = 2
 #: number of noise samples of each
 DRAWS = {SEARCH: 2, DECISION: 6, REPORT: 6}
 
+#: returns the result of a set of exposures with the noise of a number and so many samples of it
+Evaluate = Callable[[PlannedExposure, int, int], ExposureResult]
+
 
 @dataclass(frozen=True)
 class PlanRules:
@@ -103,12 +106,7 @@ class _Results:
     :class:`~mitsim.running.time_limit.OutOfTimeError`.
     """
 
-    def __init__(
-        self,
-        evaluate: Callable[[PlannedExposure, int, int], ExposureResult],
-        noise: int,
-        over: Callable[[], bool],
-    ) -> None:
+    def __init__(self, evaluate: Evaluate, noise: int, over: Callable[[], bool]) -> None:
         self.evaluate, self.noise, self.over = evaluate, noise, over
         self.results = dict[PlannedExposure, ExposureResult]()
 
@@ -121,7 +119,7 @@ class _Results:
 
 
 def plan_exposures(
-    evaluate: Callable[[PlannedExposure, int, int], ExposureResult],
+    evaluate: Evaluate,
     default: PlannedExposure,
     limits_s: tuple[float, float],
     rules: PlanRules,

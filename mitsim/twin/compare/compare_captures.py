@@ -34,7 +34,7 @@ from characterisation.files.errors import InputError
 from characterisation.words.numbers import two_digits
 from mitsim.capture.capture import Capture
 from mitsim.decoding.cloud import Geometry, Settings, capture_geometry
-from mitsim.decoding.matching.stereo import StereoGeometry
+from mitsim.decoding.matching.stereo_geometry import StereoGeometry
 from mitsim.twin.compare.compared_quantities import QUANTITIES, Quantity
 from mitsim.twin.compare.plain_image import median_level, plain_image
 from mitsim.twin.compare.specimen_patches import PATCH_PX, SpecimenPatches, contrast_window, specimen_patches

@@ -30,7 +30,7 @@ from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.decoding.cloud import Geometry, Settings, capture_cloud
 from mitsim.decoding.matching.row_error import row_error
-from mitsim.decoding.matching.stereo import StereoGeometry
+from mitsim.decoding.matching.stereo_geometry import StereoGeometry
 from mitsim.twin.compare.plain_image import plain_image
 from mitsim.twin.finish.find_specimen import MARGIN_PX, feet_of, image_mask, on_specimen
 from mitsim.twin.finish.fine_detail import finest_detail

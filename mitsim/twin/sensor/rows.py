@@ -18,7 +18,7 @@ import numpy as np
 from characterisation.files.arrays import MEDIAN_TO_STD, Floats
 from mitsim.capture.capture import Capture
 from mitsim.decoding.cloud import Settings, capture_geometry
-from mitsim.decoding.matching.stereo import StereoGeometry
+from mitsim.decoding.matching.stereo_geometry import StereoGeometry
 from mitsim.twin.compare.specimen_patches import patch_rows
 from mitsim.twin.finish.specimen import Specimen
 

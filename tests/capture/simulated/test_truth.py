@@ -15,7 +15,7 @@ from characterisation.point_cloud import PointCloud, Status
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.capture.simulated.truth import true_images
 from mitsim.capture.truth import encode_exr, read_truth
-from mitsim.decoding.matching.stereo import stereo_geometry
+from mitsim.decoding.matching.stereo_geometry import stereo_geometry
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
 from mitsim.scene.ray_casting.raycast import PixelRays, cast

@@ -23,7 +23,7 @@ from mitsim.decoding.checks.sanity import code_findings, row_error_in_words, wit
 from mitsim.decoding.cloud import capture_cloud
 from mitsim.decoding.coded_images import CodedImages
 from mitsim.decoding.matching import stereo
-from mitsim.decoding.matching.stereo import stereo_geometry
+from mitsim.decoding.matching.stereo_geometry import stereo_geometry
 from mitsim.decoding.structured_light import decoder, two_cameras
 from mitsim.decoding.structured_light.decoder import decode_coordinates
 from mitsim.sensor.camera import Camera, Rig, stereo_rectification

@@ -12,7 +12,8 @@ from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from mitsim.decoding.image_context import ImageContext
 from mitsim.decoding.matching.correlation import correlate_both_ways
-from mitsim.decoding.matching.stereo import decode_stereo, stereo_geometry
+from mitsim.decoding.matching.stereo import decode_stereo
+from mitsim.decoding.matching.stereo_geometry import stereo_geometry
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.transforms import Transform

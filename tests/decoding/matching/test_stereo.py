@@ -18,7 +18,8 @@ from mitsim.capture.decoding import Decoding
 from mitsim.decoding.cloud import capture_cloud
 from mitsim.decoding.image_context import ImageContext
 from mitsim.decoding.matching.sgbm import match_both_ways, search_range
-from mitsim.decoding.matching.stereo import decode_stereo, stereo_geometry
+from mitsim.decoding.matching.stereo import decode_stereo
+from mitsim.decoding.matching.stereo_geometry import stereo_geometry
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.transforms import Transform

@@ -18,7 +18,7 @@ from mitsim.capture.decoding import Decoding
 from mitsim.decoding.cloud import capture_cloud
 from mitsim.decoding.grey_levels import MeasuredNoise
 from mitsim.decoding.image_context import ImageContext
-from mitsim.decoding.matching.stereo import stereo_geometry
+from mitsim.decoding.matching.stereo_geometry import stereo_geometry
 from mitsim.decoding.structured_light.decoder import decode_structured_light
 from mitsim.decoding.structured_light.geometry import structured_light_geometry
 from mitsim.decoding.structured_light.two_cameras import decode_structured_light_stereo, find_coordinates

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mitsim.decoding.image_context import ImageContext
-from mitsim.decoding.matching.stereo import stereo_geometry
+from mitsim.decoding.matching.stereo_geometry import stereo_geometry
 from mitsim.decoding.structured_light.two_cameras import decode_structured_light_stereo
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings

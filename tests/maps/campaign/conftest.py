@@ -8,7 +8,8 @@ import pytest
 
 from characterisation.maps.building import build_map
 from mitsim.maps.campaign import missing_finishes, one_finish, run
-from mitsim.maps.campaign.plan import CampaignFile, plan_campaign
+from mitsim.maps.campaign.campaign_file import CampaignFile
+from mitsim.maps.campaign.plan import plan_campaign
 from tests.maps.campaign.known_clouds import known_source, smooth
 from tests.smaller_sensors import binned
 

@@ -20,8 +20,9 @@ from mitsim.cli.devices import mount
 from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.campaign import live as live_module
 from mitsim.maps.campaign.acquire import coupon_cloud, in_turn, measured
+from mitsim.maps.campaign.campaign_file import CampaignFile
 from mitsim.maps.campaign.live import live_source, place_by_place, plan_live
-from mitsim.maps.campaign.plan import MEASUREMENT_VERSION, CampaignFile, plan_campaign
+from mitsim.maps.campaign.plan import MEASUREMENT_VERSION, plan_campaign
 from mitsim.maps.campaign.run import run_campaign
 from mitsim.maps.campaign.stage_pose import write_stage_calibration
 from mitsim.sensor.preset import load_sensor

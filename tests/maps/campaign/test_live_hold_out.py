@@ -11,9 +11,9 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
 from mitsim.cli.devices import mount
 from mitsim.maps.campaign import live as live_module
+from mitsim.maps.campaign.campaign_file import CampaignFile
 from mitsim.maps.campaign.hold_out import compare, held_out_live, held_out_shots
 from mitsim.maps.campaign.live import live_source
-from mitsim.maps.campaign.plan import CampaignFile
 from mitsim.maps.campaign.stage_pose import write_stage_calibration
 from tests.capture.devices.emulated_port import emulated
 from tests.capture.devices.nxlib_standin import installed

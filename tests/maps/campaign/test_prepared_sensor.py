@@ -9,8 +9,9 @@ import pytest
 
 from characterisation.files.errors import InputError
 from mitsim.capture.simulated import render
+from mitsim.maps.campaign.campaign_file import CampaignFile
 from mitsim.maps.campaign.orders import order_of, prepared_sensor
-from mitsim.maps.campaign.plan import CampaignFile, plan_campaign
+from mitsim.maps.campaign.plan import plan_campaign
 from mitsim.scene.surface.scatter import Deviation
 from mitsim.sensor.sensor_file import MisalignmentTable, RoomTable
 

@@ -42,7 +42,8 @@ def sensor_file(tmp_path_factory):
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory, scenes, sensor_file):
     """A rendered campaign that keeps its images, in a folder."""
-    from mitsim.maps.campaign.plan import CampaignFile, plan_campaign
+    from mitsim.maps.campaign.campaign_file import CampaignFile
+    from mitsim.maps.campaign.plan import plan_campaign
 
     file = CampaignFile.model_validate(
         {

@@ -20,7 +20,7 @@ from mitsim.study.choose import read_candidates, rounds, selection
 from mitsim.study.choose.ranking import rank_key, rank_keys, relative_to_least, unpromising
 from mitsim.study.choose.sensor_result import SensorResult, ordered
 from mitsim.study.choose.table import as_text, best_reasons, document, reasons_of
-from mitsim.study.virtual.race import combined_cost, first_of_each, possible_measurements
+from mitsim.study.virtual.risks import combined_cost, first_of_each, possible_measurements
 from mitsim.study.virtual.stated import StatedView
 from tests.report.choice_run import choice as made_choice
 from tests.report.choice_run import write_choice

@@ -15,7 +15,8 @@ from characterisation.tasks.task_file import Task
 from mitsim.maps.campaign.acquire import one_ahead
 from mitsim.study import RaceTable
 from mitsim.study.scoring import raced_errors, with_race
-from mitsim.study.virtual.race import ALL, Job, complete, run_race, shortlist
+from mitsim.study.virtual.race import ALL, Job, complete, run_race
+from mitsim.study.virtual.risks import shortlist
 from mitsim.study.virtual.trials import Outcome, TrialFolder
 from mitsim.study.virtual.world import Trial
 

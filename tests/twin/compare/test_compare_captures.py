@@ -19,7 +19,7 @@ from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.cli.program import app
 from mitsim.decoding.cloud import capture_cloud
-from mitsim.decoding.matching.stereo import stereo_geometry
+from mitsim.decoding.matching.stereo_geometry import stereo_geometry
 from mitsim.scene.test_targets import plate
 from mitsim.sensor.fitted_to import FittedCapture, images_digest
 from mitsim.sensor.preset import load_sensor
