@@ -321,14 +321,7 @@ def _straight_covariance(residual: Array, jacobian: Array, pitch: Array, fractio
     exp(-(2 pi k s)^2). Losses with the ``fraction`` F have a variance of (1 - F) / F^2 pixels^2; s^2 is what exceeds
     it by more than a standard error.
 
-    Parameters
-    ----------
-    residual, jacobian, pitch, fraction
-        As above.
-
-    See Also
-    --------
-    characterisation.features.figures.edge_covariance : expected, before there are crossings
+    :func:`characterisation.features.figures.edge_covariance` is the one expected before there are crossings.
     """
     count = len(residual)
     normal = jacobian.T @ jacobian

@@ -18,7 +18,7 @@ All captures use direct light, since a single plate has no interreflections, and
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -144,18 +144,10 @@ class DataSheet:
 
     def numbers(self) -> dict[str, Any]:
         """Return the values for JSON, without the single residuals."""
-        residuals = {name: value for name, value in asdict(self.residuals).items() if name not in ("values", "image")}
-        return {
-            "sensor": self.sensor.name,
-            "mid_mm": self.mid_mm,
-            "planes": [asdict(p) for p in self.planes],
-            "radius_mm": self.radius_mm,
-            "radius_error": self.radius_error,
-            "noise": [asdict(p) for p in self.noise],
-            "metal": [asdict(p) for p in self.metal],
-            "residuals": residuals,
-            "exposure_rule": self.sensor.exposure.rule,
-        }
+        sensor: Any = self.sensor.name
+        entries = asdict(replace(self, sensor=sensor))
+        del entries["residuals"]["values"], entries["residuals"]["image"]
+        return entries | {"exposure_rule": self.sensor.exposure.rule}
 
 
 @dataclass(frozen=True)
@@ -243,9 +235,8 @@ class _SimulatedTargets:
         facing = -(out * view).sum(axis=1) / np.maximum(np.linalg.norm(out, axis=1), 1e-9)
         kept = near & (facing > math.cos(math.radians(_EDGE_DEG)))
         try:
-            return (
-                float(fit_sphere(points[kept], np.zeros(3)).radius - radius) if kept.sum() > _LEAST_POINTS else math.nan
-            )
+            enough = kept.sum() > _LEAST_POINTS
+            return float(fit_sphere(points[kept], np.zeros(3)).radius - radius) if enough else math.nan
         except FitError:
             return math.nan
 
@@ -277,16 +268,8 @@ class _SimulatedTargets:
         apart = image[::step, ::step]
         apart = apart[np.isfinite(apart)]
         p_normal = float(stats.normaltest(apart).pvalue) if len(apart) >= 20 else math.nan
-        return Residuals(
-            distance,
-            values,
-            length,
-            len(apart),
-            float(stats.skew(values)),
-            float(stats.kurtosis(values)),
-            p_normal,
-            image,
-        )
+        skewness, kurtosis = float(stats.skew(values)), float(stats.kurtosis(values))
+        return Residuals(distance, values, length, len(apart), skewness, kurtosis, p_normal, image)
 
     def _plate(self, finish: str, distance: float, tilt_deg: float, noise: Noise) -> tuple[PointCloud, Coupon]:
         size = PLATE_SHARE * distance

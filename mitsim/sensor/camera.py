@@ -196,15 +196,9 @@ class Camera:
                     (self._at(ideal + width * unit) - self._at(ideal - width * unit)) / (2 * width)
                     for unit in np.eye(2)
                 )
-                off = wanted - self._at(ideal)
-                determinant = by_x[:, 0] * by_y[:, 1] - by_x[:, 1] * by_y[:, 0]
-                ideal = ideal + np.stack(
-                    [
-                        (off[:, 0] * by_y[:, 1] - off[:, 1] * by_y[:, 0]) / determinant,
-                        (off[:, 1] * by_x[:, 0] - off[:, 0] * by_x[:, 1]) / determinant,
-                    ],
-                    axis=1,
-                )
+                (u, v), (u_x, v_x), (u_y, v_y) = (wanted - self._at(ideal)).T, by_x.T, by_y.T
+                determinant = u_x * v_y - v_x * u_y
+                ideal = ideal + np.stack([u * v_y - v * u_y, v * u_x - u * v_x], axis=1) / determinant[:, None]
         exact = np.abs(self._at(ideal) - pixels).max(axis=1) < _ROUND_TRIP_PX
         return np.where((exact & before_fold(ideal[:, 0], ideal[:, 1], radii))[:, None], ideal, np.nan)
 
@@ -335,17 +329,9 @@ def stereo_rectification(left: Camera, right: Camera) -> Rectification:
     if not right_from_left.translation.any():
         found = "both cameras of the pair in the same place"
         raise InputError("rig", "cameras", found, "a distance between them", "give the pose of the second camera")
-    r1, r2, p1, p2, *_ = cv2.stereoRectify(
-        left.matrix,
-        left.distortion,
-        right.matrix,
-        right.distortion,
-        (left.width, left.height),
-        right_from_left.rotation,
-        right_from_left.translation.reshape(3, 1),
-        flags=0,
-        alpha=-1,
-    )
+    eyes = (left.matrix, left.distortion, right.matrix, right.distortion, (left.width, left.height))
+    rotation, shift = right_from_left.rotation, right_from_left.translation.reshape(3, 1)
+    r1, r2, p1, p2, *_ = cv2.stereoRectify(*eyes, rotation, shift, flags=0, alpha=-1)
     baseline = float(np.linalg.norm(right_from_left.translation))
     k1, k2, turn1, turn2 = (np.array(matrix, np.float64)[:, :3] for matrix in (p1, p2, r1, r2))
     f, middle = k1[0, 0], np.array([(left.width - 1) / 2, (left.height - 1) / 2])

@@ -14,10 +14,9 @@ from __future__ import annotations
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from characterisation.files.documents import Document, validate
@@ -30,41 +29,9 @@ from mitsim.sensor.calibration_numbers import by_rows, checked_matrix, numbers_o
 from mitsim.sensor.calibration_poses import is_motion
 from mitsim.sensor.calibration_qualifiers import OF_FORMAT, of_images, read_out_of, rectified_pair, unit_mm
 from mitsim.sensor.calibration_quaternions import ORDERED
+from mitsim.sensor.calibration_table import CalibrationTable, EyeKeys
 from mitsim.sensor.calibration_tree import CalibrationTree, Found, read_tree
 from mitsim.sensor.lens_models import is_fisheye, lens_model
-
-
-class EyeKeys(Document):
-    """Names of one camera's or the projector's values in the file; dots step into maps: ``stereo.R``.
-
-    ``file``: the one of several files that contains matrix, distortion and size of this eye alone.
-    """
-
-    file: str | None = None
-    matrix: str | None = None
-    distortion: str | None = None
-    size: str | None = None
-    rotation: str | None = None
-    translation: str | None = None
-
-
-class CalibrationTable(Document):
-    """Source of the geometry of cameras and projector, in place of their own keys.
-
-    - ``file``: one or several, beside the sensor file.
-    - ``to_mm``: their unit of length in mm; by default the unit that the file or its format states, else 1 if likely.
-    - ``cameras``: names, the reference camera first.
-    - ``projector``: whether the files also calibrate it.
-    - ``model`` of the cameras' lenses; by default the one that the file states, else perspective.
-    - ``keys`` of each camera, and of ``projector``, if the file does not use the usual names.
-    """
-
-    file: str | Annotated[list[str], Field(min_length=1, max_length=8)]
-    to_mm: Annotated[float, Field(gt=0, le=1e6)] | None = None
-    cameras: list[str] = Field(default=["camera"], min_length=1, max_length=2)
-    projector: bool = True
-    model: Literal["perspective", "fisheye"] | None = None
-    keys: dict[str, EyeKeys] = Field(default={})
 
 
 def with_calibration(

@@ -21,6 +21,7 @@ from pydantic import AfterValidator, Field, model_validator
 from characterisation.files.documents import Document, Name
 from characterisation.files.errors import InputError
 from mitsim.sensor.calibration_qualifiers import check_intrinsics
+from mitsim.sensor.calibration_table import CalibrationTable
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.fitted_to import FittedCapture
@@ -28,7 +29,6 @@ from mitsim.sensor.imager import DESCRIPTION, Imager
 from mitsim.sensor.light_code import LightCode
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
-from mitsim.sensor.opencv_calibration import CalibrationTable
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.projector_images import ImageFolder
 from mitsim.sensor.published_figures import PublishedAccuracy, PublishedLengths, PublishedNoise

@@ -33,9 +33,10 @@ from mitsim.capture.recordings.recording_files import plain_name
 from mitsim.capture.recordings.stated_scale import stated_scales
 from mitsim.sensor.calibration_eyes import cameras_of
 from mitsim.sensor.calibration_qualifiers import check_camera
+from mitsim.sensor.calibration_table import CalibrationTable
 from mitsim.sensor.calibration_tree import CalibrationTree, read_tree, tree_of
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.opencv_calibration import CalibrationTable, has_pair, with_calibration
+from mitsim.sensor.opencv_calibration import has_pair, with_calibration
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.sensor_file import OpticsTable
 from mitsim.sensor.unknowns import UnknownsTable
