@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
     from characterisation.region_of_interest import Roi
 
-Floats = NDArray[np.floating]
-
 #: a point farther than this share of |V| from the surface that its pixel shows, along its ray, is a false match: it is
 #: no point recovered, no noise, and no point of a feature. The talk does not say what it did with them; a sensor that
 #: invents points must not gain by it. It is wide: 6 mm at 600 mm, where a pixel of disparity is worth 6 mm to an
@@ -130,7 +128,7 @@ class ViewGrid:
         local = np.stack([x, y, np.ones(x.shape)], axis=-1) / np.sqrt(x * x + y * y + 1)[..., None]
         return np.asarray(local @ self.rotation.T)
 
-    def project(self, points: Floats) -> NDArray[np.float64]:
+    def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """Project points (..., 3) of the sensor frame to (column, row) (..., 2); NaN for points behind the grid."""
         local = (points - self.origin) @ self.rotation
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -175,7 +173,7 @@ class ViewGrid:
         assert self.normalised is not None
         return self.normalised.astype(np.float64) * [self.fx, self.fy] + [self.cx, self.cy]
 
-    def cos_off_axis(self, directions: Floats) -> NDArray[np.float64]:
+    def cos_off_axis(self, directions: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return the cosine of the angle phi between view directions (..., 3) and the grid's axis.
 
         One pixel of a pinhole covers the solid angle lambda^2 cos^3(phi), because the imager is flat.

@@ -32,10 +32,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
-from characterisation.files.arrays import Floats
+from characterisation.files.arrays import Floats, Singles
 from characterisation.files.threads import in_threads
-
-Singles = NDArray[np.float32]
 
 #: variables of the map, in the order of the answer
 FIELDS = (

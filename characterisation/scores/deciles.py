@@ -26,7 +26,6 @@ from scipy import stats
 
 from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
-from characterisation.scores.rank_agreement import spearman
 
 #: number of bins, beside that of impossible views
 BINS = 10
@@ -217,3 +216,19 @@ def mean_interval(values: Floats, least: float = 0.0) -> tuple[float, float, flo
         return mean, math.nan, math.nan
     half = float(stats.t.ppf(0.5 + CONFIDENCE / 2, len(finite) - 1) * finite.std(ddof=1) / math.sqrt(len(finite)))
     return mean, max(mean - half, least), mean + half
+
+
+#: least number of pairs for a rank correlation
+LEAST_PAIRS = 4
+
+
+def spearman(x: ArrayLike, y: ArrayLike) -> float:
+    """Return Spearman's rank correlation; ties have their mean rank (Kendall and Gibbons, "Rank Correlation Methods").
+
+    It is NaN for fewer than 4 pairs, or where one of the two does not vary.
+    """
+    a, b = stats.rankdata(x), stats.rankdata(y)
+    if len(a) < LEAST_PAIRS or np.ptp(a) == 0 or np.ptp(b) == 0:
+        return math.nan
+    a, b = a - a.mean(), b - b.mean()
+    return float(np.clip(a @ b / math.sqrt((a @ a) * (b @ b)), -1.0, 1.0))

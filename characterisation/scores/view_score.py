@@ -23,8 +23,6 @@ from numpy.typing import ArrayLike, NDArray
 from characterisation.files.atomic_io import atomic_write
 from characterisation.tasks.task_file import Task
 
-Floats = NDArray[np.floating[Any]]
-
 #: Inputs of the score, each (view, feature): long name and unit.
 INPUTS = {
     "n": ("expected points on the feature", "1"),
@@ -145,7 +143,7 @@ def score_views(views: xr.Dataset, task: Task, minimum_points: float = 100) -> x
     return xr.Dataset(scores, coordinates, {"minimum_points": minimum_points})
 
 
-def rank_views(score: Floats, possible: NDArray[np.bool_]) -> NDArray[np.int64]:
+def rank_views(score: NDArray[np.floating], possible: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return ranks 1, 2, ... along the last axis (..., view): possible first, then higher score, then lower index."""
     order = np.lexsort((-score, ~possible), axis=-1)  # lexsort is stable: ties stay in view order
     rank = np.empty(score.shape, np.int64)
@@ -209,7 +207,7 @@ def write_scores(
         writer.writerows(rows)
 
 
-def _ratio(numerator: Floats, denominator: Floats) -> Floats:
+def _ratio(numerator: NDArray[np.floating], denominator: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return the quotient, 0 where the denominator is 0 or either is NaN, which means no visible points."""
     numerator, denominator = np.broadcast_arrays(numerator, denominator)
     defined = (denominator > 0) & np.isfinite(numerator)

@@ -26,7 +26,7 @@ from scipy.stats import t
 
 from characterisation.files.arrays import Floats
 from characterisation.scores.coverage import NORMAL_COVERAGE, coverage_interval
-from characterisation.scores.rank_agreement import spearman
+from characterisation.scores.deciles import spearman
 
 #: verdict on the order that u gives the checked views: it is right
 CONFIRMED = "smaller u, smaller error"

@@ -18,17 +18,13 @@ import time
 import weakref
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 from characterisation.files.checked_files import is_file
 from characterisation.files.errors import InputError, MissingEnvironmentError
 from characterisation.words.progress import say
 from mitsim.running.build import differences, own_build
-from mitsim.running.executor import finished_orders, never
-
-Item = TypeVar("Item")
-Plain = TypeVar("Plain")
-Result = TypeVar("Result")
+from mitsim.running.executor import Item, Plain, Result, finished_orders, never
 
 #: orders that wait at each worker: enough to keep it busy, few enough to lose little at a stop
 AHEAD = 3

@@ -25,7 +25,6 @@ from scipy.ndimage import correlate1d, gaussian_filter
 from characterisation.files.documents import Document
 from mitsim.sensor.point_spread import point_spread
 
-Positive = Annotated[float, Field(gt=0)]
 Shift = Annotated[float, Field(ge=-1000, le=1000)]
 
 #: mean run length of thresholded Gaussian noise per standard deviation of its filter

@@ -25,7 +25,7 @@ from mitsim.sensor.calibration_table import CalibrationTable
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.fitted_to import FittedCapture
-from mitsim.sensor.imager import DESCRIPTION, Imager
+from mitsim.sensor.imager import DESCRIPTION, Imager, Positive
 from mitsim.sensor.light_code import LightCode
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
@@ -37,7 +37,6 @@ from mitsim.sensor.unknowns import UnknownsTable
 
 Pair = tuple[float, float]
 Triple = tuple[float, float, float]
-Positive = Annotated[float, Field(gt=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Slope = Annotated[float, Field(ge=-20, le=20)]
 Bow = Annotated[float, Field(ge=-200, le=200)]

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.coupon.orientations import sphere_directions
+from characterisation.region_of_interest import Roi
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.rig_parameters import eyes
 from mitsim.sensor.sensor import Sensor
@@ -114,3 +115,13 @@ def pose_at(
     """
     camera = sensor.rig.reference.sensor_from_camera
     return look_at(position, target, (0.0, 0.0, 1.0), roll_deg) @ camera.inverse()
+
+
+def roi_around(camera: Camera, points: NDArray[np.floating], margin: int) -> Roi | None:
+    """Return the region of a camera's image that holds points (n, 3) of the sensor frame; None if one is behind it."""
+    pixels = camera.project(points)
+    if not np.isfinite(pixels).all():
+        return None
+    low = np.clip(np.floor(pixels.min(axis=0)).astype(int) - margin, 0, [camera.width - 1, camera.height - 1])
+    high = np.clip(np.ceil(pixels.max(axis=0)).astype(int) + margin + 1, low + 1, [camera.width, camera.height])
+    return Roi.between(*low, *high)

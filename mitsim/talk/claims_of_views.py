@@ -8,7 +8,7 @@ from collections import Counter
 import numpy as np
 import xarray as xr
 
-from characterisation.scores.rank_agreement import spearman
+from characterisation.scores.deciles import spearman
 from characterisation.tasks.task_reading import read_task
 from characterisation.words.numbers import listed, two_digits, unit_symbol
 from mitsim.study import MINIMUM_POINTS

@@ -26,7 +26,7 @@ from scipy.spatial import cKDTree
 from trimesh.grouping import unique_rows
 
 from characterisation.files.arrays import Floats
-from mitsim.scene.ray_casting.solid_angles import solid_angles
+from mitsim.scene.ray_casting.triangles import solid_angles
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.views.table import MARGIN_MM, SensorBody

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from characterisation.scores.rank_agreement import spearman
+from characterisation.scores.deciles import spearman
 from tests.proofs.judgement import true_risk
 
 Floats = NDArray[np.float64]

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import beta, spearmanr
 
-from characterisation.scores.rank_agreement import spearman
+from characterisation.scores.deciles import spearman
 from mitsim.report.agreement import CHANCE, CONFIRMED, REVERSED, TOO_FEW, agreement, chance_level
 
 

@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
-from mitsim.capture.recordings.cloud_numbers import unit_in, unit_named
-from mitsim.capture.recordings.number_text import number_words
+from mitsim.capture.recordings.cloud_numbers import number_words, unit_in, unit_named
 from mitsim.capture.recordings.point_columns import check_points_first
 from mitsim.sensor.calibration_qualifiers import UNITS_MM
 

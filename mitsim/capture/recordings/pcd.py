@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.checked_files import LARGEST_FILE
 from characterisation.files.errors import InputError
-from mitsim.capture.recordings.number_text import number_words
+from mitsim.capture.recordings.cloud_numbers import number_words
 from mitsim.sensor.png import LONGEST_SIDE_PX
 
 _KINDS = ("ascii", "binary", "binary_compressed")

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
-from mitsim.capture.recordings.cloud_numbers import unit_in
-from mitsim.capture.recordings.number_text import number_words
+from mitsim.capture.recordings.cloud_numbers import number_words, unit_in
 
 _TYPES = {
     "char": "i1",

@@ -29,9 +29,9 @@ from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.scene.load import Scene
 from mitsim.scene.visible_surfaces import sees_nothing
 from mitsim.sensor.imager import Imager
-from mitsim.sensor.roi import roi_around
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
+from mitsim.sensor.working_volume import roi_around
 
 #: largest error of a rendering, over the sensor's noise, without a warning
 LIMIT = 0.2

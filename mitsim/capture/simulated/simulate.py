@@ -49,11 +49,11 @@ from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.pattern import DotPattern
-from mitsim.sensor.roi import roi_around
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.speckle import SpeckleField
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.vignetting import camera_illumination
+from mitsim.sensor.working_volume import roi_around
 
 #: margin around the required points [px], for the blur of the lens and the window of the matcher
 _MARGIN_PX = 12

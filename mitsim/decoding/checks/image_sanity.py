@@ -12,14 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Singles
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.decoding.checks.code_lines import CodeLines, line_slices, lines_of
+from mitsim.decoding.checks.code_lines import CodeLines, Levels, line_slices, lines_of
 from mitsim.decoding.checks.fringe_edges import stripe_edges
 from mitsim.decoding.checks.fringe_origin import origin_in_words
 from mitsim.decoding.checks.fringe_steps import copies_in_words, steps_in_words
@@ -29,9 +29,6 @@ from mitsim.decoding.coded_images import CodedImages
 from mitsim.decoding.structured_light.projector_coordinate import ProjectorCoordinate
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis, Kind, Role
-
-Levels = NDArray[np.unsignedinteger[Any]]
-Floats = NDArray[np.float32]
 
 #: number of successive changes of a coordinate in one sum
 _CHANGES = 12
@@ -245,7 +242,7 @@ def _plain_images(
     return out
 
 
-def _pairs(stack: Levels, image_roles: list[Role], axis: Axis) -> list[tuple[int, Floats, Floats]]:
+def _pairs(stack: Levels, image_roles: list[Role], axis: Axis) -> list[tuple[int, Singles, Singles]]:
     """Return number, image and complement of every bit of an axis that has a complement, most significant first."""
     where = {
         (role.kind, role.index): image for role, image in zip(image_roles, stack, strict=True) if role.axis == axis

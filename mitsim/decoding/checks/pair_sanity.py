@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +25,6 @@ from mitsim.sensor.camera import Rig
 from mitsim.sensor.image_role import Axis
 from mitsim.sensor.light_code import roles
 
-Levels = NDArray[np.unsignedinteger[Any]]
 #: largest row error of a pair [px]; a stereo matcher begins to lose points at about this
 LARGEST_ROW_ERROR = 0.3
 

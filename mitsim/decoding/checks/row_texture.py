@@ -11,7 +11,6 @@ patches have no common offset, there is no result.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +18,12 @@ from scipy.ndimage import map_coordinates
 
 from characterisation.files.arrays import MEDIAN_TO_STD, Floats
 from characterisation.point_cloud import PointCloud
+from mitsim.decoding.checks.code_lines import Levels
 from mitsim.decoding.matching.row_error import MAXIMUM_ROWS, row_error
 from mitsim.decoding.matching.stereo_geometry import StereoGeometry
 from mitsim.decoding.structured_light.two_cameras import find_coordinates
 from mitsim.sensor.image_role import Role
 
-Levels = NDArray[np.unsignedinteger[Any]]
 #: range of row offsets of a code of columns, which has the disparity whatever they are
 _ROWS = 6
 

@@ -32,12 +32,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Singles
 from characterisation.files.threads import in_threads
 from mitsim.decoding.matching.sgbm import Matches, both_ways_disagreement, pixels_matched_back
 from mitsim.decoding.matching.sub_pixel import offset_of_minimum
 from mitsim.sensor.matcher import MatcherSettings
-
-Floats = NDArray[np.float32]
 
 #: bytes of the correlations that each thread holds at once
 _VOLUME_BYTES = 24e6
@@ -51,8 +50,8 @@ _MINIMUM_PEAK = 0.1
 
 
 def correlate_both_ways(
-    left: Floats,
-    right: Floats,
+    left: Singles,
+    right: Singles,
     columns: tuple[int, int],
     first: int,
     count: int,
@@ -81,7 +80,7 @@ def correlate_both_ways(
     width = columns[1] - columns[0]
     rows = max(int(_VOLUME_BYTES / (4 * count * (width + 2 * count))), 4)
 
-    def match_rows(start: int) -> tuple[Floats, Floats]:
+    def match_rows(start: int) -> tuple[Singles, Singles]:
         chunk = slice(start, min(start + rows, height))
         reach = settings.block_size // 2
         around = slice(max(chunk.start - reach, 0), min(chunk.stop + reach, height))
@@ -105,8 +104,8 @@ class _Search:
 
 
 def _matched(
-    left: Floats, right: Floats, inner: slice, search: _Search, settings: MatcherSettings, noisy_right: bool
-) -> tuple[Floats, Floats]:
+    left: Singles, right: Singles, inner: slice, search: _Search, settings: MatcherSettings, noisy_right: bool
+) -> tuple[Singles, Singles]:
     """Match the ``inner`` rows of strips (F, h, W), disparity by disparity.
 
     Returns
@@ -165,7 +164,7 @@ def _matched(
     return disparities, back_requested
 
 
-def _sliding_sums(values: Floats, count: int, length: int) -> Floats:
+def _sliding_sums(values: Singles, count: int, length: int) -> Singles:
     """Return ``length`` sums of ``count`` neighbours along the first axis, from sums of 1, 2, 4, ... of them."""
     total, summed, power = None, 0, 1
     while True:
@@ -181,7 +180,7 @@ def _sliding_sums(values: Floats, count: int, length: int) -> Floats:
     return total
 
 
-def _block_mean(images: Floats, block: int) -> Floats:
+def _block_mean(images: Singles, block: int) -> Singles:
     """Return the mean (F, h, w) of a square block around each pixel; pixels beyond the edges repeat the edge."""
     reach = block // 2
     height, width = images.shape[1:]
@@ -191,13 +190,13 @@ def _block_mean(images: Floats, block: int) -> Floats:
     return np.ascontiguousarray(np.moveaxis(sums, (2, 1), (0, 1))) * np.float32(1 / block**2)
 
 
-def _block_variance(images: Floats, means: Floats, block: int) -> Floats:
+def _block_variance(images: Singles, means: Singles, block: int) -> Singles:
     """Return the variance of each block (h, w), summed over the frames."""
     total = _block_mean((images * images).sum(axis=0)[None], block)[0]
     return np.asarray(np.maximum(total - (means * means).sum(axis=0), 0))
 
 
-def _lag_covariance(images: Floats, means: Floats, block: int) -> Floats:
+def _lag_covariance(images: Singles, means: Singles, block: int) -> Singles:
     """Return the covariance of each block with that of the column before (h, w), summed over the frames."""
     previous, mean_previous = (np.concatenate([array[:, :, :1], array[:, :, :-1]], axis=2) for array in (images, means))
     total = _block_mean((images * previous).sum(axis=0)[None], block)[0]
@@ -205,8 +204,8 @@ def _lag_covariance(images: Floats, means: Floats, block: int) -> Floats:
 
 
 def _best_disparities(
-    score: Floats, variance: Floats, lag: Floats, settings: MatcherSettings, noisy_right: bool
-) -> Floats:
+    score: Singles, variance: Singles, lag: Singles, settings: MatcherSettings, noisy_right: bool
+) -> Singles:
     """Return the best disparities (h, w) less ``first``, NaN if not unique.
 
     ``score`` (count, h, w) holds the correlations of all disparities, and is overwritten. ``variance`` and ``lag`` are
@@ -229,13 +228,13 @@ def _best_disparities(
 
 
 def _sub_pixel(
-    rho: tuple[Floats, Floats, Floats],
+    rho: tuple[Singles, Singles, Singles],
     best: NDArray[np.intp],
-    variance: Floats,
-    lag: Floats,
+    variance: Singles,
+    lag: Singles,
     count: int,
     noisy_right: bool,
-) -> Floats:
+) -> Singles:
     """Return the position of the maximum of rho between the best disparity and its neighbours, -1 to 1.
 
     ``rho`` at one disparity less, at the best, and at one more; ``variance`` of right blocks; ``lag``, the covariance
@@ -244,7 +243,7 @@ def _sub_pixel(
     lower, peak, upper = rho
     column = np.arange(best.shape[1]) + count - best
 
-    def at(values: Floats, shift: int) -> Floats:
+    def at(values: Singles, shift: int) -> Singles:
         return np.take_along_axis(values, np.clip(column + shift, 0, values.shape[1] - 1), axis=1)
 
     variance_here = at(variance, 0)
@@ -266,7 +265,7 @@ def _sub_pixel(
     return step.astype(np.float32)
 
 
-def _peak_height(lower: Floats, peak: Floats, upper: Floats) -> Floats:
+def _peak_height(lower: Singles, peak: Singles, upper: Singles) -> Singles:
     """Return the height of the Gaussian through three neighbouring correlations, limited to 0.1 to 1."""
     with np.errstate(divide="ignore", invalid="ignore"):
         a, b, c = (np.log(np.maximum(array, np.float32(1e-3))) for array in (lower, peak, upper))

@@ -42,11 +42,10 @@ from numpy.typing import NDArray
 
 from characterisation.files.arrays import Floats
 from mitsim.capture.simulated.indirect_light import smoothed
+from mitsim.maps.prediction.multipath_range_bias import Complex
 from mitsim.maps.prediction.predictor import Ideal
 from mitsim.sensor.light_code import GrayCodePhaseShift, PhaseShift, patterns
 from mitsim.sensor.sensor import Sensor
-
-Complex = NDArray[np.complex128]
 
 #: standard deviation of the window that averages A_2 [px] of the sensor
 WINDOW_PX = 2.0

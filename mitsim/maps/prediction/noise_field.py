@@ -45,7 +45,7 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from characterisation.coupon.offsets import own_area
-from characterisation.files.arrays import Floats
+from characterisation.files.arrays import Floats, Singles
 from characterisation.files.threads import in_threads, thread_count
 from characterisation.maps.noise_structure import noise_structure
 from characterisation.maps.performance_map import PerformanceMap
@@ -54,8 +54,6 @@ from characterisation.tasks.covariance import PERSISTENT_REACH_PX, PERSISTENT_TU
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
 from mitsim.scene.ray_casting.mapped_scene import MappedView
-
-Singles = NDArray[np.float32]
 
 #: number of cosines of the persistent part
 COSINES = 32

@@ -19,7 +19,7 @@ from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from mitsim.scene.authoring.face import Face, Ints, same_surface
 from mitsim.scene.authoring.recognise import recognised
-from mitsim.scene.ray_casting.solid_angles import solid_angles
+from mitsim.scene.ray_casting.triangles import solid_angles
 
 #: largest number of faces; a mesh with more is a scan or noise, not a machined part
 LARGEST_COUNT = 1000

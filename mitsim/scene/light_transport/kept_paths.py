@@ -33,13 +33,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Singles
 from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import to_device
 from mitsim.scene.light_transport.low_discrepancy import z_positions
 from mitsim.scene.light_transport.projected_codes import ProjectedLight
-
-Floats = NDArray[np.float32]
 
 #: number of candidates whose light is found together
 _AT_ONCE = 1 << 19
@@ -55,16 +54,16 @@ class CandidatePaths:
     """
 
     pixel: NDArray[np.int32]
-    weight: Floats
-    code: Floats
+    weight: Singles
+    code: Singles
     material: NDArray[np.int16]
-    toward: Floats
+    toward: Singles
 
     def __len__(self) -> int:
         return len(self.pixel)
 
     def chosen(
-        self, index: NDArray[np.integer] | NDArray[np.bool_] | slice, weight: Floats | None = None
+        self, index: NDArray[np.integer] | NDArray[np.bool_] | slice, weight: Singles | None = None
     ) -> CandidatePaths:
         """Return some of the paths, with other weights if given."""
         kept = self.weight[index] if weight is None else weight
@@ -96,7 +95,7 @@ class CandidatePaths:
 class Vertices:
     """The surfaces of paths, sorted by material: their BSDFs are evaluated with one call for each material."""
 
-    def __init__(self, material: NDArray[np.int16], toward: Floats) -> None:
+    def __init__(self, material: NDArray[np.int16], toward: Singles) -> None:
         flat = material.ravel()
         order = np.argsort(flat, kind="stable")
         order = order[np.searchsorted(flat[order], 0) :]
@@ -149,7 +148,7 @@ class KeptPaths:
         """Memory that the paths need on the device."""
         return 24 * len(self._vertices) + self.count * (16 + 4 * len(self._indices))
 
-    def codes(self, bsdfs: Sequence[Any], light: ProjectedLight) -> Floats:
+    def codes(self, bsdfs: Sequence[Any], light: ProjectedLight) -> Singles:
         """Return the light (codes, height, width) of each code of a region, for the BSDFs of the drawn finishes.
 
         Each pixel sums its paths in their order, so that the same paths give the same bytes.

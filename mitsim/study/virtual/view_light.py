@@ -17,8 +17,8 @@ from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.running.executor import available_memory
 from mitsim.scene.light_transport.room_light import SeenSurfaces
 from mitsim.scene.load import Scene
-from mitsim.sensor.roi import roi_around
 from mitsim.sensor.transforms import Transform
+from mitsim.sensor.working_volume import roi_around
 
 #: pixels traced around the part, for the blur of the lens and the blocks of the matcher
 _MARGIN_PX = 12

@@ -20,9 +20,9 @@ from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.decoding.cloud import Settings, capture_cloud, capture_geometry
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.roi import roi_around
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.transforms import Transform
+from mitsim.sensor.working_volume import roi_around
 from mitsim.twin.finish.specimen import Bend, Specimen, fit_bend, known_specimen, plane_points, specimen_in_cloud
 
 #: margin inside the specimen's outline that is not used [px]: its edge is blurred, and matched with the background;

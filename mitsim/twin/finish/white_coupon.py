@@ -24,8 +24,8 @@ from mitsim.scene.differentiable import lambertian_coupon
 from mitsim.scene.light_transport.projected_codes import ProjectedPatterns
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.pattern import RandomDots
-from mitsim.sensor.roi import roi_around
 from mitsim.sensor.sensor import Sensor
+from mitsim.sensor.working_volume import roi_around
 from mitsim.twin.finish.specimen import Specimen
 
 #: image in place of a sensor's patterns: the mean of all patterns; a uniform image of their mean level; the first one

@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from scipy import stats
 
 from characterisation.scores.coverage import coverage_interval
-from characterisation.scores.rank_agreement import spearman
+from characterisation.scores.deciles import spearman
 from tests.proofs.screening_figures import roc_area
 
 NAN, INF = math.nan, math.inf
