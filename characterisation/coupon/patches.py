@@ -38,6 +38,12 @@ from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, PointCloud, ViewGrid
 
+#: radius of a patch [px]: 113 possible points
+RADIUS_PX = 6.0
+
+#: distance of a patch from the edge of the coupon [px]: about one matching block
+MARGIN_PX = 5.0
+
 
 @dataclass(frozen=True)
 class Coupon:
@@ -125,8 +131,8 @@ def patch_centres(
 def measure_patches(
     cloud: PointCloud,
     coupon: Coupon,
-    radius_px: float = 6.0,
-    margin_px: float = 5.0,
+    radius_px: float = RADIUS_PX,
+    margin_px: float = MARGIN_PX,
     step_px: float | None = None,
     angular_pitch: float | None = None,
     reference: PointCloud | None = None,
@@ -245,22 +251,12 @@ def measure_patches(
     )
 
 
-def patch_residuals(cloud: PointCloud, coupon: Coupon, radius_px: float = 6.0, margin_px: float = 5.0) -> Floats:
+def patch_residuals(cloud: PointCloud, coupon: Coupon) -> Floats:
     """Return the residuals [mm] along V of the points of each patch from its plane: (patches, pixels of a disc).
 
-    They are NaN for outliers and pixels without a point.
-
-    Parameters
-    ----------
-    cloud, coupon, radius_px, margin_px
-        As in :func:`measure_patches`.
-
-    See Also
-    --------
-    measure_patches : the metrics of the patches
+    They are NaN for outliers and pixels without a point. The patches are those of :func:`measure_patches` by default.
     """
-    _check_sizes(coupon, radius_px, margin_px, None)
-    pixels = _pixels(cloud, patch_centres(cloud.grid, coupon, radius_px, margin_px, 2 * radius_px), radius_px)
+    pixels = _pixels(cloud, patch_centres(cloud.grid, coupon, RADIUS_PX, MARGIN_PX, 2 * RADIUS_PX), RADIUS_PX)
     points, true = _points_of(cloud, coupon, pixels)
     return ray_noise_std(np.where(true[..., None], points, np.nan)).inlier_residual
 

@@ -61,8 +61,6 @@ class BudgetLine:
         95 % interval of ``share``.
     settled
         Whether this interval is narrower than 0.5. Else the trials are too few to tell.
-    source
-        Where a variance that was not drawn comes from; empty for groups that the trials drew.
     """
 
     group: str
@@ -72,7 +70,6 @@ class BudgetLine:
     share: float
     share_interval: tuple[float, float]
     settled: bool = True
-    source: str = ""
 
 
 class SizedLine(Protocol):
@@ -111,20 +108,8 @@ def largest_line(lines: Sequence[_Line]) -> _Line | None:
     return largest if told else None
 
 
-@dataclass(frozen=True)
-class Undrawn:
-    """A variance [unit^2] that no trial draws, such as the error of a model, with its ``source``."""
-
-    group: str
-    variance: float
-    source: str
-
-
 def budget(
-    errors: ArrayLike | OneSidedErrors,
-    numbers: Mapping[str, ArrayLike],
-    seeds: Mapping[str, ArrayLike],
-    undrawn: Sequence[Undrawn] = (),
+    errors: ArrayLike | OneSidedErrors, numbers: Mapping[str, ArrayLike], seeds: Mapping[str, ArrayLike]
 ) -> tuple[BudgetLine, ...]:
     """Return the budget of one measurement, largest contribution first; empty for under 30 trials with a value.
 
@@ -138,8 +123,6 @@ def budget(
     seeds
         By group, (n,) whole numbers: trials with the same number have the same draw of the group. ``interaction`` has
         the day of each trial.
-    undrawn
-        Variances that are added to that of the trials.
 
     See Also
     --------
@@ -162,30 +145,17 @@ def budget(
         errors.part(finite).gradients if isinstance(errors, OneSidedErrors) else None,
     )
     low, high = _intervals(estimate)
-    whole = drawn + sum(influence.variance for influence in undrawn)
     lines = [
         BudgetLine(
             NOISE if name == RESIDUAL else name,
             drawn * float(estimate.shares[i]),
             drawn * float(low[i]),
             drawn * float(high[i]),
-            drawn / whole * float(estimate.shares[i]),
-            (drawn / whole * float(low[i]), drawn / whole * float(high[i])),
+            float(estimate.shares[i]),
+            (float(low[i]), float(high[i])),
             bool(high[i] - low[i] < _TOO_WIDE),
         )
         for i, name in enumerate(estimate.names)
-    ]
-    lines += [
-        BudgetLine(
-            influence.group,
-            influence.variance,
-            influence.variance,
-            influence.variance,
-            influence.variance / whole,
-            (influence.variance / whole, influence.variance / whole),
-            source=influence.source,
-        )
-        for influence in undrawn
     ]
     return tuple(sorted(lines, key=lambda line: -line.variance))
 

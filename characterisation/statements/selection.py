@@ -125,47 +125,25 @@ def deviates(measurements: int, views: int) -> Floats:
     return np.random.default_rng(0).standard_normal((measurements, _SAMPLES, views))
 
 
-def joint_samples(
-    errors: ArrayLike, prior_risk: ArrayLike, prior_chance: ArrayLike, prior_own: float = PRIOR_OWN
-) -> Floats:
+def joint_samples(errors: ArrayLike, prior_risk: ArrayLike, prior_chance: ArrayLike) -> Floats:
     """Return samples (m, s, v) of the logarithms of the risks of all measurements and views.
 
-    Parameters
-    ----------
-    errors
-        (m, v, n) by measurement, view and world, as in :func:`posterior`.
-    prior_risk, prior_chance, prior_own
-        (m, v), and a number, as in :func:`posterior`.
-
-    See Also
-    --------
-    posterior : of one measurement
+    The arguments are those of :func:`posterior`, with the measurement as first dimension.
     """
     every, risk, chance = (np.asarray(values, float) for values in (errors, prior_risk, prior_chance))
     independent = deviates(*every.shape[:2])
     standard = np.tensordot(np.linalg.cholesky(_between_measurements(every)), independent, 1)
     return np.stack(
-        [sampled(*posterior(every[m], risk[m], chance[m], prior_own), standard=standard[m]) for m in range(len(every))]
+        [sampled(*posterior(every[m], risk[m], chance[m]), standard=standard[m]) for m in range(len(every))]
     )
 
 
-def posterior(
-    errors: ArrayLike, prior_risk: ArrayLike, prior_chance: ArrayLike, prior_own: float = PRIOR_OWN
-) -> tuple[Floats, Floats]:
+def posterior(errors: ArrayLike, prior_risk: ArrayLike, prior_chance: ArrayLike) -> tuple[Floats, Floats]:
     """Return the mean (v,) and covariance (v, v) of the logarithms of the risks of views, from their trials.
 
-    Parameters
-    ----------
-    errors
-        (v, n) by view and world; NaN for a trial without a value, infinite where the view had no trial in that world.
-    prior_risk, prior_chance
-        (v,) the map's u, and its probability that the measurement is possible.
-    prior_own
-        Standard uncertainty of the logarithm of the map's u, of each view.
-
-    See Also
-    --------
-    sampled : samples of that distribution
+    ``errors`` (v, n) are by view and world: NaN for a trial without a value, infinite where the view had no trial in
+    that world. ``prior_risk`` and ``prior_chance`` (v,) are the map's u, and its probability that the measurement is
+    possible.
     """
     every = np.asarray(errors, float)
     tried, valued = ~np.isinf(every), np.isfinite(every)
@@ -174,7 +152,7 @@ def posterior(
     loss = -0.5 * np.log(possible)
     loss_variance = (1 - possible) / (4 * possible * (tried.sum(axis=1) + BELIEF))
     prior_mean = u + np.zeros(len(every))
-    prior = np.eye(len(every)) * prior_own**2 + PRIOR_COMMON**2
+    prior = np.eye(len(every)) * PRIOR_OWN**2 + PRIOR_COMMON**2
     counts = valued.sum(axis=1)
     counted = np.flatnonzero(counts)
     if not len(counted):

@@ -38,7 +38,7 @@ _DARK = (
 def noise_figure(sheets: Sequence[DataSheet]) -> Figure:
     """Draw sigma over distance on matt white, a panel for each sensor, with the values that others published."""
     with drawing():
-        figure, panels = _panels(len(sheets), 3.4, 2.9)
+        figure, panels = _panels(len(sheets), 2.9)
         for sheet, axes in zip(sheets, panels, strict=False):
             distance = np.array([point.distance for point in sheet.noise])
             sigma = np.array([point.sigma for point in sheet.noise])
@@ -64,7 +64,7 @@ def noise_figure(sheets: Sequence[DataSheet]) -> Figure:
 def residual_figure(sheets: Sequence[DataSheet]) -> Figure:
     """Draw the distribution of the residuals on a plane at mid range, with the normal one of the same spread."""
     with drawing():
-        figure, panels = _panels(len(sheets), 3.4, 2.6)
+        figure, panels = _panels(len(sheets), 2.6)
         for sheet, axes in zip(sheets, panels, strict=False):
             residuals = sheet.residuals
             spread = float(residuals.values.std())
@@ -208,10 +208,10 @@ def _mm(value: float) -> str:
     return two_digits(value) if abs(value) >= 1e-4 else "0.0000"
 
 
-def _panels(count: int, width: float, height: float) -> tuple[Figure, NDArray[np.object_]]:
+def _panels(count: int, height: float) -> tuple[Figure, NDArray[np.object_]]:
     across = min(3, count)
     down = math.ceil(count / across)
-    figure = Figure((width * across, height * down), layout="constrained")
+    figure = Figure((3.4 * across, height * down), layout="constrained")
     panels = np.asarray(figure.subplots(down, across, squeeze=False)).ravel()
     for spare in panels[count:]:
         spare.set_visible(False)

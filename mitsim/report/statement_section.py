@@ -25,7 +25,6 @@ def statement_section(document: StatementDocument) -> dict[str, Any]:
     measured = document.measurements
     lines = [line for one in measured.values() for line in one.budget]
     shown = [group for group in GROUPS if any(line.group == group for line in lines)]
-    undrawn = {line.group: line.source for line in lines if line.source}
     return {
         "view": document.view,
         "rendered": document.measured_by == "render",
@@ -46,7 +45,6 @@ def statement_section(document: StatementDocument) -> dict[str, Any]:
             for name, one in measured.items()
         ),
         "find_out": remedies_in_words(one.size_depends_on for one in measured.values()),
-        "undrawn": [{"name": GROUPS.get(group, ("", group))[1], "source": undrawn[group]} for group in undrawn],
         "missing": [influence.model_dump() for influence in document.influences if not influence.included],
         "losses": lost_features(
             (name, one.trials, [Loss(lost.reason, lost.count) for lost in one.losses]) for name, one in measured.items()

@@ -75,9 +75,10 @@ class CalibratedEye:
     matrix_map: str
     values: dict[str, Composed] = field(repr=False)
 
-    def sources(self, quantity: str) -> tuple[str, ...]:
-        """Return the dotted names of the sources of a value; none without it."""
-        return self.values[quantity].sources if quantity in self.values else ()
+    @property
+    def rotation_sources(self) -> tuple[str, ...]:
+        """Return the dotted names of the sources of its rotation; none without one."""
+        return self.values["rotation"].sources if "rotation" in self.values else ()
 
     @property
     def is_projector(self) -> bool:

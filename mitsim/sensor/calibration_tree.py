@@ -120,9 +120,9 @@ def read_tree(files: list[Path]) -> CalibrationTree:
     tree = CalibrationTree([file for file, _ in read], [values for _, values in read])
     if len(files) == len(read) == 2:  # of one camera each, as of EuRoC
         first, second = (cameras_of(eyes_of(values))[0] for values in tree.values)
-        if len(first) == len(second) == 1 and first[0].sources("rotation"):
+        if len(first) == len(second) == 1 and first[0].rotation_sources:
             tree.values[1] |= second_from_first(first[0].values, second[0].values)
-            tree.seen.update((0, source) for source in first[0].sources("rotation"))
+            tree.seen.update((0, source) for source in first[0].rotation_sources)
     return tree
 
 

@@ -11,7 +11,6 @@ another and of the errors of the calibration, so covariances add.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
@@ -22,24 +21,10 @@ from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.rig_parameters import eyes
 
-#: Sources of the defaults. "Recorded" refers to the Ensenso recordings of docs/how-to/real-captures.md.
-SOURCES: Mapping[str, str] = {
-    "vergence_mrad": "recorded: the device's own correction turned each camera of an N10 by 0.17 mrad toward the "
-    "other, 0.34 mrad together; one such difference of two calibrations gives 0.34 / sqrt(2)",
-    "row_mrad": "recorded: rows of three Ensenso units off by 0.09, 0.22 and 0.008 px at f = 589, 1474 and 1154 px "
-    "under the calibrations in use; their root mean square. An N10 under its factory's was off by 1.5 mrad",
-    "roll_mrad": "assumed: as the row error, of the same mounts",
-    "focal_relative": "assumed: 5 K at 2e-5 per K, a lens of glass in a mount of aluminium",
-    "baseline_per_kelvin": "known: thermal expansion of aluminium, 23e-6 per K",
-    "path_offset_mm": "recalled: after warming up, distances of a Kinect V2 stay within a millimetre or so (Lachat et "
-    "al., Remote Sensing 7, 2015)",
-    "temperature_k": "assumed: between the temperatures of calibration and use, once the sensor is warm",
-}
-
 
 @dataclass(frozen=True)
 class Drift:
-    """One-sigma figures of drift since the calibration; :data:`SOURCES` gives the sources of the defaults.
+    """One-sigma figures of drift since the calibration.
 
     - ``vergence_mrad``: rotation of the second eye about the axis perpendicular to baseline and view.
     - ``row_mrad``: rotation about the baseline, which shifts its rows by the focal length times the angle.
@@ -49,12 +34,23 @@ class Drift:
     - ``path_offset_mm``: offset of a time-of-flight path.
     """
 
+    # "recorded" refers to the Ensenso recordings of docs/how-to/real-captures.md
+    #: recorded: the device's own correction turned each camera of an N10 by 0.17 mrad toward the other, 0.34 mrad
+    #: together; one such difference of two calibrations gives 0.34 / sqrt(2)
     vergence_mrad: float = 0.24
+    #: recorded: rows of three Ensenso units off by 0.09, 0.22 and 0.008 px at f = 589, 1474 and 1154 px under the
+    #: calibrations in use; their root mean square. An N10 under its factory's was off by 1.5 mrad
     row_mrad: float = 0.12
+    #: assumed: as the row error, of the same mounts
     roll_mrad: float = 0.12
+    #: assumed: 5 K at 2e-5 per K, a lens of glass in a mount of aluminium
     focal_relative: float = 1e-4
+    #: known: thermal expansion of aluminium
     baseline_per_kelvin: float = 23e-6
+    #: assumed: between the temperatures of calibration and use, once the sensor is warm
     temperature_k: float = 5.0
+    #: recalled: after warming up, distances of a Kinect V2 stay within a millimetre or so (Lachat et al., Remote
+    #: Sensing 7, 2015)
     path_offset_mm: float = 1.0
 
     def __post_init__(self) -> None:

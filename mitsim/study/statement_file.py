@@ -46,7 +46,6 @@ class BudgetEntry(PartialDocument):
     share: float
     share_interval: tuple[float, float]
     settled: bool
-    source: str
     fresh: bool
 
 

@@ -118,7 +118,7 @@ class EnsensoCamera(LiveCamera):
             self._unlink()
             for path, value in settings.wanted().items():
                 self._set(path, value)
-            self._command("Synchronize")
+            self._synchronize()
             self._check_read_back()
 
     def take(self) -> EnsensoShot:
@@ -203,8 +203,8 @@ class EnsensoCamera(LiveCamera):
                 hint = "Set a value within the camera's range, which NxView shows"
                 raise DeviceError(self.where, f"set {path}", f"{reading}, read back", f"{value}", hint)
 
-    def _command(self, name: str) -> None:
-        command = self._nxlib.NxLibCommand(name)
+    def _synchronize(self) -> None:
+        command = self._nxlib.NxLibCommand("Synchronize")
         command.parameters()["Cameras"] = self.serial
         command.execute()
 
@@ -232,7 +232,7 @@ class EnsensoCamera(LiveCamera):
                 self._item("Link").set_json(json.dumps(self._link), True)
         if self._before:
             with suppress(Exception):
-                self._command("Synchronize")
+                self._synchronize()
         self._before.clear()
         self._link = None
 

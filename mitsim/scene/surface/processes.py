@@ -56,10 +56,10 @@ class WideAngle:
         return moved_odds(share, 1 / self.factor), moved_odds(share, self.factor)
 
 
-def moved_odds(share: float, factor: float, largest: float = LARGEST_WIDE_ANGLE) -> float:
-    """Return the share w [1] whose odds w / (``largest`` - w) are ``factor`` times those of ``share``."""
-    odds = share / (largest - share) * factor
-    return largest * odds / (1 + odds)
+def moved_odds(share: float, factor: float) -> float:
+    """Return the share w [1] whose odds w / (:data:`LARGEST_WIDE_ANGLE` - w) are ``factor`` times those of ``share``."""
+    odds = share / (LARGEST_WIDE_ANGLE - share) * factor
+    return LARGEST_WIDE_ANGLE * odds / (1 + odds)
 
 
 @dataclass(frozen=True)

@@ -58,10 +58,10 @@ class FittedKey:
         """Return the 95 % interval, or that the number is not determined: its interval would be the assumed one."""
         return "{:.4g} to {:.4g}".format(*self.interval()) if self.determined else "not determined"
 
-    def interval(self, coverage: float = 1.959964) -> tuple[float, float]:
-        """Return the interval of ``coverage`` standard uncertainties about the value, on its scale; 95 % by default."""
+    def interval(self) -> tuple[float, float]:
+        """Return the 95 % interval about the value, of 1.96 standard uncertainties on its scale."""
         middle = scaled(self.value, self.scale)
-        ends = [unscaled(middle + sign * coverage * self.uncertainty, self.scale) for sign in (-1, 1)]
+        ends = [unscaled(middle + sign * 1.959964 * self.uncertainty, self.scale) for sign in (-1, 1)]
         return min(ends), max(ends)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from characterisation.statements.budget import INTERACTION, NOISE, Undrawn, budget
+from characterisation.statements.budget import INTERACTION, NOISE, budget
 from characterisation.statements.one_sided import OneSidedErrors
 from characterisation.statements.variance_components import AT_ONCE
 from tests.proofs.budgets import NUMBERS, KnownStudy, design
@@ -81,17 +81,6 @@ def test_numbers_that_do_not_vary_and_seeds_that_all_differ_have_no_line():
     assert groups == set(TRUTH)
     single = {line.group for line in budget(errors, numbers, {INTERACTION: np.arange(60)})}
     assert single == {*NUMBERS, NOISE}
-
-
-def test_an_undrawn_variance_is_a_line_of_its_own():
-    errors, numbers, seeds = drawn(7, 100)
-    plain = {line.group: line for line in budget(errors, numbers, seeds)}
-    whole = errors.var(ddof=1)
-    lines = {line.group: line for line in budget(errors, numbers, seeds, [Undrawn("model", whole, "a laboratory")])}
-    assert lines["model"].share == pytest.approx(0.5) and lines["model"].source == "a laboratory"
-    assert sum(line.share for line in lines.values()) == pytest.approx(1)
-    for name, line in plain.items():
-        assert lines[name].variance == line.variance and lines[name].share == pytest.approx(line.share / 2)
 
 
 def test_errors_of_a_position_are_divided_by_their_vectors():

@@ -8,7 +8,7 @@ import pytest
 from characterisation.files.errors import InputError
 from mitsim.decoding.structured_light.geometry import structured_light_geometry
 from mitsim.decoding.structured_light.newton_polynomial import evaluate
-from mitsim.sensor.drift import SOURCES, Drift, drift_modes
+from mitsim.sensor.drift import Drift, drift_modes
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.preset_covariance import with_drift
 from mitsim.sensor.rig_covariance import RigCovariance
@@ -122,7 +122,6 @@ def test_drift_adds_to_a_covariance(n10):
     assert sigma["left.focal_x_px"] == pytest.approx(0.62618) and sigma["left.k1"] == 0
     assert sigma["right.position_x_mm"] == pytest.approx(100.775 * 5 * 23e-6)
     assert "vergence_mrad 0.3" in found.source
-    assert set(SOURCES) == set(Drift().numbers())
     with pytest.raises(InputError, match=r"drift: roll_mrad.*0 or more"):
         Drift(roll_mrad=-1)
 
