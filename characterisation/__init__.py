@@ -39,43 +39,30 @@ _NAMES = {
 }
 
 if TYPE_CHECKING:
-    from characterisation.cloud_files import read_cloud, write_cloud
-    from characterisation.coupon.patch_table import Overall, overall
-    from characterisation.coupon.patches import Coupon
-    from characterisation.coupon_cloud import measure_coupon, patch_metrics
-    from characterisation.features.fits import fit_cylinder, fit_plane, fit_sphere
-    from characterisation.features.fitted import CylinderFit, PlaneFit, SphereFit
-    from characterisation.features.robust_fit import FitError
-    from characterisation.features.surfaces import Cylinder
-    from characterisation.files.errors import InputError, MissingEnvironmentError
-    from characterisation.maps.performance_map import PerformanceMap
-    from characterisation.point_cloud import PointCloud, Status, ViewGrid
-    from characterisation.scores.deciles import deciles
+    from characterisation.cloud_files import read_cloud as read_cloud
+    from characterisation.cloud_files import write_cloud as write_cloud
+    from characterisation.coupon.patch_table import Overall as Overall
+    from characterisation.coupon.patch_table import overall as overall
+    from characterisation.coupon.patches import Coupon as Coupon
+    from characterisation.coupon_cloud import measure_coupon as measure_coupon
+    from characterisation.coupon_cloud import patch_metrics as patch_metrics
+    from characterisation.features.fits import fit_cylinder as fit_cylinder
+    from characterisation.features.fits import fit_plane as fit_plane
+    from characterisation.features.fits import fit_sphere as fit_sphere
+    from characterisation.features.fitted import CylinderFit as CylinderFit
+    from characterisation.features.fitted import PlaneFit as PlaneFit
+    from characterisation.features.fitted import SphereFit as SphereFit
+    from characterisation.features.robust_fit import FitError as FitError
+    from characterisation.features.surfaces import Cylinder as Cylinder
+    from characterisation.files.errors import InputError as InputError
+    from characterisation.files.errors import MissingEnvironmentError as MissingEnvironmentError
+    from characterisation.maps.performance_map import PerformanceMap as PerformanceMap
+    from characterisation.point_cloud import PointCloud as PointCloud
+    from characterisation.point_cloud import Status as Status
+    from characterisation.point_cloud import ViewGrid as ViewGrid
+    from characterisation.scores.deciles import deciles as deciles
 
-__all__ = [
-    "Coupon",
-    "Cylinder",
-    "CylinderFit",
-    "FitError",
-    "InputError",
-    "MissingEnvironmentError",
-    "Overall",
-    "PerformanceMap",
-    "PlaneFit",
-    "PointCloud",
-    "SphereFit",
-    "Status",
-    "ViewGrid",
-    "deciles",
-    "fit_cylinder",
-    "fit_plane",
-    "fit_sphere",
-    "measure_coupon",
-    "overall",
-    "patch_metrics",
-    "read_cloud",
-    "write_cloud",
-]
+__all__ = list(_NAMES)
 
 
 def __getattr__(name: str) -> Any:

@@ -15,7 +15,7 @@ from characterisation.words.version import __version__ as __version__
 #: name -> module that defines it
 _NAMES = {
     "BudgetLine": "characterisation.statements.budget",
-    "CampaignFile": "mitsim.maps.campaign.plan",
+    "CampaignFile": "mitsim.maps.campaign.campaign_file",
     "Capture": "mitsim.capture.capture",
     "InputError": "characterisation.files.errors",
     "MissingEnvironmentError": "characterisation.files.errors",
@@ -55,75 +55,46 @@ _NAMES = {
 }
 
 if TYPE_CHECKING:
-    from characterisation.cloud_files import write_cloud
-    from characterisation.files.errors import InputError, MissingEnvironmentError
-    from characterisation.maps.performance_map import PerformanceMap
-    from characterisation.point_cloud import PointCloud
-    from characterisation.statements.budget import BudgetLine
-    from characterisation.statements.statement import Statement
-    from characterisation.tasks.result import Result
-    from characterisation.tasks.task_file import Task
-    from characterisation.tasks.task_reading import read_task
-    from mitsim.capture.capture import Capture
-    from mitsim.capture.folder import read_capture, write_capture
-    from mitsim.capture.simulated.render import load_scene, render
-    from mitsim.capture.truth import Truth, read_truth
-    from mitsim.decoding.decode import decode, read_cloud
-    from mitsim.decoding.own_code import triangulate
-    from mitsim.maps.campaign.campaign_file import CampaignFile
-    from mitsim.maps.use import characterise, performance_map, predict
-    from mitsim.scene.load import Scene
-    from mitsim.scene.ray_casting.true_points import true_points
-    from mitsim.sensor.poses import look_at
-    from mitsim.sensor.preset import load_sensor
-    from mitsim.sensor.sensor import Sensor
-    from mitsim.sensor.transforms import Transform
-    from mitsim.study import Study, StudyFile
-    from mitsim.study.reading import open_study
-    from mitsim.study.run import run_study
-    from mitsim.study.session import score, statement
-    from mitsim.study.task_measurement import label, measure
+    from characterisation.cloud_files import write_cloud as write_cloud
+    from characterisation.files.errors import InputError as InputError
+    from characterisation.files.errors import MissingEnvironmentError as MissingEnvironmentError
+    from characterisation.maps.performance_map import PerformanceMap as PerformanceMap
+    from characterisation.point_cloud import PointCloud as PointCloud
+    from characterisation.statements.budget import BudgetLine as BudgetLine
+    from characterisation.statements.statement import Statement as Statement
+    from characterisation.tasks.result import Result as Result
+    from characterisation.tasks.task_file import Task as Task
+    from characterisation.tasks.task_reading import read_task as read_task
+    from mitsim.capture.capture import Capture as Capture
+    from mitsim.capture.folder import read_capture as read_capture
+    from mitsim.capture.folder import write_capture as write_capture
+    from mitsim.capture.simulated.render import load_scene as load_scene
+    from mitsim.capture.simulated.render import render as render
+    from mitsim.capture.truth import Truth as Truth
+    from mitsim.capture.truth import read_truth as read_truth
+    from mitsim.decoding.decode import decode as decode
+    from mitsim.decoding.decode import read_cloud as read_cloud
+    from mitsim.decoding.own_code import triangulate as triangulate
+    from mitsim.maps.campaign.campaign_file import CampaignFile as CampaignFile
+    from mitsim.maps.use import characterise as characterise
+    from mitsim.maps.use import performance_map as performance_map
+    from mitsim.maps.use import predict as predict
+    from mitsim.scene.load import Scene as Scene
+    from mitsim.scene.ray_casting.true_points import true_points as true_points
+    from mitsim.sensor.poses import look_at as look_at
+    from mitsim.sensor.preset import load_sensor as load_sensor
+    from mitsim.sensor.sensor import Sensor as Sensor
+    from mitsim.sensor.transforms import Transform as Transform
+    from mitsim.study import Study as Study
+    from mitsim.study import StudyFile as StudyFile
+    from mitsim.study.reading import open_study as open_study
+    from mitsim.study.run import run_study as run_study
+    from mitsim.study.session import score as score
+    from mitsim.study.session import statement as statement
+    from mitsim.study.task_measurement import label as label
+    from mitsim.study.task_measurement import measure as measure
 
-__all__ = [
-    "BudgetLine",
-    "CampaignFile",
-    "Capture",
-    "InputError",
-    "MissingEnvironmentError",
-    "PerformanceMap",
-    "PointCloud",
-    "Result",
-    "Scene",
-    "Sensor",
-    "Statement",
-    "Study",
-    "StudyFile",
-    "Task",
-    "Transform",
-    "Truth",
-    "characterise",
-    "decode",
-    "label",
-    "load_scene",
-    "load_sensor",
-    "look_at",
-    "measure",
-    "open_study",
-    "performance_map",
-    "predict",
-    "read_capture",
-    "read_cloud",
-    "read_task",
-    "read_truth",
-    "render",
-    "run_study",
-    "score",
-    "statement",
-    "triangulate",
-    "true_points",
-    "write_capture",
-    "write_cloud",
-]
+__all__ = list(_NAMES)
 
 
 def __getattr__(name: str) -> Any:

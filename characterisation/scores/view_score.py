@@ -207,7 +207,7 @@ def write_scores(
         writer.writerows(rows)
 
 
-def _ratio(numerator: NDArray[np.floating], denominator: NDArray[np.floating]) -> NDArray[np.floating]:
+def _ratio(numerator: NDArray[np.floating], denominator: NDArray[np.floating]) -> NDArray[np.floating[Any]]:
     """Return the quotient, 0 where the denominator is 0 or either is NaN, which means no visible points."""
     numerator, denominator = np.broadcast_arrays(numerator, denominator)
     defined = (denominator > 0) & np.isfinite(numerator)

@@ -57,7 +57,7 @@ class WideAngle:
 
 
 def moved_odds(share: float, factor: float) -> float:
-    """Return the share w [1] whose odds w / (:data:`LARGEST_WIDE_ANGLE` - w) are ``factor`` times those of ``share``."""
+    """Return the share w [1] whose odds w / (LARGEST_WIDE_ANGLE - w) are ``factor`` times those of ``share``."""
     odds = share / (LARGEST_WIDE_ANGLE - share) * factor
     return LARGEST_WIDE_ANGLE * odds / (1 + odds)
 
