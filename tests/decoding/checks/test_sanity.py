@@ -22,7 +22,6 @@ from mitsim.decoding.checks.row_texture import measured_row_error
 from mitsim.decoding.checks.sanity import code_findings, row_error_in_words, with_warnings
 from mitsim.decoding.cloud import capture_cloud
 from mitsim.decoding.coded_images import CodedImages
-from mitsim.decoding.matching import stereo
 from mitsim.decoding.matching.stereo_geometry import stereo_geometry
 from mitsim.decoding.structured_light import decoder, two_cameras
 from mitsim.decoding.structured_light.decoder import decode_coordinates
@@ -472,7 +471,8 @@ def test_cloud_and_checks_share_the_geometry_of_a_pair(monkeypatch, technology):
         capture = replace(capture, technology=technology, images=images, decoding=Decoding())
         settings = MatcherSettings(near_mm=300, far_mm=2000)
     prepared = []
-    monkeypatch.setattr(stereo, "stereo_rectification", lambda *eyes: prepared.append(1) or stereo_rectification(*eyes))
+    patched = "mitsim.decoding.matching.stereo_geometry.stereo_rectification"
+    monkeypatch.setattr(patched, lambda *eyes: prepared.append(1) or stereo_rectification(*eyes))
     checked_cloud(capture, settings, None)
     assert len(prepared) == 1
 
