@@ -65,7 +65,7 @@ def _about(axis: Array, middle: Array, points: Array) -> tuple[Cylinder, float, 
     """Return the cylinder along an axis (3,) through most points (n, 3), their width, and median distance from it."""
     basis = tangents(axis)
     local = (points - middle) @ basis.T
-    centre, radius = _robust_circle(local)
+    centre, radius = _nearer(local, *_circle(local))
     distance = float(np.median(np.abs(np.linalg.norm(local - centre, axis=1) - radius)))
     return Cylinder(middle + centre @ basis, axis, radius), _width(local), distance
 
@@ -89,12 +89,6 @@ def _across(normals: Array) -> Array:
     half = normals[nearest <= np.median(nearest)]
     axis: Array = np.linalg.eigh(half.T @ half)[1][:, 0]
     return axis if np.median(np.abs(normals @ axis)) * _MUCH < np.median(sines) else squares
-
-
-def _robust_circle(points: Array) -> tuple[Array, float]:
-    """Return centre (2,) and radius of the circle through most of the points (n, 2)."""
-    centre, radius = _circle(points)
-    return _nearer(points, centre, radius)
 
 
 def _circle(points: Array) -> tuple[Array, float]:

@@ -44,12 +44,12 @@ from characterisation.statements.tolerance import Tolerance
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Part = Literal["any part", "part at the limit of the tolerance", "part far from nominal"]
+ErrorsOf = Literal["any part", "part at the limit of the tolerance", "part far from nominal"]
 
 #: parts whose errors are stated
-ANY_PART: Part = "any part"
-AT_THE_LIMIT: Part = "part at the limit of the tolerance"
-FAR_FROM_NOMINAL: Part = "part far from nominal"
+ANY_PART: ErrorsOf = "any part"
+AT_THE_LIMIT: ErrorsOf = "part at the limit of the tolerance"
+FAR_FROM_NOMINAL: ErrorsOf = "part far from nominal"
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class Statement:
     decided: Decided | None
     verdict: Verdict
     losses: tuple[Loss, ...] = ()
-    errors_of: Part = ANY_PART
+    errors_of: ErrorsOf = ANY_PART
     size_depends_on: SizeDependence | None = None
 
     @property
@@ -256,7 +256,7 @@ def statement(
     related
         (n,) whole numbers: trials with the same number have draws in common. By default those of one day.
     """
-    part: Part = ANY_PART
+    part: ErrorsOf = ANY_PART
     if isinstance(errors, OneSidedErrors):
         part = AT_THE_LIMIT if errors.limit is not None else FAR_FROM_NOMINAL
         every = errors.stated

@@ -183,7 +183,7 @@ def load_scene(
         try:
             scene = backend.mi.load_file(str(path), parallel=False, optimize=False, **parameters)
         except Exception as error:  # Mitsuba raises plain RuntimeErrors for errors in the file
-            mitsuba_error = InputError(path, "", _one_line(error), "a scene that Mitsuba 3 can load")
+            mitsuba_error = InputError(path, "", " ".join(str(error).split())[:400], "a scene that Mitsuba 3 can load")
             raise state.fault or explain_error(mitsuba_error, path) from None
     return replace(_wrap(scene, state.finishes, str(path)), parameters=parameters)
 
@@ -328,7 +328,3 @@ def _check_xml(path: Path, parameters: dict[str, str], wavelength_nm: float) -> 
             raise InputError(path, name, "a parameter that the scene does not have", allowed, nearest(name, names))
     check_rotations(path, trees, parameters)
     check_spectra(path, trees, parameters, wavelength_nm)
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:400]

@@ -67,7 +67,8 @@ def explain_error(error: InputError, path: Path) -> InputError:
         found = f"a second object of the id {match[1]!r} (the first is in line {match[2]})"
         return InputError(where, "id", found, "one id for one object", "a shape's id is the name of its feature")
     if match := re.search(r'reference to "([^"]+)"', text):
-        ids = _ids(path)
+        objects = ElementTree.parse(path).getroot().iter()
+        ids = [str(e.get("id")) for e in objects if e.get("id") and e.tag != "ref"]
         return InputError(where, "ref", repr(match[1]), f"ids in the file: {', '.join(ids)}", nearest(match[1], ids))
     return error
 
@@ -76,8 +77,3 @@ def _name_in_xml(path: Path, name: str) -> str:
     """Return the path of a file as the XML has it; Mitsuba reports only its last part."""
     names = [str(e.get("value")) for e in ElementTree.parse(path).getroot().iter("string")]
     return next((candidate for candidate in names if Path(candidate).name == name), name)
-
-
-def _ids(path: Path) -> list[str]:
-    """Return the ids of all objects in the XML."""
-    return [str(e.get("id")) for e in ElementTree.parse(path).getroot().iter() if e.get("id") and e.tag != "ref"]

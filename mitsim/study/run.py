@@ -130,7 +130,8 @@ def run_within(
     session.claim("run")
     (folder / "clouds").mkdir(parents=True, exist_ok=True)
     (folder / "captures").mkdir(exist_ok=True)
-    residuals = _coupon_residuals(session)
+    own, renderer = session.study.campaign, session.renderer
+    residuals = [] if own is None or renderer is None else coupon_residuals(renderer.simulated, own)
     performance_map = _map(session)
     clock.lap("characterise")
 
@@ -266,12 +267,6 @@ def _best(scores: xr.Dataset) -> list[int]:
     ranks = np.concatenate([scores["uncertainty_rank"].values, scores["rank"].values])
     able = np.concatenate([np.isfinite(scores["predicted_uncertainty"].values), scores["possible"].values])
     return sorted({int(view) for view in np.flatnonzero(((ranks <= SHOWN) & able).any(axis=0))})
-
-
-def _coupon_residuals(session: Session) -> list[RenderResidual]:
-    """Return the render noise of the coupons of a study's own campaign."""
-    campaign, renderer = session.study.campaign, session.renderer
-    return [] if campaign is None or renderer is None else coupon_residuals(renderer.simulated, campaign)
 
 
 def _map(session: Session) -> PerformanceMap:

@@ -35,6 +35,7 @@ from mitsim.capture.recordings.recording_files import (
     MOST_FILES,
     SQLITE_MAGIC,
 )
+from mitsim.sensor.projector_images import counted
 
 #: first bytes of data packed by Zstandard
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -84,7 +85,7 @@ def open_bag(path: Path) -> RosBag:
     if not path.is_dir():
         return _opened(path)
     files = [file for file in islice(path.iterdir(), MOST_FILES) if file.is_file() and not file.is_symlink()]
-    bag_files = sorted((file for file in files if file.suffix.lower() in ROS2_SUFFIXES), key=_numbered)
+    bag_files = sorted((file for file in files if file.suffix.lower() in ROS2_SUFFIXES), key=counted)
     if not bag_files:
         packed = next((file.name for file in files if file.name.lower().endswith(".zstd")), None)
         hint = "" if packed is None else f"unpack it: zstd -d {packed}"
@@ -251,11 +252,6 @@ def is_ros_mcap(path: Path) -> bool:
         return any(channel.message_encoding in ("cdr", "ros1") for _, channel, _ in first)
     except (InputError, ValueError, OSError):
         return False
-
-
-def _numbered(path: Path) -> list[Any]:
-    """Return a key that orders ``bag_2`` before ``bag_10``."""
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
 
 
 @contextmanager

@@ -24,7 +24,7 @@ from numpy.lib.stride_tricks import as_strided, sliding_window_view
 from numpy.typing import NDArray
 
 from mitsim.decoding.matching.sgbm import Matches, both_ways_disagreement, pixels_matched_back, strips
-from mitsim.decoding.matching.sub_pixel import Fit, offset_of_minimum
+from mitsim.decoding.matching.sub_pixel import SubPixelFit, offset_of_minimum
 from mitsim.sensor.matcher import MatcherSettings
 
 Words = NDArray[np.unsignedinteger[Any]]
@@ -101,7 +101,7 @@ def match_census_both_ways(
     scale = bits / _BITS / 2**shift
     p1 = max(round(settings.p1 * scale), 1)
     penalties = _Penalties(p1, max(round(settings.p2 * scale), p1 + 1))
-    fit: Fit = "equiangular" if settings.sub_pixel == "equiangular" else "parabola"
+    fit: SubPixelFit = "equiangular" if settings.sub_pixel == "equiangular" else "parabola"
     disparities = np.full((height, width), np.nan, np.float32)
     back = np.full((height, width + 2 * count), np.nan, np.float32)
     exists = (source - first >= 0) & (source - first < whole)
@@ -290,7 +290,7 @@ class _Places:
         return least, self.count - self._place.max(axis=0).astype(np.intp)
 
 
-def _best_disparities(least: _Least, count: int, uniqueness: int, fit: Fit) -> NDArray[np.float32]:
+def _best_disparities(least: _Least, count: int, uniqueness: int, fit: SubPixelFit) -> NDArray[np.float32]:
     """Return disparities (h, w), of a number of ``count``, NaN where another is nearly as good."""
     lower, middle, upper = least.sums.astype(np.float32)
     inside = (least.best > 0) & (least.best < count - 1)

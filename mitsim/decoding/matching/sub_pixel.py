@@ -12,10 +12,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-Fit = Literal["parabola", "equiangular"]
+SubPixelFit = Literal["parabola", "equiangular"]
 
 
-def offset_of_minimum(lower: NDArray[Any], least: NDArray[Any], upper: NDArray[Any], fit: Fit) -> NDArray[np.float32]:
+def offset_of_minimum(
+    lower: NDArray[Any], least: NDArray[Any], upper: NDArray[Any], fit: SubPixelFit
+) -> NDArray[np.float32]:
     """Return the offset [px], -0.5 to 0.5, of the minimum from the middle one of three costs.
 
     Parameters

@@ -82,7 +82,8 @@ def machined(
     sigma = _height(face, process)
     feed_variance = 0.0
     if process.feed_marks and face.feed_marks != "resolved" and not face.said:
-        feed_variance = 2 * _feed_slope(face) ** 2
+        radius = face.nose_radius if face.nose_radius is not None else NOSE_RADIUS_MM
+        feed_variance = 2 * feed_slope(feed(face.roughness, radius), radius) ** 2
     lobe = _lobe(face, process, sigma, wavelength_nm, where)
     across = np.hypot(lobe.across, np.sqrt(feed_variance))
 
@@ -134,11 +135,6 @@ def _height(face: MachinedFace, process: Process) -> float:
     if face.profile is not None:
         return face.profile.Rq
     return face.Rq if face.Rq is not None else rms_height(face.roughness)
-
-
-def _feed_slope(face: MachinedFace) -> float:
-    radius = face.nose_radius if face.nose_radius is not None else NOSE_RADIUS_MM
-    return feed_slope(feed(face.roughness, radius), radius)
 
 
 def _lobe(face: MachinedFace, process: Process, sigma: float, wavelength_nm: float, where: str) -> _LobeWidths:

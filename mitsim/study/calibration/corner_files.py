@@ -101,7 +101,9 @@ def _together(
             continue
         pixels = {eye: np.array([by_eye[eye][corner] for corner in common]) for eye in sizes}
         _check_inside(path, pose, pixels, sizes)
-        twin = next((name for name, other in used.items() if _are_equal(pixels, other)), None)
+        # a copy of an image has the same pixels
+        equal = (name for name, other in used.items() if all(np.array_equal(pixels[eye], other[eye]) for eye in pixels))
+        twin = next(equal, None)
         if twin is not None:
             left_out.append(f"{pose}: the same as {twin}")
             continue
@@ -129,11 +131,6 @@ def _check_inside(path: Path, pose: str, pixels: dict[str, Floats], sizes: Sizes
             hint = "are these corners of images of another size, or are x and y exchanged?"
             corner = f"a corner at {x:.1f}, {y:.1f} px"
             raise InputError(path, f"{eye}, pose {pose}", corner, f"corners within {width} x {height} px", hint)
-
-
-def _are_equal(first: dict[str, Floats], second: dict[str, Floats]) -> bool:
-    """Return whether two poses have the same pixels, as a copy of an image has."""
-    return all(np.array_equal(corners, second[eye]) for eye, corners in first.items())
 
 
 def _of_images(path: Path, board: Board) -> tuple[Seen, Sizes, dict[str, FittedCapture]]:
