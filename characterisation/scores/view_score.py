@@ -211,7 +211,7 @@ def _ratio(numerator: NDArray[np.floating], denominator: NDArray[np.floating]) -
     """Return the quotient, 0 where the denominator is 0 or either is NaN, which means no visible points."""
     numerator, denominator = np.broadcast_arrays(numerator, denominator)
     defined = (denominator > 0) & np.isfinite(numerator)
-    return np.divide(numerator, denominator, out=np.zeros(numerator.shape), where=defined)
+    return np.asarray(np.divide(numerator, denominator, out=np.zeros(numerator.shape), where=defined))
 
 
 def _variable(values: ArrayLike, dims: tuple[str, ...], long_name: str, units: str) -> xr.Variable:
