@@ -98,7 +98,6 @@ class RunDocument(PartialDocument):
     checked_views: list[int]
     raced_views: int = 0
     race_trials: int = 0
-    race_decided: bool = False
     race_margin: float = 0.1
     finished: bool = True
     lacks: list[str] = Field(default_factory=list)

@@ -46,7 +46,6 @@ class BudgetEntry(PartialDocument):
     share: float
     share_interval: tuple[float, float]
     settled: bool
-    fresh: bool
 
 
 class DecisionEntry(PartialDocument):
@@ -82,7 +81,6 @@ class StatedMeasurement(PartialDocument):
     standard_uncertainty: float | None
     interval: tuple[float | None, float | None]
     interval_corrected: tuple[float | None, float | None]
-    numerical_tolerance: float | None
     settled: bool
     repeatability: float | None
     budget: list[BudgetEntry]
