@@ -47,20 +47,16 @@ class Port(Protocol):
 
     def read(self, size: int = 1, /) -> bytes:
         """Read up to ``size`` bytes, fewer after the port's own time-out."""
-        ...
 
     def write(self, data: bytes, /) -> int | None:
         """Send bytes."""
-        ...
 
     def close(self) -> None:
         """Close the port."""
-        ...
 
     @property
     def in_waiting(self) -> int:
         """Return the number of bytes that can be read without waiting."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -57,23 +57,18 @@ class Controller(Protocol):
 
     def home(self, timeout_s: float) -> None:
         """Let the device find its zero; return when it has."""
-        ...
 
     def start(self, targets: Sequence[float]) -> float:
         """Start the axes, and return the expected duration of the move [s]."""
-        ...
 
     def report(self) -> tuple[tuple[float, ...], bool | None]:
         """Return the positions of the axes, and whether they move; None if the device does not report motion."""
-        ...
 
     def halt(self) -> bool:
         """Stop the axes; return whether the device has confirmed it."""
-        ...
 
     def close(self) -> None:
         """Close the port."""
-        ...
 
 
 class LiveStage:
