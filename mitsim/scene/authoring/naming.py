@@ -1,7 +1,7 @@
 """Name faces descriptively: ``top``, ``bore_12mm_left``, ``chamfer_30deg``.
 
 Signal chain: faces -> the name in the CAD file, if a person wrote one -> else the kind of the face with its size -> for
-equal names, the position -> for names that are still equal, a number by z, y, x.
+equal names, the position -> for names that are still equal, a number by z, y, x, then by area.
 
 Names depend on geometry alone. A file that is read again, or exported with its entities in another order, gives the
 same names. Left and right are -x and +x, front and back -y and +y, bottom and top -z and +z, seen from the front with z
@@ -40,6 +40,13 @@ _HALF = np.deg2rad(150.0)
 
 #: positions differ if their distance exceeds this share of the part's size along that axis
 _APART = 0.02
+
+#: faces form two clusters along an axis if the gap between them exceeds this share of their distance; over a half, so
+#: that the middle lies in the gap: noise would give the middle one of three holes a side; chosen
+_GAP = 0.55
+
+#: noise of a file, and facets of the default mesh at the rim of a round face, move its place by less [mm]; chosen
+_NOISE_MM = 0.02
 
 #: placeholders of CAD programs for faces without a name
 _NO_NAME = re.compile(r"(none|null|unnamed|advanced_?face|face|surface|shape|body|solid|\W)*[\d\W_]*", re.IGNORECASE)
@@ -82,7 +89,8 @@ def _unique(names: dict[int, str], faces: Sequence[Face]) -> list[str]:
     """
     taken: dict[str, int] = {}
     out: dict[int, str] = {}
-    for number in sorted(names, key=lambda index: (names[index], _place(faces[index]).round(4).tolist()[::-1])):
+    rank = _ranks(np.array([_place(face) for face in faces]))
+    for number in sorted(names, key=lambda index: (names[index], rank[index], faces[index].area)):
         base = name = f"face_{names[number]}" if _FINISH.fullmatch(names[number]) else names[number]
         while name.casefold() in taken:
             taken[base.casefold()] += 1
@@ -129,8 +137,9 @@ def _part_names(faces: Sequence[Face]) -> list[str]:
     bodies = {face.body: face.part for face in faces}
     if len(bodies) == 1:
         return [""] * len(faces)
-    middles = {b: np.concatenate([f.vertices for f in faces if f.body == b]).mean(axis=0).round(3) for b in bodies}
-    order = sorted(bodies, key=lambda body: (bodies[body], middles[body].tolist()))
+    middles = [np.concatenate([f.vertices for f in faces if f.body == body]).mean(axis=0) for body in bodies]
+    rank = dict(zip(bodies, _ranks(np.array(middles)), strict=True))
+    order = sorted(bodies, key=lambda body: (bodies[body], rank[body][::-1]))
     names: dict[int, str] = {}
     for body in order:
         name = identifier(bodies[body] or "part", _LONGEST_PART)
@@ -229,7 +238,7 @@ def _distinguished(faces: list[Face], extent: Floats) -> list[str]:
         return [""]
     positions = np.array([_place(face) for face in faces])
     spread = np.ptp(positions, axis=0)
-    far = spread > np.maximum(_APART * extent, 1e-3)
+    far = spread > np.maximum(_APART * extent, _NOISE_MM)
     words: list[list[str]] = [[] for _ in faces]
     for along in (2, 1, 0):
         if far[along] and _form_two_clusters(positions[:, along]):
@@ -241,15 +250,26 @@ def _distinguished(faces: list[Face], extent: Floats) -> list[str]:
     groups = defaultdict(list)
     for number, suffix in enumerate(suffixes):
         groups[suffix].append(number)
+    rank = _ranks(positions)
     for suffix, members in groups.items():
-        order = sorted(members, key=lambda member: (positions[member].round(3) + 0.0).tolist()[::-1])
+        order = sorted(members, key=lambda member: (rank[member], faces[member].area))
         for count, number in enumerate(order, 1):
             out[number] = suffix if len(members) == 1 else f"{suffix}_{count}"
     return [out[number] for number in range(len(faces))]
+
+
+def _ranks(positions: Floats) -> list[list[int]]:
+    """Return the ranks of positions (n, 3) [mm] by z, y and x; those less than :data:`_NOISE_MM` apart are equal."""
+    order = np.argsort(positions, axis=0)
+    steps = np.diff(np.take_along_axis(positions, order, axis=0), axis=0, prepend=positions.min(axis=0)[None])
+    ranks = np.empty(positions.shape, int)
+    np.put_along_axis(ranks, order, np.cumsum(steps > _NOISE_MM, axis=0), axis=0)
+    out: list[list[int]] = ranks[:, ::-1].tolist()
+    return out
 
 
 def _form_two_clusters(values: Floats) -> bool:
     """Return whether numbers form two clusters with a gap, so that sides distinguish them; a row of holes does not."""
     ordered = np.sort(values)
     gaps = np.diff(ordered)
-    return bool(gaps.max() > 0.45 * (ordered[-1] - ordered[0]))
+    return bool(gaps.max() > _GAP * (ordered[-1] - ordered[0]))

@@ -85,6 +85,35 @@ def test_names_do_not_hang_on_the_order_of_the_file(faces):
     assert {face.name: face.entities for face in with_names(mixed)} == {face.name: face.entities for face in faces}
 
 
+def test_names_hang_on_geometry_alone_where_noise_puts_equal_places_apart(tmp_path):
+    """Four bores on the axes, drawn at their coordinates or by rotation, about which 30 sin(pi) = 4e-15 mm is noise."""
+    from OCP.BRepAlgoAPI import BRepAlgoAPI_Cut
+
+    def places(at):
+        plate = solid("Cylinder", 40.0, 8.0)
+        for x, y in at:
+            plate = BRepAlgoAPI_Cut(plate, solid("Cylinder", 3.0, 20.0, at=(x, y, -1.0))).Shape()
+        faces = with_names(read_step(write_step([("flange", plate, None)], tmp_path / "flange.step")).faces)
+        return {f.name: f.surface.point.round(6).tolist() for f in faces if f.name.startswith("bore")}
+
+    exact = places([(30.0, 0.0), (0.0, 30.0), (-30.0, 0.0), (0.0, -30.0)])
+    turned = [math.pi / 2 * number for number in range(4)]
+    assert exact == places([(30 * math.cos(angle), 30 * math.sin(angle)) for angle in turned])
+    assert list(exact) == [f"bore_6mm_{number}" for number in range(1, 5)], "none is left or right of the others"
+
+
+def test_concentric_faces_of_one_height_are_numbered_by_area(tmp_path):
+    from OCP.BRepAlgoAPI import BRepAlgoAPI_Cut
+
+    groove = BRepAlgoAPI_Cut(solid("Cylinder", 34.0, 10.0, at=(0, 0, 7)), solid("Cylinder", 28.0, 20.0)).Shape()
+    ring = BRepAlgoAPI_Cut(solid("Cylinder", 40.0, 10.0), groove).Shape()
+    faces = read_step(write_step([("ring", ring, None)], tmp_path / "ring.step")).faces
+    for order in (faces, faces[::-1]):
+        areas = {face.name: face.area for face in with_names(order)}
+        assert areas["top_1"] == pytest.approx(math.pi * (40**2 - 34**2), rel=1e-3)
+        assert areas["top_2"] == pytest.approx(math.pi * 28**2, rel=1e-3)
+
+
 def test_upright_faces_between_the_axes_are_sides_and_inclined_ones_are_slopes(tmp_path):
     from OCP.BRepBuilderAPI import BRepBuilderAPI_Transform
     from OCP.BRepPrimAPI import BRepPrimAPI_MakeBox
