@@ -30,7 +30,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
-from characterisation.features.robust_fit import CLIP, FitError, robust_std
+from characterisation.features.robust_fit import CLIP, SMALLEST_SCALE, FitError, robust_std
 from characterisation.features.surfaces import Surface
 from characterisation.files.arrays import Floats
 
@@ -58,12 +58,16 @@ _RINGS = 60
 
 @dataclass(frozen=True)
 class _Part:
-    """Points (n, 3) of a shape from a view; each represents ``thinning`` points."""
+    """Points (n, 3) of a shape from a view; each represents ``thinning`` points.
+
+    The robust standard deviation of its residuals is at least ``least_scale`` [mm].
+    """
 
     view: int
     shape: str
     points: Floats
     thinning: float
+    least_scale: float
 
 
 @dataclass(frozen=True)
@@ -88,6 +92,7 @@ def best_fit(
     about: Floats,
     pose_covariance: Floats,
     seed: int = 0,
+    least_scales: Sequence[Mapping[str, float]] = (),
 ) -> list[Floats]:
     """Return the motion (4, 4) of each view, in their order.
 
@@ -103,6 +108,9 @@ def best_fit(
         (6, 6) covariance of the motion [w (rad), t (mm)] that is expected of each view, of mean 0.
     seed
         Selects the random numbers of the fit.
+    least_scales
+        Of each view the least scale [mm] of the residuals of each shape, for rounded points
+        (:func:`characterisation.features.starts.rounding_scale`); by default that of exact points.
 
     Raises
     ------
@@ -110,7 +118,7 @@ def best_fit(
         If the views are not all connected by shapes of which two views have :data:`LEAST` points each, or the points do
         not determine a shape.
     """
-    parts = _parts(views, np.random.default_rng(seed))
+    parts = _parts(views, least_scales or [{}] * len(views), np.random.default_rng(seed))
     _check_connected(parts, len(views))
     names = list(dict.fromkeys(part.shape for part in parts))
     fitted = {name: shapes[name] for name in names}
@@ -145,13 +153,16 @@ def best_fit(
     return motions
 
 
-def _parts(views: Sequence[Mapping[str, Floats]], rng: np.random.Generator) -> list[_Part]:
+def _parts(
+    views: Sequence[Mapping[str, Floats]], scales: Sequence[Mapping[str, float]], rng: np.random.Generator
+) -> list[_Part]:
     parts = []
-    for number, view in enumerate(views):
+    for number, (view, least) in enumerate(zip(views, scales, strict=True)):
         for name, points in view.items():
             if len(points) >= LEAST:
                 sample = points if len(points) <= POINTS else points[rng.choice(len(points), POINTS, replace=False)]
-                parts.append(_Part(number, name, sample, len(points) / len(sample)))
+                least_scale = least.get(name, SMALLEST_SCALE)
+                parts.append(_Part(number, name, sample, len(points) / len(sample), least_scale))
     return parts
 
 
@@ -181,12 +192,12 @@ def _choose(
 
     A motion moves points as a change of the shape does. So to first order these residuals do not depend on the poses.
     """
-    near = np.abs(residual) <= CLIP * robust_std(residual)
+    near = np.abs(residual) <= CLIP * max(robust_std(residual), part.least_scale)
     if near.sum() <= by_shape.shape[1]:
         raise FitError(f"{part.shape}: only {near.sum()} points lie on one {part.shape}")
     g = by_shape[near]
     left = residual[near] - g @ np.linalg.lstsq(g, residual[near], rcond=1e-9)[0]
-    variance = max(float(left @ left) / len(left), np.finfo(float).tiny)
+    variance = max(float(left @ left) / len(left), SMALLEST_SCALE**2)
     return _Chosen(near, part.thinning / (variance * counted_as_one(points[near], left, part.thinning, rng)))
 
 

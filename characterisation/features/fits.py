@@ -81,7 +81,7 @@ def fit_plane(points: ArrayLike, viewpoint: ArrayLike | None = None) -> PlaneFit
     """
     points = _usable(points, Plane)
     start = plane_start(points)
-    plane, kept = _fit(start, points, viewpoint, rounding_scale(points, start.normal))
+    plane, kept = _fit(start, points, viewpoint, rounding_scale(points, start))
     centroid = points[kept].mean(axis=0)
     outward = plane.normal[np.argmax(np.abs(plane.normal))]
     if viewpoint is not None:

@@ -44,6 +44,7 @@ from numpy.polynomial.legendre import legvander
 from numpy.typing import ArrayLike, NDArray
 
 from characterisation.features.robust_fit import CHOICES, CLIP, FitError, rays_from, robust_std, usable
+from characterisation.features.starts import rounding_scale
 from characterisation.features.surfaces import GRAZING_COSINE, Cylinder, Meeting, Plane
 from characterisation.features.vectors import tangents
 
@@ -295,6 +296,7 @@ def fit_form(points: ArrayLike, surface: Plane | Cylinder, viewpoint: ArrayLike 
         raise FitError(f"only {facing.sum()} of {len(points)} points are not seen at grazing incidence")
     among = _Points.of(surface, points, rays, at, facing)
     near, rows = np.ones(len(among.points), bool), np.empty((0, 0))
+    least_scale = rounding_scale(points, surface)
     for _ in range(CHOICES):
         if not rows.size or among.are_wider(near):
             among, near = among.among(near), np.ones(int(near.sum()), bool)
@@ -305,7 +307,7 @@ def fit_form(points: ArrayLike, surface: Plane | Cylinder, viewpoint: ArrayLike 
         combined = _combined(products - gone @ gone.T, rigid)
         coefficients = combined.T @ (right - gone @ among.residual[~chosen])
         deviation = among.residual - (combined @ coefficients) @ rows
-        near = chosen & (np.abs(deviation) <= CLIP * robust_std(deviation[chosen]))
+        near = chosen & (np.abs(deviation) <= CLIP * max(robust_std(deviation[chosen]), least_scale))
         if np.array_equal(near, chosen):
             break
     deviation, slope = deviation[chosen], among.slope[chosen]

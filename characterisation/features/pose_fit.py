@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.features.fitted import FitQuality
 from characterisation.features.robust_fit import FitError, covariance_of, rays_from, robust_fit
+from characterisation.features.starts import rounding_scale
 from characterisation.features.surfaces import Surface
 
 Array = NDArray[np.float64]
@@ -139,7 +140,11 @@ def fit_pose(
     start = Pose(np.asarray(sensor_from_part, float), stacked.mean(axis=0))
     every = np.arange(len(stacked))
     _check_determined(linearised(start, np.zeros(6), every, True)[1], start, stacked)
-    pose, kept = robust_fit(start, linearised, len(stacked))
+    scales = [
+        rounding_scale(rows, surface.placed(start.sensor_from_part))
+        for rows, surface in zip(arrays.values(), surfaces, strict=True)
+    ]
+    pose, kept = robust_fit(start, linearised, len(stacked), max(scales))
     pose = Pose(pose.sensor_from_part, stacked[kept].mean(axis=0))
     residual, jacobian, _ = linearised(pose, np.zeros(6), np.flatnonzero(kept), True)
     _check_determined(jacobian, pose, stacked[kept])

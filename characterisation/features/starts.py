@@ -20,7 +20,7 @@ from scipy.linalg import eig
 from scipy.spatial import cKDTree
 
 from characterisation.features.robust_fit import SMALLEST_SCALE, FitError, usable
-from characterisation.features.surfaces import Cylinder, Plane, Sphere
+from characterisation.features.surfaces import Cylinder, Plane, Sphere, Surface
 from characterisation.features.vectors import tangents
 
 Array = NDArray[np.float64]
@@ -205,13 +205,15 @@ def plane_start(points: Array) -> Plane:
     return squares
 
 
-def rounding_scale(points: Array, normal: Array) -> float:
-    """Return the least scale [mm] of the residuals of a plane of unit ``normal`` (3,) through rounded points (n, 3).
+def rounding_scale(points: Array, surface: Surface) -> float:
+    """Return the least scale [mm] of the residuals of a surface through points (n, 3), in the frame of their rounding.
 
     Most points of a plane across an axis may have the same rounded coordinate. The median of their residuals is then 0,
     and all others would count as outliers. With a scale of half a step, points two steps away are kept.
     """
-    column = points[:: 1 + len(points) // _MOST_ROUNDED, np.argmax(np.abs(normal))]
+    if not isinstance(surface, Plane):
+        return SMALLEST_SCALE
+    column = points[:: 1 + len(points) // _MOST_ROUNDED, np.argmax(np.abs(surface.normal))]
     values, counts = np.unique(column, return_counts=True)
     if len(values) < 2 or counts.max() < _TIED * len(column):
         return SMALLEST_SCALE

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from characterisation.features.fits import belonging
 from characterisation.features.robust_fit import CLIP, robust_std
+from characterisation.features.starts import rounding_scale
 from characterisation.features.surfaces import GRAZING_COSINE, Surface
 from characterisation.files.arrays import Floats
 from characterisation.point_cloud import PointCloud, Status
@@ -50,7 +51,8 @@ class FeatureResult:
     - ``points``: mean number of recovered points; ``fraction``: their share F of the possible points [1].
     - ``u`` [mm]: standard uncertainty of the surface's position, root mean square over the noise samples. It is
       infinite if the points are too few or do not determine the surface.
-    - ``scatter`` [mm]: robust standard deviation of the points along the rays, NaN if unknown.
+    - ``scatter`` [mm]: robust standard deviation of the points along the rays, NaN if unknown; of rounded depths, of
+      which most are the same, the standard deviation.
     - ``error``: relative standard error of u from the finite number of noise samples [1], 0 if unknown.
     """
 
@@ -154,12 +156,14 @@ def feature_result(
     residual, g = meeting.residual[usable], derivatives[recovered][usable]
     if len(residual) < max(MINIMUM_POINTS, 2 * derivatives.shape[1]):
         return no_result, recovered
-    near = np.ones(len(residual), bool)
+    near, least_scale = np.ones(len(residual), bool), rounding_scale(points[recovered][usable], surface)
     for _ in range(3):
         change = np.linalg.lstsq(g[near], residual[near], rcond=None)[0]
         remaining = residual - g @ change
-        near = np.abs(remaining) <= CLIP * robust_std(remaining)
+        near = np.abs(remaining) <= CLIP * max(robust_std(remaining), least_scale)
     scatter = robust_std(remaining)
+    if scatter < least_scale:
+        scatter = float(np.sqrt(np.mean(remaining[near] ** 2)))
     try:
         covariance = scatter**2 * np.linalg.inv(g[near].T @ g[near])
     except np.linalg.LinAlgError:

@@ -19,7 +19,8 @@ import numpy as np
 
 from characterisation.features.best_fit import best_fit, motion_matrix
 from characterisation.features.fits import belonging
-from characterisation.features.robust_fit import FitError
+from characterisation.features.robust_fit import SMALLEST_SCALE, FitError
+from characterisation.features.starts import rounding_scale
 from characterisation.files.arrays import Floats
 from characterisation.scores.joining import pose_covariance
 from characterisation.tasks.evaluation import measure_points
@@ -51,10 +52,10 @@ class JoinedMeasurements:
         for day in days:
             yield day, self._measured([self._measure_view(view, k, day) for k, view in enumerate(self.views)], day)
 
-    def _measure_view(self, view: View, number: int, day: int) -> dict[str, Floats]:
+    def _measure_view(self, view: View, number: int, day: int) -> dict[str, tuple[Floats, float]]:
         """Return the points (n, 3) [mm] of each feature of one view on one day, part frame by its assumed pose.
 
-        The ``number`` of the view in the set is that of its capture.
+        With them comes the least scale [mm] of their residuals. The ``number`` of the view is that of its capture.
         """
         renderer, first = self.renderer, self.renderer.unknowns.draw(Trial(day))
         drawn = replace(renderer.unknowns.draw(Trial(day, number)), placed=first.placed, assumed=first.assumed)
@@ -68,10 +69,11 @@ class JoinedMeasurements:
             face_points = cloud.of_feature(name)
             nominal = renderer.study.task.features[name].nominal(assumed.inverse().matrix())
             kept = face_points[belonging(face_points, nominal, cloud.grid.origin)] if len(face_points) else face_points
-            points[name] = kept @ motion[:3, :3].T + motion[:3, 3]
+            scale = rounding_scale(kept, nominal) if len(kept) else SMALLEST_SCALE
+            points[name] = kept @ motion[:3, :3].T + motion[:3, 3], scale
         return points
 
-    def _measured(self, measured: Sequence[dict[str, Floats]], day: int) -> Outcome:
+    def _measured(self, measured: Sequence[dict[str, tuple[Floats, float]]], day: int) -> Outcome:
         task = self.renderer.study.task
         try:
             points = self._join(measured, day)
@@ -80,19 +82,18 @@ class JoinedMeasurements:
             return Outcome(dict.fromkeys(names, math.nan), dict.fromkeys(names, f"the views do not join: {error}"))
         return Outcome.of(measure_points(points, task, MINIMUM_POINTS, False))
 
-    def _join(self, measured: Sequence[dict[str, Floats]], day: int) -> dict[str, Floats]:
+    def _join(self, measured: Sequence[dict[str, tuple[Floats, float]]], day: int) -> dict[str, Floats]:
         """Return the points of every feature from all views together."""
-        motions = [np.eye(4)] * len(measured)
+        views = [{name: points for name, (points, _) in view.items()} for view in measured]
+        motions = [np.eye(4)] * len(views)
         if self.table.joining == "best_fit":
             task = self.renderer.study.task
             shapes = {name: task.features[name].nominal() for name in task.shapes}
-            motions = best_fit(measured, shapes, self.centre, self.covariance, day)
+            scales = [{name: scale for name, (_, scale) in view.items()} for view in measured]
+            motions = best_fit(views, shapes, self.centre, self.covariance, day, scales)
         return {
             name: np.concatenate(
-                [
-                    points[name] @ motion[:3, :3].T + motion[:3, 3]
-                    for points, motion in zip(measured, motions, strict=True)
-                ]
+                [points[name] @ motion[:3, :3].T + motion[:3, 3] for points, motion in zip(views, motions, strict=True)]
             )
-            for name in measured[0]
+            for name in views[0]
         }

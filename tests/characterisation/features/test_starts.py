@@ -1,11 +1,15 @@
-"""Points that are hard to start from: rounded coordinates, thin rods."""
+"""Points that are hard to fit: rounded coordinates, thin rods."""
 
 import numpy as np
 import pytest
 from scipy.stats import norm
 
+from characterisation.features.best_fit import best_fit
 from characterisation.features.fits import fit_cylinder, fit_plane
-from characterisation.features.starts import cylinder_start
+from characterisation.features.form import fit_form
+from characterisation.features.pose_fit import fit_pose
+from characterisation.features.starts import cylinder_start, rounding_scale
+from characterisation.features.surfaces import Plane
 
 EYE = np.zeros(3)
 
@@ -27,6 +31,38 @@ def test_rounded_depths_have_the_mean_and_the_noise_of_rounded_noise(step, offse
     noise = np.sqrt(share @ (steps - mean) ** 2)
     assert -fit.normal @ fit.point == pytest.approx(500 + step * mean, abs=step * (4 * noise / np.sqrt(5000) + 0.005))
     assert fit.residual_std == pytest.approx(step * noise, rel=0.1)
+
+
+@pytest.mark.parametrize("step", [0.1, 1.0])
+def test_form_pose_and_joined_views_use_all_rounded_depths(step, rng):
+    """Three quarters and more of the depths are the same; their noise and their means are those of rounded noise."""
+    means, clouds = [], []
+    for offset in (0.0, 0.3):
+        steps = np.arange(-8, 9)
+        share = norm.cdf(steps + 0.5, offset, 0.3) - norm.cdf(steps - 0.5, offset, 0.3)
+        means.append(step * share @ steps)
+        noise = step * np.sqrt(share @ (steps - share @ steps) ** 2)
+        points = face(step * np.round(offset + 0.3 * rng.standard_normal(5000)), rng)
+        form = fit_form(points, fit_plane(points, EYE), EYE)
+        assert form.residual_std == pytest.approx(noise, rel=0.1)
+        wall = np.column_stack([40 + 0.02 * rng.standard_normal(800), rng.uniform([-40, 500], [40, 540], (800, 2))])
+        clouds.append({"face": points, "wall": wall, "other": wall[:, [1, 0, 2]]})
+    shapes = {
+        name: Plane(np.array(point), np.array(normal))
+        for name, point, normal in [
+            ("face", [0.0, 0, 500], [0.0, 0, -1]),
+            ("wall", [40.0, 0, 0], [1.0, 0, 0]),
+            ("other", [0, 40.0, 0], [0, 1.0, 0]),
+        ]
+    }
+    close = step * 4 * 0.5 / np.sqrt(5000) + 0.005
+    for mean, cloud in zip(means, clouds, strict=True):
+        assert fit_pose(cloud, shapes, np.eye(4)).sensor_from_part[2, 3] == pytest.approx(mean, abs=close)
+    expected = np.diag([1e-3, 1e-3, 1e-3, 1.0, 1.0, 1.0]) ** 2
+    scales = [{"face": rounding_scale(cloud["face"], shapes["face"])} for cloud in clouds]
+    first, second = best_fit(clouds, shapes, np.array([0, 0, 500.0]), expected, least_scales=scales)
+    joined = second @ [0, 0, 500, 1] - first @ [0, 0, 500, 1]
+    assert joined[2] == pytest.approx(means[0] - means[1], abs=2 * close)
 
 
 def test_a_step_of_a_part_is_no_rounding(rng):

@@ -149,14 +149,16 @@ def test_a_difference_that_noise_explains_is_no_shortfall():
     assert shortfall(sure, {"a": replace(limit["a"], error=0.0)}) == pytest.approx(0.25)
 
 
-def plane_cloud(sigma: float, seed: int, keep: np.ndarray | None = None):
-    """A plane 500 mm before a pinhole of 60 x 40 pixels, with noise along the rays."""
+def plane_cloud(sigma: float, seed: int, keep: np.ndarray | None = None, step: float = 0.0):
+    """A plane 500 mm before a pinhole of 60 x 40 pixels, with noise along the rays, or of depths rounded to a step."""
     grid = ViewGrid(1000.0, 1000.0, 29.5, 19.5, 60, 40)
     rays = grid.rays().reshape(-1, 3)
     surface = Plane(np.array([0.0, 0.0, 500.0]), np.array([0.0, 0.0, -1.0]))
     points = rays * (500.0 / rays[:, 2:])
     noise = np.random.default_rng(seed).normal(0, sigma, len(points))
     measured = points + noise[:, None] * rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    if step:
+        measured = rays * (500.0 + step * np.round(noise / step))[:, None] / rays[:, 2:]
     if keep is not None:
         measured[~keep] = np.nan
     derivatives = surface.linearised(np.zeros(3), points, rays / np.linalg.norm(rays, axis=1, keepdims=True))[1]
@@ -179,6 +181,14 @@ def test_u_of_a_feature_that_is_seen_whole_is_sigma_over_the_root_of_points_per_
         assert one.points == 2400 and one.fraction == 1.0 and recovered.all()
         uncertainties.append(one.u)
     assert np.mean(uncertainties) == pytest.approx(0.05 * math.sqrt(3 / 2400), rel=0.02)
+
+
+def test_most_of_the_depths_are_the_same_and_the_scatter_is_that_of_all():
+    """Of 0.3 steps of noise, 90.4 % round to one depth; the rest is one step off: 0.309 steps."""
+    cloud, derivatives, surface = plane_cloud(0.3, 1, step=1.0)
+    one, _ = feature_result(cloud, np.arange(2400), derivatives, surface)
+    assert one.scatter == pytest.approx(math.sqrt(2 * 0.04779), rel=0.1)
+    assert one.u == pytest.approx(one.scatter * math.sqrt(3 / 2400), rel=0.05)
 
 
 def test_a_half_that_is_lost_costs_more_than_half_of_the_points_lost_at_random():
