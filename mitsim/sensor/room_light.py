@@ -17,6 +17,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.sensor import Sensor
 
 #: share of full scale that a matt white plate reaches at most by light of the room. It is chosen: the remainder is for
@@ -76,7 +77,7 @@ def exposures_in_room(
 
     They are those of the sensor's rule, which knows no room, times the largest factor up to 1 with which a matt white
     plate at normal incidence shows the bright pattern and the room at :data:`FULLEST` of full scale. A plate that is
-    brighter in the dark stays as bright.
+    brighter in the dark stays as bright. For time of flight, full scale is a full tap.
 
     Parameters
     ----------
@@ -89,9 +90,11 @@ def exposures_in_room(
     """
     by_radiance = sensor.electrons() * exposures_s[0] / sensor.imager.full_well
     control = sensor.exposure.control
-    plate = sensor.projector.plate_radiance(_WHITE, distance_mm)
+    plate, room = sensor.projector.plate_radiance(_WHITE, distance_mm), _WHITE / np.pi * irradiance
+    if isinstance(sensor.pattern, AmplitudeModulation):  # of the two taps of a pixel the fuller one
+        plate, room = plate * (1 + float(sensor.pattern.contrasts.max())) / 2, room / 2
     dark = plate * by_radiance if control is None else control.level
-    both = dark + _WHITE / np.pi * irradiance * by_radiance
+    both = dark + room * by_radiance
     factor = min(1.0, max(FULLEST, dark) / both)
     return tuple(factor * seconds for seconds in exposures_s)
 

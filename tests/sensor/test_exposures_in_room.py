@@ -2,8 +2,11 @@
 
 import math
 
+import numpy as np
 import pytest
 
+from mitsim.sensor.modulation import expose_taps
+from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.room_light import exposures_in_room, room_irradiance
 
@@ -49,3 +52,24 @@ def test_every_exposure_of_a_bracket_is_shortened_alike(zivid):
     own = zivid.exposure.exposures(None, zivid.imager.full_well)[0]
     both = exposures_in_room(zivid, (own, 4 * own), 700.0, room_irradiance(5000.0, 0.2, zivid.wavelength_nm, 300.0))
     assert math.isclose(both[1], 4 * both[0]) and both[0] < own
+
+
+@pytest.mark.parametrize("distance", [600.0, 800.0])
+def test_time_of_flight_fills_the_fuller_of_its_two_taps(distance):
+    """Of a plate by daylight the simulated taps are full just above the exposure over 0.9."""
+    kinect = load_sensor("kinect-v2")
+    own, code = kinect.exposure.exposures(None, kinect.imager.full_well), kinect.pattern
+    radiance = 0.85 / np.pi * kinect.projector.plane_irradiance / distance**2
+    frequencies, delays, contrasts = code.images()
+    turns = np.linspace(0, 1, 4001) * 2 * np.pi * frequencies[:, None] / 16e6
+    light = radiance * (1 + contrasts[:, None] * np.cos(turns - delays[:, None]))[:, None]
+    room = room_irradiance(60000.0, 1.0, kinect.wavelength_nm, 40.0)
+
+    def saturates(seconds):
+        correlations = (light + 0.85 / np.pi * room) * kinect.electrons() * seconds
+        levels = expose_taps(correlations, code, kinect.imager, None, Noise.only("quantisation"), None)
+        return (levels == 2**kinect.imager.bits - 1).any()
+
+    (set_here,) = exposures_in_room(kinect, own, distance, room)
+    assert set_here < own[0]
+    assert not saturates(0.999 * set_here / 0.9) and saturates(1.001 * set_here / 0.9)

@@ -211,6 +211,8 @@ def trial_digest(
         content["sprayed"] = True
     if any(unknowns.table.form.features.values()):
         content["form"] = FORM_VERSION
+    if source == "render" and study.sensor.technology == "time_of_flight":
+        content["taps"] = 2  # of a pixel, by which exposures in a room are set
     if separate_light:
         content["apart"] = True
     if source == "map":
