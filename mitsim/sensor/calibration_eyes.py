@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 from mitsim.sensor.calibration_names import USUAL_NAMES
-from mitsim.sensor.calibration_numbers import Composed, dotted, vector
+from mitsim.sensor.calibration_numbers import Composed, by_rows, dotted, vector
 from mitsim.sensor.calibration_poses import pose_in, second_from_first
 from mitsim.sensor.lens_models import is_fisheye
 
@@ -218,9 +218,11 @@ def _matrix(name: str, table: dict[str, Any]) -> Composed | None:
     """Return the camera matrix of a map, whose name is empty for the file itself."""
     low = {key.lower(): key for key in table}
     for usual in sorted(_MATRICES & set(low)) if name else ():
-        numbers = vector(table[low[usual]], 9)
-        if numbers is not None:
-            return Composed(numbers.reshape(3, 3), (dotted(name, low[usual]),), table)
+        numbers = vector(table[low[usual]])
+        # four pixels are fx, fy, cx, cy; those of a lens, which may have the same name, are below 1
+        if numbers is not None and (len(numbers) == 9 or (len(numbers) == 4 and numbers.min() > 1)):
+            K = numbers.reshape(3, 3) if len(numbers) == 9 else by_rows(numbers)[0]
+            return Composed(K, (dotted(name, low[usual]),), table)
     four = vector(table.get(low.get("intrinsics", "")))
     keys = [next((low[spelling] for spelling in names if spelling in low), "") for names in (*_SINGLE, *_DOUBLE)]
     if all(keys[:4]):

@@ -84,7 +84,13 @@ def _shown(value: Any, values: NDArray[np.float64]) -> str:
 
 
 def by_rows(K: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
-    """Return K (3, 3) by rows, of nine numbers too, and whether it is written by columns, as Open3D does."""
+    """Return K (3, 3) by rows, and whether it is written by columns, as Open3D does.
+
+    ``K`` may have nine numbers, or four: fx, fy, cx, cy.
+    """
+    if K.size == 4:
+        fx, fy, cx, cy = K.ravel()
+        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), False
     K = K.reshape(3, 3)
     by_columns = bool((K[:, 2] == (0, 0, 1)).all() and K[2, :2].all())
     return (K.T if by_columns else K), by_columns

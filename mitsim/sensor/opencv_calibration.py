@@ -226,7 +226,8 @@ def _eye(values: _Values, name: str, index: int, sensor_keys: dict[str, Any]) ->
     Keys in ``sensor_keys``, of the sensor file, may be missing in the calibration.
     """
     calibration_table, file = values.calibration_table, ", ".join(dict.fromkeys(map(str, values.tree.files)))
-    matrix = values.find(name, index, "matrix", ((3, 3), (9,)), needed="focal_px" not in sensor_keys)
+    matrices = ((3, 3), (9,), (4,), (4, 1), (1, 4))
+    matrix = values.find(name, index, "matrix", matrices, needed="focal_px" not in sensor_keys)
     table = {} if matrix is None else matrix.table
     values.tables.append(table)
     match = values.find(name, index, "distortion", ((0,), (4,), (5,), (8,), (12,), (14,)), needed=False)

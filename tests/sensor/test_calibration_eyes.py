@@ -253,6 +253,26 @@ def test_a_pose_as_one_matrix_that_a_toml_names(tmp_path):
     sees(read.rig.cameras["right"], K2, D, OM, T)
 
 
+FOUR = [600.0, 602.0, 331.0, 245.0]
+
+
+@pytest.mark.parametrize("four", [FOUR, [[number] for number in FOUR]])
+@pytest.mark.parametrize(("name", "keys"), [("optik.mine", "optik.mine"), ("K", ""), ("cam.K", ""), ("cam.K", "cam")])
+def test_four_numbers_are_the_focal_lengths_and_the_principal_point(tmp_path, four, name, keys):
+    """In a map or not, under a usual name or one that the sensor file gives; kc beside it is the lens."""
+    inner = {name.rpartition(".")[2]: four, "kc": [0.1, -0.2, 0.001, 0.002]}
+    saved(tmp_path / "a.json", {name.partition(".")[0]: inner} if "." in name else inner)
+    given = f'[calibration.keys.camera]\nmatrix = "{keys}"\n' if keys else ""
+    (tmp_path / "a.toml").write_text(f'[calibration]\nfile = "a.json"\nprojector = false\n{given}')
+    camera = read_calibration(tmp_path / "a.toml", SIZE).rig.reference
+    assert camera.matrix.tolist() == [[600, 0, 331], [0, 602, 245], [0, 0, 1]]
+
+
+def test_four_numbers_in_another_order_raise_a_doubt(tmp_path):
+    saved(tmp_path / "a.json", {"K": [600.0, 331.0, 602.0, 245.0]})
+    assert any("are these fx and fy" in note for note in read_calibration(tmp_path / "a.json", SIZE).notes)
+
+
 def colour_and_depth(size):
     colour = {"fx": 900.0, "fy": 900.0, "ppx": 331.0, "ppy": 245.0, "width": size[0], "height": size[1]}
     return {"color": colour, "depth": OF_LIBREALSENSE | {"coeffs": D}}
