@@ -318,6 +318,9 @@ def _check_round(where: str, name: str, shape: Any) -> None:
 
 
 def _check_xml(path: Path, parameters: dict[str, str], wavelength_nm: float) -> None:
+    if str(path) != str(path).encode("utf-8", "ignore").decode():
+        hint = "rename the file or its folder, or start mitsim in this folder"
+        raise InputError(path, "", "a path that is not UTF-8", "one that Mitsuba 3 can open", hint)
     root, *_ = trees = checked_trees(path, parameters)
     if root.tag != "scene":
         raise InputError(path, "", f"the root element <{root.tag}>", "<scene version='3.0.0'>")

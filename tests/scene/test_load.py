@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,6 +29,16 @@ def test_features_and_finishes_of_the_artefact(scenes):
     assert np.allclose(scene.bounds, [[-90, -60, 0], [90, 60, 60]])
     assert np.array_equal(scene.bounds, bounds_of(scene.mitsuba))
     assert scene.only("pillar1").names == ("pillar1",)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of any bytes are of Linux")
+def test_a_scene_in_a_folder_of_a_latin_1_name_is_read_from_inside(scenes, tmp_path, monkeypatch):
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/pr\xfcf"))
+    shutil.copytree((scenes / TWO).parent, folder)
+    with pytest.raises(InputError, match=r"a path that is not UTF-8; .*start mitsim in this folder"):
+        load_scene(folder / "two_pillars.xml", 850)
+    monkeypatch.chdir(folder)
+    assert load_scene("two_pillars.xml", 850).names[0] == "plane"
 
 
 def test_a_lamp_does_not_move_the_part(scenes, tmp_path):
