@@ -1,4 +1,7 @@
-"""Write files and folders atomically: completely or not at all, also on a full disk."""
+"""Write files and folders atomically: completely or not at all, also on a full disk.
+
+A symbolic link stays, and the file or folder that it points to is written.
+"""
 
 from __future__ import annotations
 
@@ -46,12 +49,12 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     OSError
         If the disk is full: its ``errno`` is in :data:`FULL`, its ``filename`` is ``path``.
     """
-    path = Path(path)
-    partial = path.with_name(f".{path.name}.{os.getpid()}-{HOST}.partial")
+    target = pointed_to(path)
+    partial = target.with_name(f".{target.name}.{os.getpid()}-{HOST}.partial")
     try:
-        with _naming(path):
+        with _naming(Path(path)):
             yield partial
-            partial.replace(path)
+            partial.replace(target)
     finally:
         with suppress(OSError):  # a read-only file system rejects that too; its error is already reported
             partial.unlink(missing_ok=True)
@@ -66,10 +69,10 @@ def atomic_write_named(path: str | Path) -> Iterator[Path]:
     OSError
         As :func:`atomic_write`.
     """
-    path = Path(path).absolute()
+    path, name = pointed_to(path).absolute(), Path(path).name
     ours = f"{os.getpid()}-{HOST}.partial"
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", suffix=f".{ours}", dir=path.parent) as folder:
-        partial = Path(folder) / path.name
+        partial = Path(folder) / name
         with _naming(path):
             try:
                 yield partial
@@ -89,7 +92,7 @@ def atomic_folder(folder: str | Path) -> Iterator[Path]:
     OSError
         As :func:`atomic_write`, or if ``folder`` exists and is not empty.
     """
-    folder = Path(folder).absolute()
+    folder = pointed_to(folder).absolute()
     partial = _beside(folder, "partial")
     try:
         with _naming(folder):
@@ -98,6 +101,12 @@ def atomic_folder(folder: str | Path) -> Iterator[Path]:
             partial.rename(folder)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def pointed_to(path: str | Path) -> Path:
+    """Return the path that a symbolic link points to; any other path as it is."""
+    path = Path(path)
+    return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
 def _beside(folder: Path, kind: str) -> Path:
@@ -117,7 +126,7 @@ def write_folder(folder: str | Path, files: Mapping[str, bytes], *, overwrite: b
         If the folder cannot be written, or exists already; an existing folder is then unchanged. If the disk is full,
         ``errno`` is in :data:`FULL` and ``filename`` is ``folder``.
     """
-    folder = Path(folder).absolute()
+    folder = pointed_to(folder).absolute()
     partial, old = _beside(folder, "partial"), _beside(folder, "old")
     try:
         with _naming(folder):

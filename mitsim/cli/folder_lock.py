@@ -19,7 +19,7 @@ from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 
-from characterisation.files.atomic_io import HOST
+from characterisation.files.atomic_io import HOST, pointed_to
 from characterisation.files.errors import InputError
 
 LOCK = ".mitsim.lock"
@@ -69,7 +69,8 @@ def remove_partial(folder: Path) -> list[Path]:
 
 def remove_partial_beside(path: Path) -> list[Path]:
     """Remove partial files that dead processes left for one file or folder, and nothing else in its parent folder."""
-    return _swept(path.absolute().parent, path.name)
+    path = pointed_to(path).absolute()
+    return _swept(path.parent, path.name)
 
 
 def _swept(folder: Path, name: str | None = None) -> list[Path]:

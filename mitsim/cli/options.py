@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from characterisation.files.atomic_io import pointed_to
 from characterisation.files.errors import InputError
 from mitsim.cli.folder_lock import lock_folder, remove_partial_beside
 
@@ -319,7 +320,7 @@ def check_folder(folder: Path, locked: bool = True) -> None:
         hint = "rename the folder, or give one elsewhere: -o /tmp/out"
         raise InputError("--output", "", whole, "a path in UTF-8, which netCDF files need", hint)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        pointed_to(folder).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError("--output", "", f"{folder} ({error.strerror})", "a folder that can be created") from None
     if not os.access(folder, os.W_OK):

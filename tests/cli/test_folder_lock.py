@@ -14,6 +14,7 @@ import pytest
 from characterisation.files.atomic_io import HOST, atomic_write, atomic_write_named, write_folder
 from characterisation.files.errors import InputError
 from mitsim.cli.folder_lock import LOCK, _holder, lock_folder, remove_partial, remove_partial_beside
+from mitsim.cli.options import check_folder, release_folders
 from mitsim.study.scoring import score_study
 from tests.shell import mitsim_here
 from tests.small_study import small_study
@@ -158,3 +159,13 @@ def test_commands_hold_their_folders_and_let_them_go(tmp_path, tmp_path_factory,
         mitsim_here("study", "score", study, *into)
     assert seen == [os.getpid()]
     assert (tmp_path / "scores.csv").exists() and not (tmp_path / LOCK).exists()
+
+
+def test_a_folder_that_a_link_points_to_is_made_and_swept_beside_itself(tmp_path):
+    (tmp_path / "run").symlink_to("disk/run")
+    check_folder(tmp_path / "run")
+    release_folders()
+    assert (tmp_path / "run").is_symlink() and (tmp_path / "disk" / "run").is_dir()
+    left = tmp_path / "disk" / f".run.partial-999999999-{HOST}0b"
+    left.mkdir()
+    assert remove_partial_beside(tmp_path / "run") == [left] and not left.exists()

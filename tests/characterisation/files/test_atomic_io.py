@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import errno
+import sys
 
 import pytest
 
-from characterisation.files.atomic_io import atomic_folder, atomic_write, atomic_write_named
+from characterisation.files.atomic_io import atomic_folder, atomic_write, atomic_write_named, write_folder
 
 both = pytest.mark.parametrize("written", [atomic_write, atomic_write_named])
 
@@ -57,3 +58,34 @@ def test_a_folder_is_there_whole_or_not_at_all(tmp_path):
     with pytest.raises(OSError, match="No space left") as raised, atomic_folder(tmp_path / "full"):
         raise OSError(errno.ENOSPC, "No space left on device", "somewhere/else")
     assert raised.value.filename == str(tmp_path / "full")
+
+
+needs_links = pytest.mark.skipif(sys.platform == "win32", reason="links need a privilege on Windows")
+
+
+@needs_links
+@both
+@pytest.mark.parametrize("there", [True, False])
+def test_a_link_stays_and_the_file_that_it_points_to_is_written(tmp_path, written, there):
+    (tmp_path / "store").mkdir()
+    if there:
+        (tmp_path / "store" / "cloud").write_text("old")
+    (tmp_path / "latest.ply").symlink_to("store/cloud")
+    with written(tmp_path / "latest.ply") as file:
+        file.write_text("new")
+    assert (tmp_path / "latest.ply").is_symlink() and (tmp_path / "store" / "cloud").read_text() == "new"
+    assert sorted(p.name for p in tmp_path.rglob("*")) == ["cloud", "latest.ply", "store"]
+
+
+@needs_links
+def test_a_link_to_a_folder_stays_and_its_folder_is_written(tmp_path):
+    (tmp_path / "disk" / "one").mkdir(parents=True)
+    (tmp_path / "one").symlink_to("disk/one")
+    with atomic_folder(tmp_path / "one") as folder:
+        (folder / "first").write_text("first")
+    write_folder(tmp_path / "one", {"second": b"second"}, overwrite=True)
+    (tmp_path / "two").symlink_to("disk/two")
+    write_folder(tmp_path / "two", {"third": b"third"})
+    assert (tmp_path / "one").is_symlink() and (tmp_path / "two").is_symlink()
+    names = sorted(p.relative_to(tmp_path / "disk").as_posix() for p in (tmp_path / "disk").rglob("*"))
+    assert names == ["one", "one/second", "two", "two/third"]
