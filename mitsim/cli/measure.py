@@ -224,7 +224,7 @@ def _task(
     from characterisation.tasks.task_reading import check_features, read_task
     from mitsim.scene.load import load_scene
     from mitsim.sensor.preset import load_sensor
-    from mitsim.study.task_measurement import measure_task, read_pose, read_view_statement
+    from mitsim.study.task_measurement import measure_task, read_pose, read_view_statement, unit_doubt
 
     definition = read_task(task)
     # feature positions do not depend on the finish, so any wavelength serves to load the scene
@@ -237,6 +237,8 @@ def _task(
         world_from_sensor = given_pose or (None if cloud.capture is None else cloud.capture.world_from_sensor)
         if world_from_sensor is None:
             raise InputError(cloud.path, "pose", "none", "the pose of the sensor: --pose FILE")
+        if doubt := unit_doubt(cloud.cloud, loaded, world_from_sensor):
+            say(f"warning: {cloud.path if pose is None else pose}: {doubt}")
         return measure_task(cloud.cloud, definition, loaded, world_from_sensor, statement, cloud.margin_px)
 
     return measured

@@ -27,6 +27,7 @@ from characterisation.tasks.result import Result
 from characterisation.tasks.task_file import LINE_ANGLES, Task
 from characterisation.tasks.task_reading import check_features
 from mitsim.capture.calibration import EXACT
+from mitsim.capture.recordings.cloud_numbers import METRES_UNDER
 from mitsim.capture.recordings.pose_file import read_pose as read_pose_file
 from mitsim.capture.recordings.pose_file import with_exact_rotation
 from mitsim.decoding.input_clouds import margin_of
@@ -44,6 +45,10 @@ SAME_PLACE_MM = 10.0
 
 #: largest rotation between the two poses [deg]; chosen
 SAME_ANGLE_DEG = 2.0
+
+
+#: ratio of distances from which one of them has another unit: less than that of cm and mm; chosen
+_ANOTHER_UNIT = 5.0
 
 
 def label(cloud: PointCloud, scene: Scene, sensor: Sensor, pose: Transform | ArrayLike) -> PointCloud:
@@ -295,6 +300,20 @@ def read_pose(path: Path, view: int | None = None) -> Transform:
             raise InputError("--view", "", "none" if view is None else view, allowed)
         key, matrix = f"views.part_from_sensor of view {view}", poses[view]
     return _pose(path, key, matrix)
+
+
+def unit_doubt(cloud: PointCloud, scene: Scene, pose: Transform) -> str:
+    """Return a warning about a pose far nearer to the part, or farther, than any of a cloud's points; else empty."""
+    distances = np.linalg.norm(cloud.points[cloud.valid] - cloud.grid.origin, axis=-1)
+    near, far = np.quantile(distances, [0.05, 0.95]) if len(distances) else (0.0, np.inf)
+    away = float(np.linalg.norm(pose.translation - scene.centre))
+    in_metres = 0 < np.linalg.norm(pose.translation) < METRES_UNDER and away < near  # of a large part
+    if near / _ANOTHER_UNIT <= away <= far * _ANOTHER_UNIT and not in_metres:
+        return ""
+    return (
+        f"by the pose the sensor is {away:.3g} mm from the middle of the part, by the cloud its points are {near:.3g} "
+        f"to {far:.3g} mm away: write the position of the pose in mm"
+    )
 
 
 def _pose(path: Path, key: str, matrix: Any) -> Transform:

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -145,6 +146,15 @@ def test_a_task_by_its_scene_and_the_pose_of_the_capture(scenes, tmp_path):
     assert 0.005 < gap["standard_uncertainty"] < 0.1
     assert gap["nominal"] == 70.0
     assert 0.8 * gap["points_given"] < gap["points"] <= gap["points_given"]
+    assert "warning" not in done.stderr
+    for per_mm in (1e-3, 0.1, 1 / 25.4, 1000):  # m, cm, inch and um: nothing is measured
+        rows = pose.matrix()
+        rows[:3, 3] *= per_mm
+        np.savetxt(tmp_path / "pose.txt", rows)
+        options = "--task", folder / "task.toml", "--scene", folder / "matt_white.xml", "--pose", tmp_path / "pose.txt"
+        told = run(tmp_path / "capture", *options)
+        assert told.exit_code == 1
+        assert re.search(r"warning: \S+pose\.txt: by the pose the sensor is .* in mm\n", told.stderr)
     with pytest.raises(InputError, match="the pose of the sensor"):
         cloud = tmp_path / "cloud.ply"
         write_cloud(cloud_of(plane([0, 0, 500], [0, 0, -1])), cloud)
