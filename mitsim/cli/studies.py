@@ -159,7 +159,11 @@ def choose(
     choice = read_choice(output)
     assert choice is not None
     print(json.dumps(choice.model_dump(mode="json"), indent=2) if as_json else as_text(choice))
-    say(f"page: {output / 'choice.html'}\n{choice.words}")
+    say(f"page: {output / 'choice.html'}")
+    if not choice.finished and not stopped:
+        more = "; with more --minutes, it screens more views" * any(sensor.lacks for sensor in choice.sensors)
+        say(f"time was over after {limit.elapsed:.0f} s; the same command goes on{more}")
+    say(choice.words)
     if stopped:
         raise KeyboardInterrupt  # exit code 130
     stated = [sensor for sensor in choice.sensors if sensor.status == "stated"]

@@ -163,16 +163,20 @@ def test_screening_leaves_time_for_virtual_measurements_and_the_result_says_what
         ("zivid-2-plus-m60", "no performance map of it comes with mitsim: make one, and give zivid-2-plus-m60=MAP")
     ]
     over = TimeLimit(1.0, time.monotonic() - 2.0)
-    (result,) = choose_sensor(candidates, tmp_path / "out", over, lambda *_: None)
+    final = list[bool]()
+    (result,) = choose_sensor(candidates, tmp_path / "out", over, lambda _, finished: final.append(finished))
     views = len(candidates[0].study.views)
     lacks = f"only {FEWEST_VIEWS} of {views} views screened, for lack of time"
-    entry = document(candidates[0].study, [result], excluded, 1.0, True).sensors[0]
+    choice = document(candidates[0].study, [result], excluded, 1.0, True)
+    entry = choice.sensors[0]
+    assert not any(final) and not choice.finished  # the same command goes on
     assert views > FEWEST_VIEWS and entry.lacks == lacks and lacks in entry.words
     over = TimeLimit(1.0, time.monotonic() - 2.0)
     with mock.patch.object(Session, "screen", side_effect=AssertionError):  # the same time again: the views are kept
         (again,) = choose_sensor(candidates, tmp_path / "out", over, lambda *_: None)
     assert again.scores.attrs["views_scored"] == FEWEST_VIEWS
-    (whole,) = choose_sensor(candidates, tmp_path / "out", TimeLimit(60.0), lambda *_: None)
+    (whole,) = choose_sensor(candidates, tmp_path / "out", TimeLimit(60.0), lambda _, end: final.append(end))
+    assert final[-1] and document(candidates[0].study, [whole], excluded, 60.0, True).finished
     assert whole.scores.attrs["views_scored"] == views  # with more time, more views
 
 

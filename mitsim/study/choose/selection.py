@@ -71,7 +71,7 @@ def choose_sensor(
     limit
         Time of the whole, shared among the sensors.
     report_results
-        Receives the results so far, and whether they are final, after each sensor.
+        Receives the results so far after each sensor, and whether they are final: not where time ended the work.
     workers
         Processes or cluster that make the trials; by default this process makes them.
     """
@@ -87,11 +87,12 @@ def choose_sensor(
     report_results(ordered(results), False)
     with giving_up(workers, lambda: limit.left <= _reserve(limit)):
         _measure_in_rounds(results, limit, report_results)
-        leader = ordered(results)[0]
+        leader, rest = ordered(results)[0], limit.part(1.0, _reserve(limit))
         if leader.stated and not limit.over():
-            refine_leader(leader, limit.part(1.0, _reserve(limit)))
+            refine_leader(leader, rest)
+        in_time = not rest.over()
     _complete(ordered(results)[0])
-    report_results(ordered(results), True)
+    report_results(ordered(results), in_time)
     return ordered(results)
 
 

@@ -57,7 +57,7 @@ def document(
     seconds
         Duration of the comparison so far [s].
     finished
-        Whether the comparison is complete.
+        Whether the comparison is complete, if no sensor lacks views or measurements for want of time.
     """
     task = study.task
     named_measurements = {
@@ -90,7 +90,7 @@ def document(
         scene=study.scene.where,
         seed=study.file.seed,
         words=in_words(best_reasons(sensors, named_measurements)),
-        finished=finished,
+        finished=finished and not any(sensor.lacks or sensor.why == TIME_OVER for sensor in sensors),
         seconds=round(seconds, 1),
         measurements=named_measurements,
         sensors=sensors,
