@@ -311,5 +311,5 @@ def _digest(path: Path) -> str:
 
 
 def _day(path: Path) -> str:
-    """Return the day on which a file was written, for folders of older versions, whose files do not say it."""
-    return datetime.fromtimestamp(path.stat().st_mtime, UTC).date().isoformat()
+    """Return the day here on which a file was written, for folders of older versions, whose files do not say it."""
+    return datetime.fromtimestamp(path.stat().st_mtime, UTC).astimezone().date().isoformat()

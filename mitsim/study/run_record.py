@@ -127,7 +127,7 @@ def write_record(
     about = {
         "schema_version": 1,
         "mitsim": __version__,
-        "date": datetime.now(UTC).date().isoformat(),
+        "date": datetime.now(UTC).astimezone().date().isoformat(),
         "study": str(study.path),
         "scene": study.scene.where,
         "sensor": study.sensor.name,

@@ -1,8 +1,10 @@
 """The sheet to sign: complete, on one page, and no text over another, for runs and for comparisons of sensors."""
 
 import json
+import os
 import re
 import shutil
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -222,6 +224,23 @@ def test_the_date_is_that_of_the_run(run_folder, tmp_path):
     about = json.loads((folder / "run.json").read_text(encoding="utf-8")) | {"date": "2025-02-03"}
     (folder / "run.json").write_text(json.dumps(about), encoding="utf-8")
     assert read_declaration(folder, None).date == "2025-02-03"
+
+
+@pytest.mark.skipif(not hasattr(time, "tzset"), reason="time zones of POSIX")
+@pytest.mark.parametrize(("zone", "day"), [("UTC", "2025-02-03"), ("Pacific/Kiritimati", "2025-02-04")])
+def test_the_date_of_an_older_folder_is_the_day_here(run_folder, tmp_path, monkeypatch, zone, day):
+    """Written at 2025-02-03 20:00 UTC, which is ten in the morning of the 4th on Kiritimati, 14 h ahead."""
+    folder = shutil.copytree(run_folder, tmp_path / "run")
+    about = json.loads((folder / "run.json").read_text(encoding="utf-8")) | {"date": ""}
+    (folder / "run.json").write_text(json.dumps(about), encoding="utf-8")
+    os.utime(folder / "run.json", (1738612800, 1738612800))
+    monkeypatch.setenv("TZ", zone)
+    time.tzset()
+    try:
+        assert read_declaration(folder, None).date == day
+    finally:
+        monkeypatch.undo()
+        time.tzset()
 
 
 def test_a_sheet_is_one_page_of_pdf_and_the_same_at_every_call(run_folder, tmp_path):
