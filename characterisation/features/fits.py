@@ -80,7 +80,7 @@ def fit_plane(points: ArrayLike, viewpoint: ArrayLike | None = None) -> PlaneFit
     [ 0.  0. -1.]
     """
     points = _usable(points, Plane)
-    start = plane_start(points)
+    start, points = plane_start(points)
     plane, kept = _fit(start, points, viewpoint, rounding_scale(points, start))
     centroid = points[kept].mean(axis=0)
     outward = plane.normal[np.argmax(np.abs(plane.normal))]

@@ -172,8 +172,11 @@ def _some_of(rows: Array, count: int) -> Array:
     return np.asarray(rows[rng.integers(len(rows), size=(_TRIES, count))])
 
 
-def plane_start(points: Array) -> Plane:
+def plane_start(points: Array) -> tuple[Plane, Array]:
     """Return a plane from which a fit to points (n, 3) [mm] may start, also if a third of them lie elsewhere.
+
+    With it come the points to fit: all, or those of the larger of two surfaces with a gap between them. If both have
+    nearly as many points, a robust fit would run from any start to a plane across both.
 
     Its least squares are total. A step of a few millimetres turns them, as do the outliers of a matcher, which may lie
     farther from the surface than it is wide. The plane of three points is that of the half of the points nearest to it.
@@ -183,7 +186,7 @@ def plane_start(points: Array) -> Plane:
     moments, axes = np.linalg.eigh(about.T @ about)
     squares = Plane(middle, axes[:, 0])
     if moments[0] < _THIN**2 * moments[1]:
-        return squares
+        return squares, points
     rng = np.random.default_rng(len(points))
     sample = points if len(points) <= _SOME else points[rng.choice(len(points), _SOME, replace=False)]
     corners = sample[rng.integers(len(sample), size=(_TRIPLES, 3))]
@@ -191,7 +194,7 @@ def plane_start(points: Array) -> Plane:
     lengths = np.linalg.norm(normals, axis=1)
     usable = lengths > 1e-9 * lengths.max(initial=1e-300)
     if not usable.any():
-        return squares
+        return squares, points
     normals, corners = normals[usable] / lengths[usable, None], corners[usable]
     offsets = np.abs(sample @ normals.T - np.einsum("ij,ij->i", corners[:, 0], normals))
     medians = np.median(offsets, axis=0)
@@ -199,10 +202,24 @@ def plane_start(points: Array) -> Plane:
     half = sample[offsets[:, best] <= medians[best]]
     centre = half.mean(axis=0)
     normal = np.linalg.eigh((half - centre).T @ (half - centre))[1][:, 0]
-    nearest = np.median(np.abs((sample - centre) @ normal))
+    start, nearest = squares, np.median(np.abs((sample - centre) @ normal))
     if nearest * _MUCH < np.median(np.abs((sample - middle) @ squares.normal)):
-        return Plane(centre, normal)
-    return squares
+        start = Plane(centre, normal)
+    depths = np.unique(sample[:, np.argmax(np.abs(normal))])
+    if len(depths) < max(_FEWEST, len(sample) / 10):  # few points, or rounded ones, have gaps on one surface
+        return start, points
+    for _ in range(_HALVES):  # three noisy points are tilted; the half nearest to their plane has one that is less so
+        apart = (sample - centre) @ normal
+        half = sample[np.abs(apart) <= np.median(np.abs(apart))]
+        centre = half.mean(axis=0)
+        normal = np.linalg.eigh((half - centre).T @ (half - centre))[1][:, 0]
+    fewest = len(sample) // 4
+    apart = np.sort((sample - centre) @ normal)
+    at = fewest + int(np.argmax(np.diff(apart[fewest : len(sample) - fewest])))
+    if apart[at + 1] - apart[at] <= _GAP * (apart[-1 - len(sample) // 20] - apart[len(sample) // 20]):
+        return start, points
+    beyond = (points - centre) @ normal > (apart[at] + apart[at + 1]) / 2
+    return Plane(centre, normal), points[beyond == (2 * np.count_nonzero(beyond) > len(points))]
 
 
 def rounding_scale(points: Array, surface: Surface) -> float:
@@ -230,6 +247,16 @@ _SOME = 1000
 
 #: triples of them that are tried: a triple without an outlier has a probability of 0.3 for a third of them
 _TRIPLES = 60
+
+#: times that the half of the points nearest to a plane is chosen; chosen
+_HALVES = 10
+
+#: fewest points, and different depths, between which a gap is looked for; chosen
+_FEWEST = 100
+
+#: least gap between two surfaces, each with a quarter of the points, over the range of nine tenths of all; chosen. No
+#: bowed face has one
+_GAP = 0.4
 
 #: choices of the fewest points of a circle, a sphere or an axis: of four points without one of 40 % outliers, 26 in 200
 _TRIES = 200
