@@ -4,6 +4,10 @@ Signal chain, along rays: distance |V| of each pixel in one cloud -> minus that 
 one cloud -> nearest points of the other -> the surface of second order through these -> distance along its normal. A
 plane through them would lie inside a ball of 60 mm radius by 0.16 mm, if they are 2.7 mm apart.
 
+Of a reference whose noise is as large as its pitch, the points nearest to a point err toward it, and the distance is
+too small. In such an organised reference the points of the pixels beside the point are taken, wherever all lie on one
+surface: the surface of second order is fitted to their distances along the ray, the slope to more of them.
+
 For a window of pixels only the points of the reference near it are searched, and no search extends beyond the distance
 at which a point has no counterpart.
 
@@ -34,11 +38,21 @@ _ALL = (slice(None), slice(None))
 #: number of points of the reference that determine the surface at a point: it has six coefficients
 NEIGHBOURS = 12
 
+#: pixels of an organised reference, about a point, that determine the slope of its surface, and the surface: rows and
+#: columns before and behind it; chosen
+_SLOPE_PIXELS, _PIXELS = np.arange(-3, 5), slice(2, 6)
+
+#: least noise of a reference over the distance of its points that moves the difference; chosen: there by 4 %
+_NOISY = 0.2
+
 #: a foot farther from the middle of its neighbours than this many times their distance lies beyond the edge
 _ASIDE = 1.5
 
 #: stiffness of the terms of second order, which two rows of points leave undetermined; chosen: takes 0.3 % of a bow
 _STIFF = (0.0, 1e-12, 1e-12, 1e-3, 1e-3, 1e-3)
+
+#: about the number of points by which a reference is known to be noisy: if a twentieth of them is there; chosen
+_SOME = 2000
 
 #: number of points processed at once
 _BLOCK = 32768
@@ -120,9 +134,15 @@ def difference_to_surface(
     farthest = FALSE_SHARE_OF_DISTANCE * np.linalg.norm(points - cloud.grid.origin, axis=1)
     searched = _Searched(surface, points, float(farthest.max(initial=0.0)))
     height = np.full(len(points), np.nan)
+    some = slice(None, None, 1 + len(points) // _SOME)
+    noisy = np.isfinite(_where_noisy(reference, points[some], farthest[some])).sum() * 20 > len(points[some])
     for start in progress(range(0, len(points), _BLOCK)):
         block = slice(start, start + _BLOCK)
-        height[block] = _to_surface(points[block], farthest[block], searched, cloud.grid.origin)
+        heights = height[block]
+        if noisy:
+            heights[:] = _where_noisy(reference, points[block], farthest[block])
+        rest = np.isnan(heights)
+        heights[rest] = _to_surface(points[block][rest], farthest[block][rest], searched, cloud.grid.origin)
     out = np.full(valid.shape, np.nan)
     out[valid] = height
     return out
@@ -182,6 +202,36 @@ class _Searched:
         return met, out
 
 
+def _beside(reference: PointCloud, points: Floats, farthest: Floats) -> tuple[NDArray[np.bool_], Floats]:
+    """Return which points (n, 3) have one surface of an organised reference about them, and its points there.
+
+    They are (m, k, k, 3), in all pixels about these points, and each lies within ``farthest`` (n,) [mm].
+    """
+    grid, side = reference.grid, len(_SLOPE_PIXELS)
+    one = np.zeros(len(points), bool)
+    if min(grid.height, grid.width) < side:
+        return one, np.empty((0, side, side, 3))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        column, row = np.floor(np.nan_to_num(grid.project(points), nan=-side, posinf=-side, neginf=-side)).T
+    first, last = -_SLOPE_PIXELS[0], -1 - _SLOPE_PIXELS[-1]
+    within = (row >= first) & (row <= grid.height + last) & (column >= first) & (column <= grid.width + last)
+    rows, columns = (_SLOPE_PIXELS + start[within, None].astype(np.intp) for start in (row, column))
+    at = rows[:, :, None], columns[:, None]
+    out = reference.points[at].astype(np.float64)
+    apart = np.where(reference.valid[at], np.linalg.norm(out - points[within, None, None], axis=-1), np.inf)
+    one[within] = apart.max(axis=(1, 2)) <= farthest[within]
+    return one, out[one[within]]
+
+
+def _where_noisy(reference: PointCloud, points: Floats, farthest: Floats) -> Floats:
+    """Return distances (n,) of points from an organised reference by its pixels, NaN where its noise is small."""
+    one, beside = _beside(reference, points, farthest)
+    out = np.full(len(points), np.nan)
+    if one.any():
+        out[one] = _along_ray(points[one], beside, reference.grid.origin)
+    return out
+
+
 def _to_surface(points: Floats, farthest: Floats, searched: _Searched, viewpoint: Floats) -> Floats:
     """Return signed distances (n,) of points (n, 3) from a surface, NaN without a counterpart within ``farthest`` (n,).
 
@@ -195,18 +245,54 @@ def _to_surface(points: Floats, farthest: Floats, searched: _Searched, viewpoint
     values, axes = np.linalg.eigh(spread.swapaxes(1, 2) @ spread)
     axes[..., 0] *= np.sign(np.einsum("ni,ni->n", axes[..., 0], points - viewpoint))[:, None]
     # the square root of the largest variance of the neighbours is about their distance
-    apart = np.sqrt(values[:, 2] / NEIGHBOURS)
-    height, *foot = np.einsum("nij,ni->jn", axes, points - middle)
+    out[met] = _over_surface(points - middle, spread, axes, np.sqrt(values[:, 2] / NEIGHBOURS))
+    return out
+
+
+def _along_ray(points: Floats, beside: Floats, eye: Floats) -> Floats:
+    """Return the distances (n,) of points (n, 3) from the surface of the pixels beside them, (n, k, k, 3), if noisy.
+
+    They are distances along the ray times the cosine of the incidence angle, and positive away from the eye (3,). They
+    are NaN where the pixels' noise is small against their pitch: the nearest points give a curved surface more exactly.
+    """
+    ray = (points - eye) / np.linalg.norm(points - eye, axis=1, keepdims=True)
+    across = np.cross(ray, np.eye(3)[np.argmin(np.abs(ray), axis=1)])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    axes = np.stack([ray, across, np.cross(ray, across)], axis=-1)
+    whole = beside.reshape(len(beside), -1, 3)
+    heights, feet = np.split((whole - whole.mean(axis=1, keepdims=True)) @ axes, [1], axis=-1)
+    slope = np.linalg.solve(feet.swapaxes(1, 2) @ feet, feet.swapaxes(1, 2) @ heights)
+    cosine = 1 / np.sqrt(1 + np.sum(slope**2, axis=(1, 2)))
+    noise = cosine * np.sqrt(np.mean((heights - feet @ slope) ** 2, axis=(1, 2)))
+    patch = beside[:, _PIXELS, _PIXELS].reshape(len(beside), -1, 3)
+    middle = patch.mean(axis=1)
+    spread = patch - middle[:, None]
+    apart = np.sqrt(np.mean(np.sum((spread @ axes)[..., 1:] ** 2, axis=-1), axis=1) / 2)
+    return np.where(noise > _NOISY * apart, cosine * _over_surface(points - middle, spread, axes, apart), np.nan)
+
+
+def _over_surface(local: Floats, spread: Floats, axes: Floats, apart: Floats) -> Floats:
+    """Return the heights (n,) of points over the surface of second order through their neighbours, NaN beyond its edge.
+
+    Parameters
+    ----------
+    local, spread
+        Points (n, 3) and neighbours (n, k, 3) about the middle of the neighbours [mm].
+    axes
+        (n, 3, 3) Columns: direction of the heights, and two across it.
+    apart
+        (n,) [mm] About the distance of the neighbours.
+    """
+    height, *foot = np.einsum("nij,ni->jn", axes, local)
     heights, *feet = np.moveaxis(spread @ axes, -1, 0)
     scale = np.maximum(apart, np.finfo(float).tiny)
     terms = _second_order(*(coordinate / scale[:, None] for coordinate in feet))
-    products = terms.swapaxes(1, 2) @ terms + NEIGHBOURS * np.diag(_STIFF)
+    products = terms.swapaxes(1, 2) @ terms + terms.shape[1] * np.diag(_STIFF)
     coefficients = np.linalg.solve(products, terms.swapaxes(1, 2) @ heights[..., None])[..., 0]
     surface = np.einsum("ni,ni->n", coefficients, _second_order(*(coordinate / scale for coordinate in foot)))
     low, high = heights.min(axis=1), heights.max(axis=1)
     height -= np.clip(surface, low - (high - low) / 2, high + (high - low) / 2)  # points of two faces have no surface
-    out[met] = np.where(np.hypot(*foot) > _ASIDE * apart, np.nan, height)
-    return out
+    return np.asarray(np.where(np.hypot(*foot) > _ASIDE * apart, np.nan, height))
 
 
 def _second_order(u: Floats, v: Floats) -> Floats:
