@@ -62,14 +62,13 @@ def shape_indices(scene: Any, numbers: Any) -> NDArray[np.int16]:
     """Return the indices (n,) into the shapes of an ``mi.Scene`` of Mitsuba's shape numbers; -1 for none."""
     ids = np.array(numbers)
     lookup = np.full(int(ids.max(initial=0)) + 1, -1, np.int16)
-    for index, shape in enumerate(scene.shapes()):
-        id_of_shape = shape_number(shape)
-        if id_of_shape < len(lookup):
-            lookup[id_of_shape] = index
+    shapes = shape_numbers(scene)
+    within = shapes < len(lookup)
+    lookup[shapes[within]] = np.flatnonzero(within)
     lookup[0] = -1
     return np.asarray(lookup[ids])
 
 
-def shape_number(shape: Any) -> int:
-    """Return Mitsuba's number of a shape, which is 1 or more."""
-    return int(np.ravel(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))))[0])
+def shape_numbers(scene: Any) -> NDArray[np.uint32]:
+    """Return Mitsuba's numbers of the shapes of an ``mi.Scene``, in their order; each is 1 or more."""
+    return np.array(dr.reinterpret_array(mi.UInt32, scene.shapes_dr()))

@@ -22,7 +22,7 @@ from characterisation.point_cloud import Status, ViewGrid
 from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import opaque_index, opaque_point, vectors_to_host
-from mitsim.scene.first_hits import shape_number
+from mitsim.scene.first_hits import shape_numbers
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.distortion import Distortion
 from mitsim.scene.ray_casting.eye import Eye, shadow_ray
@@ -152,8 +152,8 @@ class MappedScene:
             numbers = [-1 if row < 0 else self.tables.numbers[row] for row in numbers]
         self.with_lay = self.tables is not None and self.tables.directions > 0
         # a row for each of Mitsuba's shape numbers: index of the shape, index of its surface, whether its back is seen
-        ids = [shape_number(shape) for shape in scene.shapes]
-        rows = np.full((max(ids) + 1, 3), -1, np.int32)
+        ids = shape_numbers(scene.mitsuba)
+        rows = np.full((int(ids.max()) + 1, 3), -1, np.int32)
         for index, (number, shape) in enumerate(zip(ids, scene.shapes, strict=True)):
             two_sided = bool(int(shape.bsdf().flags()) & int(mi.BSDFFlags.BackSide))
             rows[number] = index, numbers[index], two_sided
