@@ -45,6 +45,7 @@ from mitsim.maps.prediction import (
     expected_points,
     feature_statistics,
     performance,
+    surfaces_of,
     together,
 )
 from mitsim.running.time_limit import TimeLimit, in_time
@@ -148,13 +149,16 @@ def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above 
     shapes = [scene.names.index(name) for name in names]
     alone = [CharacterisedScene(scene.only(name), performance_map, MATT_WHITE) for name in names]
 
-    def rays_of(caster: Predictor, view: View, features: Sequence[int]) -> tuple[SceneView, ViewPoints]:
-        pose, thinning, pitch = view.world_from_sensor, caster.step**2, caster.grid.angular_pitch / caster.step
-        whole = caster.surfaces(scene, pose)
-        measured = np.isin(whole.shape, [shapes[k] for k in features])
-        ideal = caster.ideal(replace(whole, shape=np.where(measured, whole.shape, np.int16(-1))))
-        labels = caster.labels(scene, pose, whole)
-        return SceneView(scene, pose, whole, ideal), ViewPoints(ideal, labels, pose, thinning, pitch)
+    def rays_of(casters: dict[Predictor, list[int]], view: View) -> list[tuple[SceneView, ViewPoints]]:
+        """Return the rays of predictors that show some features each, from one launch."""
+        pose, out = view.world_from_sensor, []
+        for whole, (caster, features) in zip(surfaces_of([*casters], scene, pose), casters.items(), strict=True):
+            thinning, pitch = caster.step**2, caster.grid.angular_pitch / caster.step
+            measured = np.isin(whole.shape, [shapes[k] for k in features])
+            ideal = caster.ideal(replace(whole, shape=np.where(measured, whole.shape, np.int16(-1))))
+            labels = caster.labels(scene, pose, whole)
+            out.append((SceneView(scene, pose, whole, ideal), ViewPoints(ideal, labels, pose, thinning, pitch)))
+        return out
 
     def cast_by(caster: Predictor, rays: tuple[SceneView, ViewPoints], features: list[int]) -> _Cast:
         seen, points = rays
@@ -172,15 +176,16 @@ def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above 
         return None if hidden or closer.step >= looking.step else closer
 
     def cast(view: View) -> list[_Cast]:
-        first = rays_of(looking, view, range(len(names)))
+        (first,) = rays_of({looking: list(range(len(names)))}, view)
         ideal = first[1].ideal
         shown = first[1].labels.reshape(-1)[ideal.pixel][ideal.status == Status.VALID]
         counts = [int((shown == shape).sum()) for shape in shapes]
-        closer = {k: caster for k, count in enumerate(counts) if (caster := closer_to(k, view, count)) is not None}
-        whole = [k for k in range(len(names)) if k not in closer]
+        closer = {caster: [k] for k, count in enumerate(counts) if (caster := closer_to(k, view, count)) is not None}
+        whole = [k for k in range(len(names)) if [k] not in closer.values()]
+        again = rays_of(closer, view) if closer else []
         return [
             cast_by(looking, first, whole),
-            *(cast_by(caster, rays_of(caster, view, [k]), [k]) for k, caster in closer.items()),
+            *(cast_by(caster, rays, of) for rays, (caster, of) in zip(again, closer.items(), strict=True)),
         ]
 
     def score(casts: list[_Cast], view: View) -> _ViewScore:

@@ -15,7 +15,7 @@ Not included: clusters of lost points, since the map has only their share F, and
 from mitsim.maps.prediction.characterised_scene import CharacterisedScene
 from mitsim.maps.prediction.perturbation import Effect, Perturbation, SceneView, together
 from mitsim.maps.prediction.point_statistics import ViewPoints, expected_points, feature_statistics, performance
-from mitsim.maps.prediction.predictor import EDGE_MARGIN_PX, Ideal, Predicted, Predictor
+from mitsim.maps.prediction.predictor import EDGE_MARGIN_PX, Ideal, Predicted, Predictor, surfaces_of
 
 __all__ = [
     "EDGE_MARGIN_PX",
@@ -30,5 +30,6 @@ __all__ = [
     "expected_points",
     "feature_statistics",
     "performance",
+    "surfaces_of",
     "together",
 ]

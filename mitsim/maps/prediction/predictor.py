@@ -12,7 +12,8 @@ same in one kernel on the device, for clouds.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,7 @@ from mitsim.maps.prediction.characterised_scene import CharacterisedScene
 from mitsim.maps.prediction.noise_field import correlated_noise
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.mapped_scene import MappedView, ViewRays
-from mitsim.scene.ray_casting.raycast import PixelRays, Surfaces, cast, shapes_met
+from mitsim.scene.ray_casting.raycast import PixelRays, Surfaces, cast_together, shapes_met
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.sensor import Sensor
@@ -130,7 +131,7 @@ class Predictor:
 
     def surfaces(self, scene: Scene, world_from_sensor: Transform) -> Surfaces:
         """Return the ray-cast surfaces of a view, in the sensor frame."""
-        return cast(scene, self.rays, world_from_sensor, np.array([eye.centre for eye in self.eyes]))
+        return surfaces_of([self], scene, world_from_sensor)[0]
 
     def ideal(self, surfaces: Surfaces) -> Ideal:
         """Return the points of a perfect sensor, and the reason why eyes do not see some of them."""
@@ -311,6 +312,12 @@ class Predictor:
             points[part] += self.grid.origin.astype(np.float32)
         baseline, names = self.rig.baseline_direction, scene.names
         return PointCloud(points, status, self.grid, self.sensor, "predicted", baseline, labels, names, spread)
+
+
+def surfaces_of(predictors: Sequence[Predictor], scene: Scene, world_from_sensor: Transform) -> list[Surfaces]:
+    """Return the :meth:`Predictor.surfaces` of several predictors of one sensor, from one launch."""
+    eyes = np.array([eye.centre for eye in predictors[0].eyes])
+    return cast_together(scene, [predictor.rays for predictor in predictors], world_from_sensor, eyes)
 
 
 def _deviates(size: tuple[int, ...], rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -9,6 +9,7 @@ There is one ray per pixel and no filter, because an average of labels is no lab
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -73,6 +74,20 @@ class PixelRays:
         return part
 
     @staticmethod
+    def joined(groups: Sequence[PixelRays]) -> PixelRays:
+        """Return the rays of all groups in one column; their origin is that of the first."""
+        if len(groups) == 1:
+            return groups[0]
+        every = copy.copy(groups[0])
+        every.size = (sum(group.size[0] * group.size[1] for group in groups), 1)
+        every.directions = mi.Vector3f(*[dr.concat([group.directions[k] for group in groups]) for k in range(3)])
+        if any(group.active is not True for group in groups):
+            every.active = dr.concat(
+                [group.active & dr.full(mi.Bool, True, dr.width(group.directions)) for group in groups]
+            )
+        return every
+
+    @staticmethod
     def of_grid(grid: ViewGrid) -> PixelRays:
         """Return the rays of a cloud's grid."""
         return PixelRays(grid.origin, grid.rays())
@@ -97,8 +112,31 @@ def cast(scene: Scene, rays: PixelRays, world_from_sensor: Transform, eyes: NDAr
 
     See Also
     --------
-    shapes_met : the shapes alone
+    mitsim.scene.ray_casting.raycast.cast_together : several groups of rays
+    mitsim.scene.ray_casting.raycast.shapes_met : the shapes alone
     """
+    return cast_together(scene, [rays], world_from_sensor, eyes)[0]
+
+
+def cast_together(
+    scene: Scene, groups: Sequence[PixelRays], world_from_sensor: Transform, eyes: NDArray[np.floating]
+) -> list[Surfaces]:
+    """Return the surfaces of :func:`cast` for several groups of rays from one point.
+
+    They share one launch: recording it takes as long as casting 40 000 rays, if the part has a hundred faces.
+
+    Parameters
+    ----------
+    scene, world_from_sensor, eyes
+        As for :func:`cast`.
+    groups
+        The rays, all from the same origin.
+
+    See Also
+    --------
+    mitsim.scene.ray_casting.raycast.cast : one group
+    """
+    rays = PixelRays.joined(groups)
     frame = rays.frame(world_from_sensor)
     surface = scene.mitsuba.ray_intersect(mi.Ray3f(frame.position, frame.to_world(rays.directions)), rays.active)
     facing = dr.select(dr.dot(surface.n, frame.to_world(rays.directions)) > 0, -1.0, 1.0)
@@ -117,14 +155,16 @@ def cast(scene: Scene, rays: PixelRays, world_from_sensor: Transform, eyes: NDAr
     along = frame.to_local(surface.dp_du) if scene.has_lay else None
     dr.eval(distance, normal, shape, seen, along)
 
-    size = rays.size
-    return Surfaces(
-        distance=np.array(distance, np.float32).reshape(size),
-        normal=vectors_to_host(normal).reshape(*size, 3),
-        shape=shape_indices(scene.mitsuba, shape).reshape(size),
-        seen=np.array([np.array(mask, bool) for mask in seen], bool).reshape(len(seen), *size),
-        along=None if along is None else vectors_to_host(along).reshape(*size, 3),
-    )
+    images = [np.array(distance, np.float32), vectors_to_host(normal), shape_indices(scene.mitsuba, shape)]
+    images += [] if along is None else [vectors_to_host(along)]
+    masks = np.array([np.array(mask, bool) for mask in seen], bool).reshape(len(seen), len(images[0]))
+    out, first = [], 0
+    for height, width in (group.size for group in groups):
+        part, size = slice(first, first + height * width), (height, width)
+        of_group = [image[part].reshape(*size, *image.shape[1:]) for image in images]
+        out.append(Surfaces(*of_group[:3], masks[:, part].reshape(len(masks), *size), *of_group[3:]))
+        first = part.stop
+    return out
 
 
 def shapes_met(scene: Scene, rays: PixelRays, world_from_sensor: Transform) -> NDArray[np.int16]:
