@@ -69,8 +69,8 @@ class Plane:
 
     def moved(self, parameters: Array) -> Plane:
         """Change the plane by the three parameters."""
-        shift, *tilts = parameters
-        return Plane(self.point + shift * self.normal, unit(self.normal + np.asarray(tilts) @ self._basis))
+        tilts = np.ascontiguousarray(parameters[1:], float)
+        return Plane(self.point + parameters[0] * self.normal, unit(self.normal + tilts @ self._basis))
 
     def placed(self, motion: ArrayLike) -> Plane:
         """Move the plane rigidly by a (4, 4) matrix."""

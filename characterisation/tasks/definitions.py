@@ -16,6 +16,7 @@ place, and thus the distance, depends on the noise.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -46,17 +47,17 @@ def intersection_distance(plane: Plane, first: Axis, second: Axis) -> float:
 
     It is NaN for an axis within 0.1 mrad of the plane.
     """
-    return float(np.linalg.norm(on_axis(plane, first) - on_axis(plane, second)))
+    return _length(on_axis(plane, first) - on_axis(plane, second))
 
 
 def axis_distance(first: Axis, second: Axis) -> float:
     """Return the distance [mm] between two axes where they were measured (:func:`between_axes`)."""
-    return float(np.linalg.norm(between_axes(first, second)))
+    return _length(between_axes(first, second))
 
 
 def point_distance(first: PointLike, second: PointLike) -> float:
     """Return the distance [mm] between two points."""
-    return float(np.linalg.norm(place(first) - place(second)))
+    return _length(place(first) - place(second))
 
 
 def point_plane_distance(point: PointLike, plane: Plane) -> float:
@@ -91,7 +92,11 @@ def plane_angle(first: Plane, second: Plane) -> float:
 
 def _line_angle(first: Array, second: Array) -> float:
     # the arc cosine would lose half the digits at small angles, which matter most
-    return float(np.arctan2(np.linalg.norm(cross(first, second)), abs(first @ second)))
+    return float(np.arctan2(_length(cross(first, second)), abs(first @ second)))
+
+
+def _length(vector: Array) -> float:
+    return math.sqrt(vector.dot(vector))  # np.linalg.norm takes three times as long
 
 
 def cone_angle(cone: Cone) -> float:

@@ -200,13 +200,15 @@ def evaluate(
         root = block_diag(*[_square_root(block) for block in blocks])
     else:
         root = _square_root(np.asarray(covariance, float))
-    ends = np.cumsum([len(block) for block in blocks])[:-1]
+    ends = np.cumsum([len(block) for block in blocks])
+    parts = [slice(end - len(block), end) for end, block in zip(ends, blocks, strict=True)]
 
     def changes(columns: Array) -> Array:
         """Return the changes (k, 2) of the value by steps (P, k) forward and back."""
+        moves = [(fit, part, columns[part].any(axis=0).tolist()) for fit, part in zip(fits, parts, strict=True)]
         moved = [
-            [fit.moved(part) if part.any() else fit for fit, part in zip(fits, np.split(step, ends), strict=True)]
-            for column in columns.T
+            [fit.moved(step[part]) if of_columns[k] else fit for fit, part, of_columns in moves]
+            for k, column in enumerate(columns.T)
             for step in (column, -column)
         ]
         return np.array([value(*each) - best for each in moved]).reshape(-1, 2)

@@ -221,12 +221,14 @@ def expected_measurement(
         for quantity, expected_input in zip(quantities, predictions, strict=True)
         for name in quantity.features
     }
-    together = _at_its_points(model.value, [expected_input.fit.middle for expected_input in predictions])
-    shared = np.concatenate([expected_input.fit.shared for expected_input in predictions])
-    covariance = (
-        block_diag(*[expected_input.fit.noise_covariance for expected_input in predictions]) + shared @ shared.T
-    )
-    total = scale * evaluate(together, [expected_input.estimate for expected_input in predictions], covariance)[1]
+    total = parts[0]
+    if len(predictions) > 1:
+        together = _at_its_points(model.value, [expected_input.fit.middle for expected_input in predictions])
+        shared = np.concatenate([expected_input.fit.shared for expected_input in predictions])
+        covariance = (
+            block_diag(*[expected_input.fit.noise_covariance for expected_input in predictions]) + shared @ shared.T
+        )
+        total = scale * evaluate(together, [expected_input.estimate for expected_input in predictions], covariance)[1]
     if not math.isfinite(total):
         return ExpectedMeasurement(math.nan, 0.0, "the measurement has no value here", quantities, tuple(parts))
     return ExpectedMeasurement(total, math.prod(chances.values()), "", quantities, tuple(parts))
@@ -305,26 +307,19 @@ def _scale(task: Task, measurement: str) -> float:
 
 def _one_by_one(value: Callable[..., float], predictions: Sequence[ExpectedInput]) -> list[Callable[[Any], float]]:
     """Return the measurement as a function of each of its inputs alone, with the others fixed."""
-    at_points, estimates = (
-        _at_its_points(value, [expected_input.fit.middle for expected_input in predictions]),
-        [expected_input.estimate for expected_input in predictions],
-    )
+    middles = [expected_input.fit.middle for expected_input in predictions]
+    fixed = [_at_foot(p.estimate, middle) for p, middle in zip(predictions, middles, strict=True)]
 
     def alone(index: int) -> Callable[[Any], float]:
-        return lambda moved: at_points(*estimates[:index], moved, *estimates[index + 1 :])
+        return lambda moved: value(*fixed[:index], _at_foot(moved, middles[index]), *fixed[index + 1 :])
 
     return [alone(index) for index in range(len(predictions))]
 
 
 def _at_its_points(value: Callable[..., Any], middles: Sequence[Floats]) -> Callable[..., Any]:
     """Return the measurement on planes and axes described at the foot of their measured points, as fits are."""
+    return lambda *estimates: value(*map(_at_foot, estimates, middles))
 
-    def at_points(*estimates: Any) -> Any:
-        return value(
-            *[
-                estimate.at_foot_of(middle) if isinstance(estimate, Plane | Cylinder | Cone) else estimate
-                for estimate, middle in zip(estimates, middles, strict=True)
-            ]
-        )
 
-    return at_points
+def _at_foot(estimate: Any, middle: Floats) -> Any:
+    return estimate.at_foot_of(middle) if isinstance(estimate, Plane | Cylinder | Cone) else estimate
