@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import find_objects
 
 from mitsim.sensor.point_spread import point_spread
 
@@ -77,9 +78,9 @@ class Smoothing:
     def of(cls, shape: NDArray[np.integer], sigma: float) -> Smoothing:
         """Return the filter of a standard deviation [px] for an index (h, w) of the shapes, -1 for none."""
         taps, parts = point_spread(sigma), []
-        for index in np.unique(shape[shape >= 0]):
-            rows, columns = np.nonzero(shape == index)
-            box = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
+        for index, box in enumerate(find_objects(np.asarray(shape) + 1)):
+            if box is None:
+                continue
             mask = shape[box] == index
             parts.append((box, mask, _filtered(mask.astype(np.float32), taps)[mask]))
         return cls(taps, tuple(parts))

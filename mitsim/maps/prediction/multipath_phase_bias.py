@@ -137,7 +137,8 @@ def phase_bias(
     size = np.abs(direct)
     # scale first: squares of radiances are too small for single precision
     unit = max(np.finfo(float).tiny, *(float(np.abs(light).max()) for light in (direct, *indirect)))
-    turned = [other / unit * np.exp(-1j * np.angle(direct)) for other in indirect]
+    back = np.where(size > 0, np.conj(direct) / np.where(size > 0, size, 1.0), 1.0)
+    turned = [other / unit * back for other in indirect]
 
     def mean(layers: list[Floats], width: float) -> Floats:
         return smoothed(np.array(layers, np.float32), shape, width / step).astype(float)
