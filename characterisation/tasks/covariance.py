@@ -305,22 +305,20 @@ def _persistent(scaled: Floats, pixel: NDArray[np.int64], normal: Floats) -> Flo
     def summed(columns: Floats) -> Floats:
         return np.stack([np.bincount(number, column, len(cells)) for column in columns.T], axis=1)
 
-    centre = summed(pixel.astype(float)) / share[:, None]
-    turned = summed(normal) / share[:, None]
-    apart = _squares(centre) / (2 * PERSISTENT_REACH_PX**2) + _squares(turned) / (2 * PERSISTENT_TURN**2)
+    # mean place and orientation of each cell, in units of their correlation lengths
+    middle = summed(np.column_stack([pixel / PERSISTENT_REACH_PX, normal / PERSISTENT_TURN])) / share[:, None]
+    half = (middle**2).sum(1) / 2
+    product = middle @ middle.T
+    product -= half[:, None]
+    product -= half
     total = summed(scaled)
-    return np.asarray(total.T @ np.exp(-apart) @ total)
+    return np.asarray(total.T @ np.exp(np.minimum(product, 0.0, out=product), out=product) @ total)
 
 
 def _cells(pixel: NDArray[np.int64], size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the occupied cells (c,) of ``size`` pixels, and the number (n,) of the cell of each element."""
     row, column = (pixel // size).T
     return np.unique(row * (column.max() + 1) + column, return_inverse=True)
-
-
-def _squares(positions: Floats) -> Floats:
-    square = (positions**2).sum(1)
-    return np.asarray(np.maximum(square[:, None] + square - 2 * positions @ positions.T, 0.0))
 
 
 def _chance(expected: ExpectedPoints, minimum: float) -> float:
