@@ -61,13 +61,16 @@ def noise_structure(
     low, part = (
         (np.array(0), np.array(0.0)) if np.isnan(rough) else _between(np.log(roughnesses), np.log(np.array(rough)))
     )
+    weights = {int(low): 1 - float(part)}  # of the members, by number: one or two
+    other = min(int(low) + 1, len(members) - 1)
+    weights[other] = weights.get(other, 0.0) + float(part)
     knots = [
         (
             i,
             np.minimum(near + step, len(data["distance"]) - 1),
             sample_weight * np.where(step, way, 1 - way) + 1e-9,
         )  # a single knot with a value is used at any distance
-        for i, sample_weight in ((int(low), 1 - float(part)), (min(int(low) + 1, len(members) - 1), float(part)))
+        for i, sample_weight in weights.items()
         for step in (0, 1)
     ]
 

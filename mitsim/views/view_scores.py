@@ -44,7 +44,7 @@ from mitsim.maps.prediction import (
     ViewPoints,
     expected_points,
     feature_statistics,
-    performance,
+    map_answers,
     surfaces_of,
     together,
 )
@@ -287,13 +287,14 @@ def _score_view(
     for cast in casts:
         ideal, labels, features = cast.points.ideal, cast.points.labels, cast.features
         of_cast = [shapes[k] for k in features]
-        for finish, counts, sigmas in ((None, n, sigma), (MATT_WHITE, n_white, sigma_white)):
-            mapped = performance(ideal, scene, performance_map, finish)
-            rays, sigmas[features] = feature_statistics(ideal, labels, *mapped, of_cast)
+        own = map_answers(ideal, scene, performance_map)
+        white = map_answers(ideal, scene, performance_map, MATT_WHITE, own)
+        for answers, counts, sigmas in ((own, n, sigma), (white, n_white, sigma_white)):
+            rays, sigmas[features] = feature_statistics(ideal, labels, answers.fraction, answers.sigma, of_cast)
             counts[features] = rays * cast.points.thinning
         n_only[features] = cast.n_only
         for k in features:
-            points[names[k]] = expected_points(cast.points, scene, shapes[k], performance_map, cast.perturbation)
+            points[names[k]] = expected_points(cast.points, scene, shapes[k], performance_map, cast.perturbation, own)
     inputs = expected_inputs(task, points, minimum_points)
     measurements = [expected_measurement(task, name, inputs) for name in task.measurements]
     return _ViewScore(n, sigma, n_white, sigma_white, n_only, dict(inputs), measurements)

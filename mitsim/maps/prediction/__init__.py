@@ -14,7 +14,13 @@ Not included: clusters of lost points, since the map has only their share F, and
 
 from mitsim.maps.prediction.characterised_scene import CharacterisedScene
 from mitsim.maps.prediction.perturbation import Effect, Perturbation, SceneView, together
-from mitsim.maps.prediction.point_statistics import ViewPoints, expected_points, feature_statistics, performance
+from mitsim.maps.prediction.point_statistics import (
+    ViewPoints,
+    expected_points,
+    feature_statistics,
+    map_answers,
+    performance,
+)
 from mitsim.maps.prediction.predictor import EDGE_MARGIN_PX, Ideal, Predicted, Predictor, surfaces_of
 
 __all__ = [
@@ -29,6 +35,7 @@ __all__ = [
     "ViewPoints",
     "expected_points",
     "feature_statistics",
+    "map_answers",
     "performance",
     "surfaces_of",
     "together",

@@ -6,7 +6,8 @@ mean sigma of a feature's points, or the input of :mod:`characterisation.tasks.c
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,19 +44,60 @@ def performance(
     expected_points : the points themselves
     feature_statistics : of whole features
     """
-    fraction = np.full(len(ideal.pixel), np.nan)
-    sigma = np.full(len(ideal.pixel), np.nan)
+    answers = map_answers(ideal, scene, performance_map, finish)
+    return answers.fraction, answers.sigma
+
+
+@dataclass(frozen=True)
+class MapAnswers:
+    """Answers of a map for the n ideal points of a view: F, sigma [mm] and the error of F, as :func:`performance`."""
+
+    fraction: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    fraction_error: NDArray[np.float64]
+
+
+def map_answers(
+    ideal: Ideal,
+    scene: Scene,
+    performance_map: PerformanceMap,
+    finish: Finish | None = None,
+    of_scene: MapAnswers | None = None,
+) -> MapAnswers:
+    """Return F, sigma and the error of F of every ideal point.
+
+    Parameters
+    ----------
+    ideal, scene, performance_map, finish
+        As for :func:`performance`.
+    of_scene
+        Answers for the finishes of the scene, if they are known: a shape with the surface of ``finish`` keeps them.
+
+    See Also
+    --------
+    mitsim.maps.prediction.performance : F and sigma alone
+    """
+    out = MapAnswers(*np.full((3, len(ideal.pixel)), np.nan))
     for index, scene_finish in enumerate(scene.finishes):
         used = finish or scene_finish
         mask = (ideal.shape == index) & (ideal.status == Status.VALID)
         if used is None or not mask.any():
             continue
-        distance, normal = ideal.distance[mask], ideal.normal[mask]
-        along = None if ideal.along is None else ideal.along[mask]
-        answer = performance_map.query(used.name, used.roughness, distance, normal, used.light, along)
-        fraction[mask], sigma[mask] = answer.fraction, answer.sigma
-    fraction[ideal.status != Status.VALID] = 0.0
-    return fraction, sigma
+        answer: Any = of_scene
+        if of_scene is None or scene_finish is None or not _same_surface(performance_map, used, scene_finish):
+            along = None if ideal.along is None else ideal.along[mask]
+            distance, normal = ideal.distance[mask], ideal.normal[mask]
+            answer = performance_map.query(used.name, used.roughness, distance, normal, used.light, along)
+        for name, values in vars(out).items():
+            values[mask] = getattr(answer, name) if answer is not of_scene else getattr(answer, name)[mask]
+    out.fraction[ideal.status != Status.VALID] = 0.0
+    return out
+
+
+def _same_surface(performance_map: PerformanceMap, first: Finish, second: Finish) -> bool:
+    """Return whether two finishes have the same surface in a map, which keeps its surfaces."""
+    one, other = (performance_map.surface(finish.name, finish.roughness, finish.light) for finish in (first, second))
+    return one is other
 
 
 @dataclass(frozen=True)
@@ -78,6 +120,7 @@ def expected_points(
     shape: int,
     performance_map: PerformanceMap,
     perturbation: Perturbation | None = None,
+    answers: MapAnswers | None = None,
 ) -> ExpectedPoints:
     """Return the predicted points of one shape in the world frame, which is the part frame; one row per possible point.
 
@@ -95,6 +138,8 @@ def expected_points(
         Gives noise areas and persistent noise.
     perturbation
         Effects that flat coupons cannot show (:mod:`mitsim.maps.prediction.perturbation`).
+    answers
+        Of the map for all points of the view, if they are known.
 
     See Also
     --------
@@ -111,10 +156,12 @@ def expected_points(
     fraction, fraction_error, sigma, area, persistent = unknown, unknown, unknown, unknown, unknown
     displaced = np.zeros(len(distance))
     if finish is not None and mask.any():
-        along = None if ideal.along is None else ideal.along[mask]
-        answer = performance_map.query(finish.name, finish.roughness, distance, normal, finish.light, along)
+        if answers is None:
+            answers = map_answers(replace(ideal, shape=np.where(mask, ideal.shape, -1)), scene, performance_map)
         structure = noise_structure(performance_map, finish.name, finish.roughness, distance, normal, finish.light)
-        fraction, fraction_error, sigma = answer.fraction, answer.fraction_error, answer.sigma
+        fraction, fraction_error, sigma = (
+            values[mask] for values in (answers.fraction, answers.fraction_error, answers.sigma)
+        )
         area, persistent = structure.area, structure.persistent_share * sigma
         displaced = np.nan_to_num(structure.bias_share * sigma)
         if perturbation is not None:
