@@ -175,6 +175,8 @@ class MappedScene:
         roi = view.roi(self.scene.bounds, world_from_sensor, margin)
         size = (roi.height, roi.width)
         images = self._images(view, world_from_sensor, roi)
+        if not normals:
+            del images["normal"]
         dr.eval(images)
         normal = vectors_to_host(images["normal"]).T.reshape(3, *size) if normals else None
         status, shape, distance, fraction, sigma = (
