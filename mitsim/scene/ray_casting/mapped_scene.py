@@ -189,12 +189,7 @@ class MappedScene:
         frame = view.rays.frame(world_from_sensor)
         ray = dr.gather(mi.Vector3f, view.rays.directions, pixel)
         direction = frame.to_world(ray)
-        surface = self.scene.mitsuba.ray_intersect(
-            mi.Ray3f(frame.position, direction),
-            ray_flags=mi.RayFlags.dPdUV if self.with_lay else mi.RayFlags.Minimal,
-            coherent=True,
-            active=True if view.rays.active is True else dr.gather(mi.Bool, view.rays.active, pixel),
-        )
+        surface = self._surface(mi.Ray3f(frame.position, direction), pixel, view)
         number = dr.reinterpret_array(mi.UInt32, surface.shape)
         met = surface.is_valid() & (number < self.count)  # shapes inside an instance have larger numbers
         index, surface_index, two_sided = dr.gather(mi.Array3i, self.shapes, number, met)
@@ -220,6 +215,18 @@ class MappedScene:
             "fraction": fraction,
             "sigma": sigma,
         }
+
+    def _surface(self, ray: Any, pixel: Any, view: ViewRays) -> Any:
+        """Return the interactions of rays with the first surface."""
+        flags = mi.RayFlags.dPdUV if self.with_lay else mi.RayFlags.Minimal
+        active = True if view.rays.active is True else dr.gather(mi.Bool, view.rays.active, pixel)
+        if len(self.scene.names) > 1:
+            return self.scene.mitsuba.ray_intersect(ray, ray_flags=flags, coherent=True, active=active)
+        # Mitsuba would record the interaction with every shape that is loaded, also of other scenes
+        met = self.scene.mitsuba.ray_intersect_preliminary(ray, coherent=True, active=active)
+        surface = self.scene.shapes[0].compute_surface_interaction(ray, met, int(flags), met.is_valid())
+        surface.t, surface.shape = met.t, met.shape
+        return surface
 
     def _occluded(
         self, view: ViewRays, world_from_sensor: Transform, surface: Any, normal: Any, point: Any, visible: Any
