@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -32,7 +34,7 @@ def cross(first: Array, second: Array) -> Array:
 def unit(vector: ArrayLike) -> Array:
     """Return the vector (3,) of length 1 in the same direction."""
     array: Array = np.asarray(vector, float)
-    of_length_one: Array = array / np.sqrt(array.dot(array))  # np.linalg.norm takes three times as long
+    of_length_one: Array = array / math.sqrt(array.dot(array))  # np.linalg.norm takes five times as long
     return of_length_one
 
 

@@ -102,9 +102,10 @@ def measurement_model(task: Task, measurement: str, sensor_from_part: ArrayLike 
     extra = _further_arguments(definition, nominal, outline)
     fitted = task.fitted_for(measurement)
 
-    def features_of(fits: Sequence[Any]) -> list[Any]:
-        by_name = dict(zip(fitted, fits, strict=True))
-        return [_resolved(task.features[name], name, by_name) for name in asked.features]
+    if list(fitted) == list(asked.features) and all(task.features[name].shaped for name in fitted):
+        features_of: Callable[[Sequence[Any]], Sequence[Any]] = lambda fits: fits  # noqa: E731
+    else:
+        features_of = partial(_all_resolved, task, asked.features, fitted)
 
     def value_of_fits(*fits: Any) -> float:
         return definition.value(*features_of(fits), **extra)
@@ -159,6 +160,11 @@ def _deviations(
         return rows @ motion[:3, :3] if rows.shape[1] == 3 else rows
 
     return from_nominal
+
+
+def _all_resolved(task: Task, names: Sequence[str], fitted: Sequence[str], fits: Sequence[Any]) -> list[Any]:
+    by_name = dict(zip(fitted, fits, strict=True))
+    return [_resolved(task.features[name], name, by_name) for name in names]
 
 
 def _resolved(feature: Feature, name: str, fits: Mapping[str, Any]) -> Any:

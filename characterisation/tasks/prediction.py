@@ -322,4 +322,4 @@ def _at_its_points(value: Callable[..., Any], middles: Sequence[Floats]) -> Call
 
 
 def _at_foot(estimate: Any, middle: Floats) -> Any:
-    return estimate.at_foot_of(middle) if isinstance(estimate, Plane | Cylinder | Cone) else estimate
+    return estimate.at_foot_of(middle) if isinstance(estimate, (Plane, Cylinder, Cone)) else estimate
