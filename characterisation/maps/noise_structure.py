@@ -68,7 +68,7 @@ def noise_structure(
         (
             i,
             np.minimum(near + step, len(data["distance"]) - 1),
-            sample_weight * np.where(step, way, 1 - way) + 1e-9,
+            sample_weight * np.where(step, way, 1 - way) + 2e-9 / len(weights),
         )  # a single knot with a value is used at any distance
         for i, sample_weight in weights.items()
         for step in (0, 1)

@@ -211,7 +211,7 @@ def evaluate(
 
     def changes(columns: Array) -> Array:
         """Return the changes (k, 2) of the value by steps (P, k) forward and back."""
-        moves = [(fit, part, columns[part].any(axis=0).tolist()) for fit, part in zip(fits, parts, strict=True)]
+        moves = [(fit, part, (columns[part] != 0).any(axis=0).tolist()) for fit, part in zip(fits, parts, strict=True)]
         moved = [
             [fit.moved(step[part]) if of_columns[k] else fit for fit, part, of_columns in moves]
             for k, column in enumerate(columns.T)

@@ -155,15 +155,23 @@ def cast_together(
     along = frame.to_local(surface.dp_du) if scene.has_lay else None
     dr.eval(distance, normal, shape, seen, along)
 
-    images = [np.array(distance, np.float32), vectors_to_host(normal), shape_indices(scene.mitsuba, shape)]
-    images += [] if along is None else [vectors_to_host(along)]
-    masks = np.array([np.array(mask, bool) for mask in seen], bool).reshape(len(seen), len(images[0]))
+    distances, normals = np.array(distance, np.float32), vectors_to_host(normal)
+    shapes = shape_indices(scene.mitsuba, shape)
+    masks = np.array([np.array(mask, bool) for mask in seen], bool).reshape(len(seen), len(distances))
+    directions = None if along is None else vectors_to_host(along)
     out, first = [], 0
-    for height, width in (group.size for group in groups):
-        part, size = slice(first, first + height * width), (height, width)
-        of_group = [image[part].reshape(*size, *image.shape[1:]) for image in images]
-        out.append(Surfaces(*of_group[:3], masks[:, part].reshape(len(masks), *size), *of_group[3:]))
+    for size in (group.size for group in groups):
+        part = slice(first, first + size[0] * size[1])
         first = part.stop
+        out.append(
+            Surfaces(
+                distance=distances[part].reshape(size),
+                normal=normals[part].reshape(*size, 3),
+                shape=shapes[part].reshape(size),
+                seen=masks[:, part].reshape(len(masks), *size),
+                along=None if directions is None else directions[part].reshape(*size, 3),
+            )
+        )
     return out
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from characterisation.point_cloud import ViewGrid
 from mitsim.scene.backend import mi
 from mitsim.scene.load import load_scene, scene_from_dict
-from mitsim.scene.ray_casting.raycast import PixelRays, cast
+from mitsim.scene.ray_casting.raycast import PixelRays, cast, cast_together
 from mitsim.sensor.transforms import Transform, look_at
 from tests.seen_shapes import points_of
 
@@ -33,6 +33,24 @@ def test_a_sphere_is_where_it_is():
     assert np.abs(surfaces.normal - normal)[away].max() < 1e-3
     assert surfaces.seen[0][away].all()  # an eye at the sensor itself sees all that the sensor sees
     assert np.isnan(surfaces.distance[~hit]).all()
+
+
+def test_groups_of_rays_in_one_launch_meet_what_each_meets_alone():
+    ball = {"type": "sphere", "radius": 100.0, "bsdf": {"type": "matt_white"}}
+    scene, pose = scene_from_dict({"ball": ball}, 850), look_at([30, -580, 120], [0, 0, 0], [0, 0, 1], 20)
+    lost = GRID.rays()[40:100, 60:200]
+    lost[10:20] = np.nan  # pixels without a ray
+    groups = [PixelRays.of_grid(GRID), PixelRays(GRID.origin, lost)]
+    eyes = np.array([[0.0, 0.0, 0.0], [200.0, 0.0, 0.0]])
+    every, part = cast_together(scene, groups, pose, eyes)
+    for name, value in vars(cast(scene, groups[0], pose, eyes)).items():
+        np.testing.assert_array_equal(getattr(every, name), value)
+    assert part.shape.shape == (60, 140)
+    assert (part.shape[10:20] == -1).all()
+    shown = every.shape[40:100, 60:200].copy()
+    shown[10:20] = -1
+    np.testing.assert_array_equal(part.shape, shown)
+    np.testing.assert_array_equal(part.seen[1][shown == 0], every.seen[1, 40:100, 60:200][shown == 0])
 
 
 def test_an_obstacle_hides_a_point_from_one_eye_only():
