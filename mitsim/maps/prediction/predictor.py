@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -92,9 +93,13 @@ class Predictor:
         cameras = list(rig.cameras.values())[1:]
         self.view = ViewRays(grid, self.seen, rig.baseline_direction, cameras, rig.projector)
         self.rays = self.view.rays
-        self.directions = grid.rays().reshape(-1, 3)
-        self.single_directions = self.directions.astype(np.float32).reshape(grid.height, grid.width, 3)
+        self.directions = self.view.directions.reshape(-1, 3)
         self.eyes = [*cameras, *([rig.projector] if rig.projector else [])]
+
+    @cached_property
+    def single_directions(self) -> NDArray[np.float32]:
+        """Return the directions of the rays (H, W, 3) in single precision, for clouds."""
+        return self.view.directions.astype(np.float32)
 
     @staticmethod
     def of_sensor(sensor: Sensor, geometry: Geometry) -> Predictor:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -65,6 +66,9 @@ class _OtherEye:
         return self.distortion.image(local.x / local.z, local.y / local.z, local.z > 0)[2]
 
 
+_other_eye = lru_cache(maxsize=32)(_OtherEye)  # a view has rays of its own for each of its small features
+
+
 class ViewRays:
     """The rays of a cloud's grid, and the cameras and projector that must see the surfaces, on the device.
 
@@ -86,15 +90,16 @@ class ViewRays:
         cameras: Sequence[Camera],
         projector: Camera | None,
     ) -> None:
-        self.grid, self.rays = grid, PixelRays.of_grid(grid)
+        self.grid, self.directions = grid, grid.rays()
+        self.rays = PixelRays(grid.origin, self.directions)
         self.pinhole, self.pinhole_pixels = replace(grid, normalised=None), None
         if grid.normalised is not None:
             self.pinhole_pixels = np.ascontiguousarray(np.moveaxis(grid.pinhole_positions(), -1, 0))
         self.seen = mi.Bool(seen_by_reference.ravel())
         self.baseline, self.origin = mi.Vector3f(opaque_point(baseline)), opaque_point(grid.origin)
         # the projector comes last, so that SHADOWED takes precedence over HIDDEN
-        self.eyes = [_OtherEye(camera, Status.HIDDEN) for camera in cameras]
-        self.eyes += [_OtherEye(projector, Status.SHADOWED)] if projector else []
+        self.eyes = [_other_eye(camera, Status.HIDDEN) for camera in cameras]
+        self.eyes += [_other_eye(projector, Status.SHADOWED)] if projector else []
 
     def roi(self, bounds: NDArray[np.floating], world_from_sensor: Transform, margin: int) -> Roi:
         """Return the region that can show a box (2, 3) [mm] of the world frame, widened by ``margin`` pixels.
