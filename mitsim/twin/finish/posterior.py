@@ -11,11 +11,11 @@ the product of power and reflectance, so the prior of the reflectance stays.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import Akima1DInterpolator
 
 from characterisation.files.arrays import Floats
 from mitsim.scene.surface.scatter import LARGEST_DEVIATION, Deviation, Scatter
@@ -24,8 +24,15 @@ from mitsim.twin.finish.finish import LOG_ALPHA_RANGE, MetalFinish
 from mitsim.twin.finish.observation import CouponView
 from mitsim.twin.finish.problem import Problem
 
-#: Beckmann shares that are fitted [1]; chi-square and results are smooth between them
+#: Beckmann shares that are fitted first [1]
 _SHARES = (0.0, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
+
+#: how often the steps of the share about the likely ones may be halved: the last are under the least standard deviation
+_HALVINGS = 3
+
+#: logarithm of the likelihood ratio to which a share is likely, and by which it may fall over a step; chosen: a step of
+#: 1.2 to 1.7 standard deviations of a normal likelihood
+_LIKELY, _FALL = 2.0, 3.0
 
 #: standard deviation of alpha and wide-angle share at least; a posterior is no better than the model of the lobe.
 #: Assumed
@@ -97,35 +104,55 @@ def finish_posterior(
     )
     if not share_known:
         apparent = np.concatenate([-apparent[::-1], apparent])  # errors also lead to a share under 0
-    places, costs = [], []
-    for share in _SHARES:
-        other = Problem(views, finish.with_beckmann(share))
+    of_share, by_covariance = _errors(shares, _blur(fit.wide_angle, shares), apparent), fit.log_alpha.by_covariance
+    alpha_blur = _blur(fit.log_alpha, alphas)
+
+    def of_tail(beckmann: float) -> list[float]:
+        """Return the logarithm of a tail's likelihood, then mean and variance of alpha, and of the share, with it."""
+        other = Problem(views, finish.with_beckmann(beckmann))
         fitted = refine(other, start, variance, np.ones(other.count, bool))[0]
-        around = fitted + _AROUND * fit.log_alpha.by_covariance * np.linspace(-1, 1, _PLACES)
+        around = fitted + _AROUND * by_covariance * np.linspace(-1, 1, _PLACES)
         every = np.concatenate([np.linspace(alphas[0], alphas[-1], _PLACES), np.clip(around, alphas[0], alphas[-1])])
-        places.append(np.unique(np.clip(every, *LOG_ALPHA_RANGE)))
-        costs.append(_chi_square(other, variance, places[-1], apparent) / max(fit.reduced_chi_square, 1.0))
-    of_share = _errors(shares, _blur(fit.wide_angle, shares), apparent)
-    logarithms, moments = [], []
-    for place, cost in zip(places, costs, strict=True):
-        of_alpha = _errors(alphas, _blur(fit.log_alpha, alphas), place)
+        place = np.unique(np.clip(every, *LOG_ALPHA_RANGE))
+        cost = _chi_square(other, variance, place, apparent) / max(fit.reduced_chi_square, 1.0)
+        of_alpha = _errors(alphas, alpha_blur, place)
         joint = of_alpha @ np.exp(-0.5 * (cost - cost.min())) @ of_share.T
         if not alpha_known:
             joint = joint * _PRIOR[:, None]
         if not share_known:
             joint = joint * _PRIOR
-        logarithms.append(np.log(joint.sum()) - 0.5 * cost.min())
-        moments.append([*_mean_and_variance(joint.sum(axis=1)), *_mean_and_variance(joint.sum(axis=0))])
+        logarithm = float(np.log(joint.sum()) - 0.5 * cost.min())
+        return [logarithm, *_mean_and_variance(joint.sum(axis=1)), *_mean_and_variance(joint.sum(axis=0))]
+
     by_tail = np.array([Deviation(tail=z).beckmann(prior.beckmann, prior.beckmann_range) for z in _GRID.tolist()])
-    logarithm = CubicSpline(_SHARES, np.array(logarithms))(by_tail)
+    # a spline through all shares would swing where the likelihood falls by hundreds from one to the next
+    logarithm, *moments = Akima1DInterpolator(*_tabulated(of_tail))(by_tail).T
+    alpha_mean, alpha_variance, share_mean, share_variance = moments
     weight = _PRIOR * np.exp(logarithm - logarithm.max())
-    alpha_mean, alpha_variance, share_mean, share_variance = CubicSpline(_SHARES, np.array(moments))(by_tail).T
     return FinishPosterior(
         name,
         None if alpha_known else _moments(alpha_mean, weight, alpha_variance),
         None if share_known else _moments(share_mean, weight, share_variance),
         _moments(_GRID, weight, np.zeros(len(_GRID))),
     )
+
+
+def _tabulated(of_tail: Callable[[float], list[float]]) -> tuple[Floats, Floats]:
+    """Return Beckmann shares (n,), close together where they are likely, and the results (n, 5) of ``of_tail``."""
+    table = {share: of_tail(share) for share in _SHARES}
+    for _ in range(_HALVINGS):
+        shares = np.array(sorted(table))
+        logarithm = np.array([table[share][0] for share in shares])
+        likely = np.maximum(logarithm[:-1], logarithm[1:])
+        # the lowest of the four ends of a step and its neighbours
+        ends = np.pad(logarithm, 1, mode="edge")
+        lowest = np.min([ends[:-3], ends[1:-2], ends[2:-1], ends[3:]], axis=0)
+        halved = (likely > logarithm.max() - _LIKELY) & (likely - lowest > _FALL)
+        if not halved.any():
+            break
+        table |= {share: of_tail(share) for share in (shares[:-1] + shares[1:])[halved] / 2}
+    shares = np.array(sorted(table))
+    return shares, np.array([table[share] for share in shares])
 
 
 def _chi_square(problem: Problem, variance: Floats, log_alphas: Floats, shares: Floats) -> Floats:

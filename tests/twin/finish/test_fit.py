@@ -6,7 +6,7 @@ import json
 import math
 import os
 import tomllib
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
@@ -317,6 +317,20 @@ def test_posteriors_cover_known_finishes(plain_views, ground, alpha_off, share):
         assert abs(found.wide_angle[0] - off) < 3 * found.wide_angle[1] < 2.0
     else:
         assert found.wide_angle[0] < -2.2 and found.wide_angle[1] < 0.4  # the trials draw no share under that of -3
+
+
+@pytest.mark.parametrize("roughness", [0.1, 0.2])
+def test_posteriors_of_quiet_views_cover_the_finish_of_the_scene(plain_views, ground, roughness):
+    """Before, a tail of 1.63 +- .05 (true 0): the likelihood falls by thousands at one tail, and a spline swung."""
+    true, rng = machined(MachinedFace("aluminium", "ground", roughness), 850.0), np.random.default_rng(3)
+    views = []
+    for view in seen_with(plain_views[1:], ground, true.alpha_u, true.wide_angle):
+        quiet = PixelNoise(*(np.array(astuple(view.noise)) / ([25.0] * 5 + [1.0])))  # of the mean of 25 images
+        electrons = rng.normal(view.electrons, np.sqrt(quiet.variance(view.electrons)))
+        views.append(replace(view, electrons=electrons, noise=quiet))
+    found = finish_posterior(views, ground, true, fit_views(views, ground), "plate")
+    for centre, size in (found.alpha, found.wide_angle, found.tail):
+        assert abs(centre) < 3 * size < 3
 
 
 def test_a_width_that_one_view_hardly_shows_is_not_wider_than_its_prior(plain_views, ground):
