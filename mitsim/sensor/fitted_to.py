@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from characterisation.files.documents import Document, validate
+from characterisation.files.errors import InputError
 
 
 class FittedCapture(Document):
@@ -28,6 +29,25 @@ class _Records(Document):
 def images_digest(images: Mapping[str, NDArray[np.generic]]) -> str:
     """Return the SHA-256 of the grey levels (P, H, W) of all cameras; names, calibration and folder do not count."""
     return joined_digest(stack_digest(stack) for stack in images.values())
+
+
+def note_images(found: dict[str, str], images: Mapping[str, NDArray[np.generic]], where: str | Path) -> None:
+    """Add the digest of a capture's images to those ``found``, and reject a copy of one of them.
+
+    Images of one level each may be equal by rounding, in the dark.
+
+    Raises
+    ------
+    InputError
+        If the images are those of another capture.
+    """
+    if all(stack.min() == stack.max() for stack in images.values()):
+        return
+    digest = images_digest(images)
+    if digest in found:
+        hint = "the same noise twice is not a repeat"
+        raise InputError(where, "images", f"those of {found[digest]}", "each capture once", hint)
+    found[digest] = str(where)
 
 
 def stack_digest(stack: NDArray[np.generic]) -> bytes:

@@ -25,6 +25,7 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
 from mitsim.scene.coupons import CouponRecipe, load_sample
 from mitsim.scene.light_transport.plain_scene import has_emitters
+from mitsim.sensor.fitted_to import note_images
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.sensor import Sensor
 from mitsim.twin.finish.dots import Dots, compare_dots
@@ -181,7 +182,7 @@ def fit_captures(
     Raises
     ------
     InputError
-        If captures, sensor and scene do not fit each other, or too few blocks can be compared.
+        If captures, sensor and scene do not fit each other, one is a copy of another, or too few blocks are left.
     """
     if not captures:
         raise InputError("CAPTURES", "", "none", "one capture folder or more")
@@ -201,11 +202,12 @@ def fit_captures(
     dots: list[Dots] = []
     specimens: list[Specimen] = []
     renderer, calibration = WhiteCouponRenderer(with_rig(chosen, first.rig)), calibration_table(first.rig)
-    unknown = False
+    unknown, digests = False, dict[str, str]()
     for index, folder in enumerate(track(list(captures), "captures", len(captures))):
         capture = read_capture(folder)
         if capture.sensor != first.sensor:
             raise InputError(folder, "sensor", capture.sensor, f"{first.sensor}, as in {captures[0]}")
+        note_images(digests, capture.images, folder)
         if calibration_table(capture.rig) != calibration:
             renderer, calibration = WhiteCouponRenderer(with_rig(chosen, capture.rig)), calibration_table(capture.rig)
         pattern_known = pattern_is_known(capture, chosen)

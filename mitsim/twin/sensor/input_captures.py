@@ -18,6 +18,7 @@ from scipy.ndimage import uniform_filter
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
+from mitsim.sensor.fitted_to import note_images
 from mitsim.sensor.sensor import Sensor
 from mitsim.twin.finish.fine_detail import finest_detail
 
@@ -71,7 +72,7 @@ def read_input_captures(
     Raises
     ------
     InputError
-        If there is none, one is given twice, or one is of another technology or has no images.
+        If there is none, one is given twice or is a copy of another, or one is of another technology or has no images.
     """
     requested: list[tuple[Path, Kind | None]] = [(folder, None) for folder in folders]
     requested += [(folder, "off") for folder in off] + [(folder, "dark") for folder in dark]
@@ -79,7 +80,7 @@ def read_input_captures(
         raise InputError("CAPTURES", "", "none", "one capture folder or more")
     if len({folder.resolve() for folder, _ in requested}) < len(requested):
         raise InputError("CAPTURES", "", "a folder twice", "each capture once", "the same noise twice is not a repeat")
-    input_captures = []
+    input_captures, digests = [], dict[str, str]()
     for folder, given_kind in requested:
         capture = read_capture(folder)
         if capture.technology != sensor.technology:
@@ -87,6 +88,7 @@ def read_input_captures(
             raise InputError(folder, "technology", capture.technology, allowed)
         if not capture.images:
             raise InputError(folder, "images", "none", "a capture with images")
+        note_images(digests, capture.images, folder)
         stated_kind: Kind = "off" if capture.settings.get("projector_on") is False else "on"
         stated_kind = "dark" if capture.settings.get("dark") is True else stated_kind
         input_captures.append(InputCapture(folder, capture, given_kind or stated_kind))

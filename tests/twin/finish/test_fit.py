@@ -551,6 +551,8 @@ def test_what_does_not_go_together_is_refused(captures, tmp_path, n10, scenes):
     refused([captures[0], "--sensor", "ensenso-n01"], "did you mean 'ensenso-n10'")
     refused([captures[0], "-D", "process=grund"], "did you mean 'ground'")
     capture = read_capture(captures[0])
+    write_capture(capture, tmp_path / "copy")  # it made the uncertainty of three captures smaller by a third
+    refused([captures[0], tmp_path / "copy"], f"images: found those of {captures[0]}")
     untimed = capture.decoding.model_copy(update={"exposure_s": None})
     write_capture(replace(capture, decoding=untimed), tmp_path / "when")
     refused([tmp_path / "when"], "settings.exposure_s", "None")

@@ -193,6 +193,9 @@ def test_what_cannot_be_is_one_message(recorded, tmp_path):
         read_input_captures([], (), (), preset)
     with pytest.raises(InputError, match="a folder twice"):
         read_input_captures([recorded / "on_0"], (), [recorded / "on_0"], preset)
+    write_capture(read_capture(recorded / "on_0"), tmp_path / "copy")  # as a repeat it halved the noise
+    with pytest.raises(InputError, match=r"images: found those of .*on_0"):
+        read_input_captures([recorded / "on_0", tmp_path / "copy"], (), (), preset)
     with pytest.raises(InputError, match=r"technology: found active_stereo"):
         read_input_captures([recorded / "on_0"], (), (), load_sensor("david-sls-3"))
     with pytest.raises(InputError, match=r"--output.* a .toml file"):
