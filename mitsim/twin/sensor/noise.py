@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
+from scipy.special import ndtri
 
 from characterisation.files.arrays import MEDIAN_TO_STD
 from mitsim.sensor.imager import Imager
@@ -27,8 +28,10 @@ from mitsim.twin.finish.specimen import Specimen
 from mitsim.twin.sensor.estimate import FittedKey, Undetermined
 from mitsim.twin.sensor.input_captures import InputCapture
 from mitsim.twin.sensor.photon_transfer import (
+    LEAST_SPREAD,
     Repeats,
     TransferLine,
+    dithered,
     fixed_variance,
     independent_share,
     one_image_line,
@@ -48,6 +51,12 @@ _SURE = 3.0
 
 #: variance of rounding to whole grey levels [DN^2]
 _ROUNDING = 1 / 12
+
+#: strips of rows, and of columns, whose scatter gives the uncertainty of the black level; chosen
+_STRIPS = 16
+
+#: share of pixels at level 0 up to which they do not matter; chosen
+_MOST_BLACK = 0.01
 
 #: share of the specimen's pixels away from edges of the print, above which the noise is estimated from these alone
 _LEAST_QUIET = 0.2
@@ -191,12 +200,33 @@ def _images(group: list[InputCapture]) -> NDArray[np.unsignedinteger]:
 
 def _with_black_level(imager: Imager, dark: list[list[InputCapture]]) -> tuple[Imager, FittedKey]:
     input_captures = [source for group in dark for source in group]
-    image = input_captures[0].image
-    value = float(np.mean([float(source.image.mean()) for source in input_captures]))
-    spread = float(image.std() / np.sqrt(image.size * len(input_captures)))
+    value, spread = dark_level(_images(input_captures))
     names = tuple(source.name for source in input_captures)
     estimate = FittedKey("imager.black_level_dn", value, spread, "DN", names, "mean grey level in the dark")
     return replace(imager, black_level=value), estimate
+
+
+def dark_level(images: NDArray[np.unsignedinteger]) -> tuple[float, float]:
+    """Return the black level [DN] of images (n, H, W) without light, and its standard uncertainty.
+
+    It is the mean level. If the converter ends at 0 within the noise, it is the middle of the normal distribution with
+    the shares of pixels at 0 and up to a second level. The scatter of strips contains noise of rows and columns; less
+    noise than half a grey level leaves an error of rounding.
+    """
+    second = max(int(np.quantile(images, 0.9)), 1)
+    cut = (images == 0).mean() > _MOST_BLACK and (images > second).any()
+
+    def level(part: NDArray[np.unsignedinteger]) -> float:
+        if not cut:
+            return float(part.mean())
+        ends = ndtri([((part <= end).sum() + 0.5) / (part.size + 1) for end in (0, second)])
+        return float(0.5 - ends[0] * second / (ends[1] - ends[0]))
+
+    variance = _ROUNDING * np.exp(-4 * np.pi**2 * max(float(images.var()) - _ROUNDING, 0.0))
+    for axis in (1, 2):
+        strips = np.array_split(images, min(_STRIPS, images.shape[axis]), axis)
+        variance += np.var([level(strip) for strip in strips], ddof=1) / len(strips)
+    return max(level(images), 0.0), float(np.sqrt(variance))
 
 
 def _with_line(
@@ -217,10 +247,10 @@ def _with_fixed(
     needed = "the mean of rows in the dark; read_noise_e includes it"
     undetermined = [Undetermined("imager.row_noise_e", before.row_noise, needed, True)]
     for kind, key, determined_by in (
-        ("dark", "imager.dsnu_e", "repeats in the dark"),
+        ("dark", "imager.dsnu_e", "repeats in the dark, with noise over 0.3 DN and a level above it"),
         ("off", "imager.prnu", "repeats with the projector off"),
     ):
-        groups = [group for group in repeated if group[0].kind == kind]
+        groups = [group for group in repeated if group[0].kind == kind and _shows_pattern(group, specimens)]
         if not groups:
             undetermined.append(Undetermined(key, before.dsnu if kind == "dark" else before.prnu, determined_by))
             continue
@@ -236,6 +266,12 @@ def _with_fixed(
         estimates.append(FittedKey(key, root / scale, spread_root / scale, unit, names, method))
         imager = replace(imager, dsnu=root) if kind == "dark" else replace(imager, prnu=root / scale)
     return imager, estimates, undetermined
+
+
+def _shows_pattern(group: list[InputCapture], specimens: dict[str, Specimen]) -> bool:
+    """Return whether neither rounding nor black hides the fixed pattern of repeats."""
+    levels = _images(group)[:, _specimen_mask(group[0], specimens)]
+    return dithered(levels, levels.mean(axis=0)) and float((levels == 0).mean()) < _MOST_BLACK
 
 
 def _from_one_image(
@@ -264,7 +300,10 @@ def _from_one_image(
     level = float(np.median(electrons[mask]))
     fine = finest_detail(electrons)
     variance = float(np.median(fine[mask] ** 2)) / MEDIAN_SQUARE
-    variance = (variance - float(widths(np.array(float(np.median(image[mask]))), imager)) ** 2 / 12) / gain
+    step = float(widths(np.array(float(np.median(image[mask]))), imager)) ** 2
+    if variance < LEAST_SPREAD * step:
+        return None
+    variance = (variance - step / 12) / gain
     relative = float(np.sqrt(2 / (mask.sum() * 0.37 * independent_share())))
     read = imager.read_noise
     if variance > level + 1.0:
@@ -273,8 +312,6 @@ def _from_one_image(
             FittedKey("imager.read_noise_e", value, relative * variance / (2 * value), "e-", names, method)
         )
         return replace(bare, read_noise=value), estimates
-    if variance <= 0:
-        return None
     # kappa level + kappa^2 read^2 = variance, the share of shot noise as the file has it
     share = level / (level + read**2)
     kappa = variance * share / level

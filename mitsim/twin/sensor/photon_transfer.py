@@ -56,6 +56,17 @@ _BY_CHANCE = 3.0
 #: standard uncertainties of a square term from which the line is a parabola, whose slope at 0 counts; chosen
 _CURVED_SIGMAS = 4.0
 
+#: least variance of a pixel's levels over the repeats [DN^2], 1/12 of it by rounding: with less noise than 0.29 DN,
+#: rounding is mostly a fixed pattern
+_LEAST_TEMPORAL = 1 / 6
+
+#: least variance of all levels of a bin [DN^2], 1/12 of it by rounding: from a spread of 0.5 DN on, rounding adds 1/12
+#: to 3 % of the rest, wherever between two grey levels the mean lies
+LEAST_SPREAD = 1 / 3
+
+#: least range of the levels of a bin [DN] beside that: it holds all places between two grey levels
+_LEAST_RANGE = 1.0
+
 #: efficiency of the median of squares against their mean (chi-square of one degree of freedom, recalled)
 _MEDIAN_EFFICIENCY = 0.37
 
@@ -133,11 +144,9 @@ def repeated_line(repeats: list[Repeats], chip: Imager) -> TransferLine | None:
     kept = kept_variance(chip.smoothing_px)
     dependent = float(((np.convolve(weights, weights[::-1]) / kept) ** 2).sum()) ** 2
     for group in repeats:
-        electrons = linearised(group.levels, chip)
-        mean, variance = electrons.mean(axis=0), electrons.var(axis=0, ddof=1)
         clear = _CLEAR_SIGMAS * float(np.sqrt(group.levels.var(axis=0, ddof=1).mean()))
         inside = (group.around > clear) & (group.around < chip.full_scale - clear)
-        bins = _bins(mean[inside], variance[inside], group.around[inside], len(group.levels) - 1, chip)
+        bins = _bins(Repeats(group.levels[:, inside], group.around[inside]), chip)
         rows += [(level, noise, dependent * spread) for level, noise, spread in bins]
     line = _line(rows)
     return None if line is None else line.over(kept**2)
@@ -157,10 +166,22 @@ def one_image_line(
         shown = float(np.interp(level, linearised(every, chip), every))
         if not _CLEAR_DN < shown < chip.full_scale - _CLEAR_DN:
             continue
-        rounding = float(widths(np.array(shown), chip)) ** 2 / 12
+        step = float(widths(np.array(shown), chip)) ** 2
+        if variance < LEAST_SPREAD * step:
+            continue
+        rounding = step / 12
         spread = 2 * variance**2 / (count * _MEDIAN_EFFICIENCY * independent_share())
         rows.append((level, variance - rounding, spread))
     return _line(rows)
+
+
+def dithered(levels: NDArray[np.unsignedinteger[Any]], around: Floats) -> bool:
+    """Return whether rounding is noise of 1/12 DN^2 in the levels (n, N) of n repeats, with local means (N,) [DN].
+
+    It is not where noise and range are small against a grey level: most images are then equal.
+    """
+    over_repeats, every = float(levels.var(axis=0, ddof=1).mean()), float(levels.var())
+    return over_repeats >= _LEAST_TEMPORAL and (every >= LEAST_SPREAD or float(np.ptp(around)) >= _LEAST_RANGE)
 
 
 def independent_share() -> float:
@@ -196,26 +217,23 @@ def fixed_variance(
     return level, total - temporal / len(images), float(np.sqrt(spread**2 + left))
 
 
-def _bins(
-    mean: Floats, variance: Floats, level: Floats, freedom: int, chip: Imager
-) -> list[tuple[float, float, float]]:
+def _bins(repeats: Repeats, chip: Imager) -> list[tuple[float, float, float]]:
     """Return mean, variance without rounding, and the variance of that, for bins of similar local mean."""
-    if len(mean) < _BINS:
+    level, freedom = repeats.around, len(repeats.levels) - 1
+    if len(level) < _BINS:
         return []
     edges = np.quantile(level, np.linspace(0, 1, _BINS + 1))
     where = np.clip(np.searchsorted(edges, level, side="right") - 1, 0, _BINS - 1)
     rows = []
     for index in range(_BINS):
         members = where == index
-        if members.sum() < 2:
+        levels, around = repeats.levels[:, members], level[members]
+        if members.sum() < 2 or not dithered(levels, around):
             continue
-        cut = float((widths(level[members], chip) ** 2).mean()) / 12
-        bin_variance = float(variance[members].mean())
-        if bin_variance <= 0:
-            continue
-        rows.append(
-            (float(mean[members].mean()), bin_variance - cut, 2 * bin_variance**2 / (freedom * float(members.sum())))
-        )
+        electrons = linearised(levels, chip)
+        cut = float((widths(around, chip) ** 2).mean()) / 12
+        variance = float(electrons.var(axis=0, ddof=1).mean())
+        rows.append((float(electrons.mean()), variance - cut, 2 * variance**2 / (freedom * float(members.sum()))))
     return rows
 
 

@@ -126,6 +126,52 @@ def test_the_smoothing_of_the_file_is_taken_out_of_repeats(smoothing, monkeypatc
     assert found.prnu == pytest.approx(0.02, rel=0.05)
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"black_level": 2.3, "read_noise": 7.0, "dsnu": 7.0},
+        {"black_level": 8.0},
+        {"black_level": 0.0, "read_noise": 60.0},
+        {"black_level": 1.0, "read_noise": 90.0, "dsnu": 30.0},
+        {"black_level": 8.0, "read_noise": 35.0, "row_noise": 20.0},
+        {"black_level": 8.0, "read_noise": 35.0, "column_pattern": 20.0},
+    ],
+    ids=["hardly any noise", "noise of 0.4 DN", "black at 0", "black at 1", "rows", "columns"],
+)
+def test_rounding_and_black_are_no_noise(changes, monkeypatch):
+    """Of 8 bits. Before: a black level of 2.127 +- 0.001 for 2.3, and of 0.390 +- 0.002 for 0; read noise of 43 +- 0
+    for 7 e-, and of 22.6 +- 0.2 for 25 e-. Beyond 4 u lies one of 16,000 numbers."""
+    chip = replace(TRUE, bits=8, **changes)
+    monkeypatch.setattr(noise, "_specimen_mask", lambda source, _: np.ones(source.image.shape, bool))
+    truth = {"black_level_dn": chip.black_level, "full_well_e": chip.full_well, "dsnu_e": chip.dsnu}
+    truth["read_noise_e"] = float(np.hypot(chip.read_noise, chip.row_noise))  # which contains that of rows
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        ramp = np.tile(np.linspace(300, 13000, 160), (120, 1))
+        fixed, groups = fixed_pattern(chip, ramp.shape, rng), []
+        for kind, electrons in (("dark", 0 * ramp), ("on", ramp)):
+            images = repeats(rng, chip, electrons, 4, fixed)
+            groups.append([SimpleNamespace(kind=kind, name=f"{kind}_{i}", image=one) for i, one in enumerate(images)])
+        sensor = SimpleNamespace(
+            technology="structured_light", imager=replace(chip, full_well=21000, read_noise=40, dsnu=3)
+        )
+        found = {one.key.removeprefix("imager."): one for one in fit_imager(groups, sensor, {}).estimates}
+        assert {"black_level_dn", "full_well_e", "read_noise_e"} <= found.keys()
+        for key in found.keys() & truth.keys():
+            assert abs(found[key].value - truth[key]) < 4 * found[key].uncertainty, key
+
+
+@pytest.mark.parametrize(("read", "brightest"), [(7.0, 560.0), (25.0, 118.0)])
+def test_one_dim_image_of_little_noise_has_no_line(read, brightest, monkeypatch):
+    """Of 8 bits. Before, a traceback of a singular matrix, as of a D435, and a read noise of 22.9 +- 0.3 for 25 e-."""
+    monkeypatch.setattr(noise, "_specimen_mask", lambda source, _: np.ones(source.image.shape, bool))
+    chip, rng = replace(TRUE, bits=8, black_level=8.0, read_noise=read), np.random.default_rng(1)
+    image = expose(np.tile(np.linspace(118.0 * (read > 7), brightest, 320), (240, 1)), chip, None, Noise(), rng)
+    sensor = SimpleNamespace(technology="structured_light", imager=chip)
+    found = fit_imager([[SimpleNamespace(kind="off", name="off", image=image)]], sensor, {})
+    assert not found.known and not found.estimates
+
+
 def test_one_even_image_gives_the_sum_of_noise_and_fixed_pattern():
     rng = np.random.default_rng(5)
     image = expose(np.tile(np.linspace(500, 12000, 400), (400, 1)), TRUE, None, Noise(), rng)
