@@ -96,6 +96,8 @@ def pooled(estimates: Sequence[FittedKey]) -> list[FittedKey]:
     out = []
     for key in dict.fromkeys(estimate.key for estimate in estimates):
         group = [estimate for estimate in estimates if estimate.key == key]
+        # one that is not determined is its assumed value again, which many captures would make a measurement
+        group = [estimate for estimate in group if estimate.determined] or group
         first = group[0]
         if len(group) > 1 and all(fitted_key.uncertainty > 0 for fitted_key in group):
             middle, spread = combined(
@@ -103,8 +105,6 @@ def pooled(estimates: Sequence[FittedKey]) -> list[FittedKey]:
                 [fitted_key.uncertainty for fitted_key in group],
             )
             names = tuple(name for fitted_key in group for name in fitted_key.captures)
-            known = any(fitted_key.determined for fitted_key in group)
-            value = unscaled(middle, first.scale)
-            first = replace(first, value=value, uncertainty=spread, captures=names, determined=known)
+            first = replace(first, value=unscaled(middle, first.scale), uncertainty=spread, captures=names)
         out.append(first)
     return out
