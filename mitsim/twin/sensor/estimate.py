@@ -5,7 +5,8 @@ mean and its uncertainty.
 
 The estimates may differ by more than their own uncertainties, as sheets and their poses do. This variance tau^2 is
 estimated by the moments of Q = sum w_i (x_i - x)^2 and added to every variance (DerSimonian & Laird, Controlled
-Clinical Trials 7 (1986) 177).
+Clinical Trials 7 (1986) 177). Few captures determine tau^2 poorly, so the uncertainty is that of a normal distribution
+with the 95 % interval of Student's, whose degrees of freedom follow from the share of tau^2 (GUM, G.4).
 """
 
 from __future__ import annotations
@@ -16,9 +17,17 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from scipy.stats import norm
+from scipy.stats import t as student
 
 #: scale on which an estimate is approximately normal: the number, its logarithm or its inverse
 Scale = Literal["linear", "logarithm", "inverse"]
+
+#: probability up to the upper end of a 95 % interval
+_SIDE = 0.975
+
+#: least share of tau^2 in the variance, below which Student's distribution is normal; chosen
+_LEAST_SHARE = 1e-3
 
 
 def scaled(value: float, scale: Scale) -> float:
@@ -87,8 +96,11 @@ def combined(values: Sequence[float], uncertainties: Sequence[float]) -> tuple[f
     mean = float((weight * x).sum() / weight.sum())
     excess = float((weight * (x - mean) ** 2).sum()) - (len(x) - 1)
     scale = float(weight.sum() - (weight**2).sum() / weight.sum())
-    weight = 1 / (variance + max(excess / scale, 0.0))
-    return float((weight * x).sum() / weight.sum()), float(weight.sum() ** -0.5)
+    scatter = max(excess / scale, 0.0)
+    share = scatter / (scatter + len(x) / float(weight.sum()))
+    weight = 1 / (variance + scatter)
+    factor = student.ppf(_SIDE, (len(x) - 1) / max(share, _LEAST_SHARE) ** 2) / norm.ppf(_SIDE)
+    return float((weight * x).sum() / weight.sum()), float(factor * weight.sum() ** -0.5)
 
 
 def pooled(estimates: Sequence[FittedKey]) -> list[FittedKey]:

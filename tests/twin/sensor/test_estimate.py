@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from mitsim.twin.sensor.estimate import FittedKey, pooled
+from mitsim.twin.sensor.estimate import FittedKey, combined, pooled
 
 
 def estimates(values, uncertainties, determined):
@@ -21,3 +22,14 @@ def test_captures_that_do_not_determine_a_number_do_not_pull_it_to_the_file():
     assert found.captures == ("sheet_0",) and found.determined
     [kept] = pooled(estimates([0.1, -0.1], [0.9, 0.9], [False, False]))
     assert not kept.determined and kept.value == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize(("count", "least"), [(2, 0.84), (3, 0.9), (6, 0.93)])
+def test_intervals_of_captures_that_differ_hold_the_truth(count, least):
+    """Poses add ten times the captures' own uncertainty. Before, intervals of 95 % held it in 71, 82 and 89 %."""
+    rng = np.random.default_rng(0)
+    u = rng.uniform(0.7, 1.4, (3000, count))
+    drawn = [combined(rng.normal(0.0, np.hypot(own, 10.0)), own) for own in u]
+    assert least < np.mean([abs(value) < 1.96 * spread for value, spread in drawn]) < 0.96
+    alike = [combined(rng.normal(0.0, own), own) for own in u]
+    assert 0.94 < np.mean([abs(value) < 1.96 * spread for value, spread in alike]) < 0.98
