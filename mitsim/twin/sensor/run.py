@@ -129,7 +129,7 @@ def fit_sensor(
     )
     lit = [group[0] for group in groups if group[0].kind != "dark"]
     off_captures, on_captures = ([source for source in lit if source.kind == kind] for kind in ("off", "on"))
-    specimens = {source.name: _specimen(source, roi) for source in lit}
+    specimens = _specimens(on_captures, off_captures, roi)
     imager = fit_imager(groups, base, specimens)
     estimates = list(imager.estimates)
     base = replace(base, imager=imager.imager)
@@ -186,6 +186,23 @@ def _specimen(source: InputCapture, roi: Roi | None) -> Specimen:
     bend = "flat" if specimen.bend is None else f"bent by {specimen.bend.rms:.2g} mm rms"
     say(f"{source.name}: a sheet at {distance:.0f} mm, {bend}")
     return specimen
+
+
+def _specimens(on: list[InputCapture], off: list[InputCapture], roi: Roi | None) -> dict[str, Specimen]:
+    """Return the specimen of each lit capture; that of the first with the projector on for one without a plane.
+
+    Without the projector's dots, a plain sheet has no points.
+    """
+    specimens = {source.name: _specimen(source, roi) for source in on}
+    for source in off:
+        try:
+            specimens[source.name] = _specimen(source, roi)
+        except InputError:
+            if not on or source.image.shape != on[0].image.shape:
+                raise
+            specimens[source.name] = specimens[on[0].name]
+            say(f"{source.name}: no plane without the projector; its sheet is taken to be where {on[0].name} shows it")
+    return specimens
 
 
 def _dots(

@@ -187,6 +187,24 @@ def test_noise_of_one_image_of_stripes_takes_the_place_of_the_fixed_pattern(tmp_
         assert (mine.read_noise, mine.prnu) == (read, pattern)
 
 
+def test_a_plain_sheet_without_the_projector_is_where_the_lit_one_is(recorded, monkeypatch):
+    """Before, an error: without dots it has no points, so no plane was found in it."""
+    lit, dark = (
+        read_input_captures([recorded / name], (), (), load_sensor("ensenso-n10"))[0] for name in ("on_0", "dark_0")
+    )
+    off = replace(dark, kind="off")
+
+    def found(source, _):
+        if source is off:
+            raise InputError(source.name, "pose", "0 points", "500 points")
+        return f"plane of {source.name}"
+
+    monkeypatch.setattr(run, "_specimen", found)
+    assert run._specimens([lit], [off], None) == dict.fromkeys((lit.name, off.name), f"plane of {lit.name}")
+    with pytest.raises(InputError, match="0 points"):
+        run._specimens([], [off], None)
+
+
 def test_what_cannot_be_is_one_message(recorded, tmp_path):
     preset = load_sensor("ensenso-n10")
     with pytest.raises(InputError, match="CAPTURES: found none"):
