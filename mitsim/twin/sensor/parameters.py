@@ -101,11 +101,8 @@ def _with_full_well(sensor: Sensor, x: float) -> Sensor:
 
 
 def _with_flux(sensor: Sensor, x: float) -> Sensor:
-    """Set the power and keep the ratio of the room's light to it."""
-    projector = sensor.projector
-    ratio = float(np.exp(x)) * sensor.imager.full_well / projector.flux
-    room = _with_room_level(sensor.room, ratio)
-    return replace(sensor, projector=replace(projector, flux=projector.flux * ratio), room=room)
+    """Set the power; the light of a known room stays, and that of a fitted one is set after it, as a ratio to it."""
+    return replace(sensor, projector=replace(sensor.projector, flux=float(np.exp(x)) * sensor.imager.full_well))
 
 
 def _with_read_noise(sensor: Sensor, x: float) -> Sensor:

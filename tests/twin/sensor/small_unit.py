@@ -129,10 +129,17 @@ def parameters(smoothing: bool = False) -> list[Parameter]:
     ]
 
 
-def small_fit(capture: Capture, sensor: Sensor, at: Specimen, varied: list[Parameter], draws: DotDraws) -> DotsFit:
+def small_fit(
+    capture: Capture,
+    sensor: Sensor,
+    at: Specimen,
+    varied: list[Parameter],
+    draws: DotDraws,
+    room: list[float] | None = None,
+) -> DotsFit:
     """The fit in patches of 24 px, since the images are small."""
     with mock.patch.multiple(dots, PATCH_PX=24, MARGIN_PX=2.0):
-        return dots.fit_dots(capture, sensor, at, varied, "unit", draws=draws)
+        return dots.fit_dots(capture, sensor, at, varied, "unit", room=room, draws=draws)
 
 
 def standard_errors(seed: int, draws: int = 3) -> tuple[DotsFit, dict[str, float]]:
