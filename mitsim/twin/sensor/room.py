@@ -10,9 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import trim_mean
 
-from characterisation.files.arrays import Floats
+from characterisation.files.arrays import MEDIAN_TO_STD, Floats
 from mitsim.sensor.imager import electrons_per_radiance
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.vignetting import camera_illumination
@@ -29,9 +28,9 @@ from mitsim.twin.sensor.parameters import ROOM_KEYS
 #: side of a patch, which gives one value of the light [px]; chosen
 _PATCH_PX = 20
 
-#: share of a patch's pixels left out at either end of their values, for specks; chosen. A median of whole grey levels
-#: is off by up to half a level
-_TRIMMED = 0.1
+#: distance from a patch's median beyond which a pixel shows a speck, in standard deviations of noise, but at least two
+#: grey levels; chosen. A trimmed mean of whole grey levels is off by up to 0.2 levels, a median by half of one
+_SPECK, _SPECK_DN = 5.0, 2.0
 
 #: least number of patches for all six terms: four for each; fewer give a constant
 _FEWEST_FOR_TERMS = 24
@@ -74,8 +73,8 @@ def fit_room(input_captures: list[InputCapture], sensor: Sensor, specimens: dict
         rays = camera.rays(middles)
         x, y = (rays[:, :2] / rays[:, 2:]).T
         rows.append(np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1))
-        patches = [irradiance[r : r + _PATCH_PX, c : c + _PATCH_PX] for r, c in corners]
-        values.append([trim_mean(patch, _TRIMMED, axis=None) for patch in patches])
+        windows = [np.s_[r : r + _PATCH_PX, c : c + _PATCH_PX] for r, c in corners]
+        values.append([_without_specks(irradiance[window], source.image[window].astype(float)) for window in windows])
     if not rows:
         return None
     design, seen = np.concatenate(rows), np.concatenate([np.array(means) for means in values])
@@ -99,6 +98,12 @@ def fit_room(input_captures: list[InputCapture], sensor: Sensor, specimens: dict
         key, unit = f"room.{ROOM_KEYS[index]}", "W/mm^2" if index == 0 else "1"
         estimates.append(FittedKey(key, float(value), spread, unit, names, "level with the projector off"))
     return RoomFit(tuple(float(term) for term in terms), tuple(estimates))
+
+
+def _without_specks(values: Floats, levels: Floats) -> float:
+    """Return the mean of a patch's values (h, w), without those of pixels whose levels [DN] are far from the median."""
+    off = np.abs(levels - np.median(levels))
+    return float(values[off <= max(_SPECK * MEDIAN_TO_STD * float(np.median(off)), _SPECK_DN)].mean())
 
 
 def _fitted(design: Floats, seen: Floats) -> tuple[Floats, Floats]:
