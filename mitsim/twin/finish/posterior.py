@@ -30,9 +30,12 @@ _SHARES = (0.0, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 #: how often the steps of the share about the likely ones may be halved: the last are under the least standard deviation
 _HALVINGS = 3
 
-#: logarithm of the likelihood ratio to which a share is likely, and by which it may fall over a step; chosen: a step of
-#: 1.2 to 1.7 standard deviations of a normal likelihood
-_LIKELY, _FALL = 2.0, 3.0
+#: logarithm of the likelihood ratio to which a share is likely; chosen
+_LIKELY = 2.0
+
+#: largest fall of that logarithm over a step and those beside it; chosen: a step of 1.2 to 1.7 standard deviations of a
+#: normal likelihood
+_FALL = 3.0
 
 #: standard deviation of alpha and wide-angle share at least; a posterior is no better than the model of the lobe.
 #: Assumed

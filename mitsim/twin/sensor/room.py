@@ -28,9 +28,12 @@ from mitsim.twin.sensor.parameters import ROOM_KEYS
 #: side of a patch, which gives one value of the light [px]; chosen
 _PATCH_PX = 20
 
-#: distance from a patch's median beyond which a pixel shows a speck, in standard deviations of noise, but at least two
-#: grey levels; chosen. A trimmed mean of whole grey levels is off by up to 0.2 levels, a median by half of one
-_SPECK, _SPECK_DN = 5.0, 2.0
+#: distance from a patch's median beyond which a pixel shows a speck, in standard deviations of noise; chosen. A trimmed
+#: mean of whole grey levels is off by up to 0.2 levels, a median by half of one
+_SPECK = 5.0
+
+#: the same at least [DN]; chosen
+_SPECK_DN = 2.0
 
 #: least number of patches for all six terms: four for each; fewer give a constant
 _FEWEST_FOR_TERMS = 24
