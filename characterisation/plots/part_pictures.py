@@ -13,7 +13,10 @@ from characterisation.files.arrays import Floats
 #: share of its colour that remains on the edge of a shape
 EDGE_SHADE = 0.55
 
-#: number of pixels of boxes around triangles that are tested at once; chosen
+#: largest distance outside an edge, over the triangle's height, of a pixel that counts as inside: rounding
+_ON_EDGE = 1e-9
+
+#: number of pixels that are tested at once; chosen
 _AT_ONCE = 1 << 20
 
 
@@ -52,20 +55,27 @@ def depth_buffer(vertices: Floats, depth: Floats, size: tuple[int, ...]) -> tupl
     high = np.minimum(np.floor(vertices.max(axis=1)), [columns - 1, rows - 1]).astype(int)
     (ax, ay), (bx, by), (cx, cy) = vertices.transpose(1, 2, 0)
     area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
-    width = np.where((high >= low).all(axis=1) & (np.abs(area) >= 1e-12), high[:, 0] - low[:, 0] + 1, 0)
-    candidates = np.flatnonzero(width)  # most triangles of a fine mesh lie between pixels
-    counts = width[candidates] * (high[candidates, 1] - low[candidates, 1] + 1)
-    ends = np.cumsum(counts)
-    for part in np.split(candidates, np.flatnonzero(np.diff(ends // _AT_ONCE)) + 1):
-        # every pixel of the box around every triangle
-        count = width[part] * (high[part, 1] - low[part, 1] + 1)
-        t = np.repeat(part, count)
-        offset = np.arange(len(t)) - np.repeat(np.cumsum(count) - count, count)
-        x, y = low[t, 0] + offset % width[t], low[t, 1] + offset // width[t]
+    height = np.where((high >= low).all(axis=1) & (np.abs(area) >= 1e-12), high[:, 1] - low[:, 1] + 1, 0)
+    triangle, row = _counted(height)  # most triangles of a fine mesh lie between pixels
+    row += low[triangle, 1]
+    left, right = low[triangle, 0].astype(float), high[triangle, 0].astype(float)
+    # a long triangle has few pixels of its box: in each row those between its edges, and a few more
+    for (px, py), (qx, qy) in (((bx, by), (cx, cy)), ((cx, cy), (ax, ay)), ((ax, ay), (bx, by))):
+        rise = (py - qy)[triangle]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            end = (py[triangle] - row) * qx[triangle] - (qy[triangle] - row) * px[triangle]
+            end = (end - 2 * _ON_EDGE * area[triangle]) / rise
+        left = np.where(rise * area[triangle] > 0, np.maximum(left, np.floor(end) - 1), left)
+        right = np.where(rise * area[triangle] < 0, np.minimum(right, np.ceil(end) + 1), right)
+    width = np.maximum(right - left + 1, 0).astype(int)
+    ends = np.cumsum(width)
+    for part in np.split(np.arange(len(width)), np.flatnonzero(np.diff(ends // _AT_ONCE)) + 1):
+        span, offset = _counted(width[part])
+        t, x, y = triangle[part][span], left[part][span].astype(int) + offset, row[part][span]
         first = ((bx[t] - x) * (cy[t] - y) - (cx[t] - x) * (by[t] - y)) / area[t]
         second = ((cx[t] - x) * (ay[t] - y) - (ax[t] - x) * (cy[t] - y)) / area[t]
         third = 1 - first - second
-        inside = np.minimum(np.minimum(first, second), third) >= -1e-9
+        inside = np.minimum(np.minimum(first, second), third) >= -_ON_EDGE
         here, t, pixel = (
             (first * depth[t, 0] + second * depth[t, 1] + third * depth[t, 2])[inside],
             t[inside],
@@ -76,3 +86,9 @@ def depth_buffer(vertices: Floats, depth: Floats, size: tuple[int, ...]) -> tupl
         won = last[here[last] > nearest[pixel[last]]]
         nearest[pixel[won]], index[pixel[won]] = here[won], t[won]
     return index.reshape(rows, columns), nearest.reshape(rows, columns)
+
+
+def _counted(counts: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the index of every item of groups with some ``counts``, and its place in its group."""
+    index = np.repeat(np.arange(len(counts)), counts)
+    return index, np.arange(len(index)) - np.repeat(np.cumsum(counts) - counts, counts)

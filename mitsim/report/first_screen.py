@@ -8,12 +8,12 @@ part coloured by the worst verdict of its measurements -> picture, its caption w
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Any, Literal
 
 import xarray as xr
-from markupsafe import Markup
 from numpy.typing import ArrayLike
 
 from characterisation.plots.statements import GROUPS
@@ -32,10 +32,11 @@ from characterisation.statements.verdict_words import (
 from characterisation.tasks.covariance import LEAST_CHANCE
 from characterisation.words.numbers import NONE, count, how_many, or_nan, with_degree_signs
 from mitsim.report.first_rows import ResultRow, RowValues, measured_words
-from mitsim.report.placement_figure import face_verdicts, placement_figure
+from mitsim.report.page_pictures import placement_picture
+from mitsim.report.placement_figure import face_verdicts
 from mitsim.report.pose_texts import pose_of_view, pose_words
 from mitsim.report.set_words import with_sets
-from mitsim.report.style import Picture, as_svg
+from mitsim.report.style import Picture
 from mitsim.study.choice_document import TIME_OVER, ChoiceDocument, SensorEntry, judged
 from mitsim.study.choose.table import best_reasons
 from mitsim.study.remedies.entries import remedies_in_words
@@ -53,20 +54,25 @@ Tone = Literal["good", "plain", "warn", "bad"]
 class FirstScreen:
     """Content of the first screen: the ``reasons`` of the result, its ``tone``, rows and picture.
 
-    The picture shows ``poses`` (label, part_from_sensor) and ``verdicts`` by feature. ``trials`` is the largest number
-    of virtual measurements behind a row. ``remedies`` are changes with which the other measurements fit,
+    ``draw`` makes the picture of ``poses`` (label, part_from_sensor) and ``verdicts`` by feature. ``trials`` is the
+    largest number of virtual measurements behind a row. ``remedies`` are changes with which the other measurements fit,
     ``doubts`` are reasons to check the statement.
     """
 
     reasons: Sequence[Reason]
     tone: Tone
     rows: list[ResultRow]
-    picture: Picture | None
+    draw: Callable[[], Picture | None] | None
     poses: list[tuple[str, ArrayLike]]
     verdicts: dict[str, str]
     trials: int = 0
     remedies: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
+
+    @cached_property
+    def picture(self) -> Picture | None:
+        """Return the picture, drawn at the first use: a sheet and the files of a run need none."""
+        return self.draw() if self.draw is not None else None
 
     def words(self, kept: int | None = None) -> str:
         """Return the result in words, by default with all its reasons."""
@@ -156,7 +162,7 @@ def of_run(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
         [Reason(first.says[:1].upper() + first.says[1:]), *reasons],
         tone_of(results) if result.good else "bad",
         [_run_row(run, view_scores, name, measurement) for name, measurement in document.measurements.items()],
-        _picture(geometry, poses, verdicts, _caption(run, document.view)),
+        partial(placement_picture, geometry, poses, verdicts, _caption(run, document.view)),
         poses,
         verdicts,
         max((measurement.trials for measurement in document.measurements.values()), default=0),
@@ -195,7 +201,7 @@ def _without_statement(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
         [Reason(f"View {leader} leads so far, by the performance map {made}; no uncertainty is stated yet")],
         "warn",
         rows,
-        _picture(geometry, poses, verdicts, _caption(run, leader)),
+        partial(placement_picture, geometry, poses, verdicts, _caption(run, leader)),
         poses,
         verdicts,
         about.race_trials,
@@ -242,7 +248,7 @@ def of_choice(
         [*reasons, *map(Reason, filter(None, [lost]))],
         tone_of(results),
         sensor_rows(choice, best),
-        _picture(geometry, poses, verdicts, caption),
+        partial(placement_picture, geometry, poses, verdicts, caption),
         poses,
         verdicts,
         max((cell.trials for cell in best.measurements.values()), default=0),
@@ -330,19 +336,3 @@ def _judged(name: str, measurement: StatedMeasurement) -> Judged:
         measurement.without_value,
         bias=or_nan(measurement.bias),
     )
-
-
-def _picture(
-    geometry: SceneGeometry | None, poses: Sequence[tuple[str, ArrayLike]], verdicts: dict[str, str], caption: str
-) -> Picture | None:
-    if geometry is None or not len(geometry.corners) or not poses:
-        return None
-    by_verdict: dict[str, Any] = {}
-    for name, verdict in verdicts.items():
-        by_verdict.setdefault(verdict, []).append(name)
-    faces = (f"{verdict}: {', '.join(names)}" for verdict, names in by_verdict.items())
-    alt = "The part and the sensor. " + "; ".join(faces)
-    drawn = f"{caption}. Drawn to scale; beside it or below, the part enlarged, from the same viewpoint."
-    # a narrow window shows the second: text would shrink to 4 px in the first
-    both = [as_svg(placement_figure(geometry, poses, verdicts, stacked), alt) for stacked in (False, True)]
-    return Picture(Markup('<div class="wide">{}</div><div class="narrow">{}</div>').format(*map(Markup, both)), drawn)

@@ -7,11 +7,12 @@ inline SVG or PNG, and captions.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup
+from numpy.typing import ArrayLike
 
 from characterisation.plots.discs import NOISE_PERCENTILES, noise_limits
 from characterisation.point_cloud import Status
@@ -19,11 +20,13 @@ from characterisation.words.numbers import count, finish_name, listed, percent, 
 from mitsim.report import figures, findings
 from mitsim.report.agreement import CHANCE, CONFIRMED, TOO_FEW, Agreement, chance_level
 from mitsim.report.cloud_figures import REASONS, camera_images, cloud_figure
+from mitsim.report.placement_figure import placement_figure
 from mitsim.report.pose_texts import angles_in_words, pose_of_view
 from mitsim.report.style import Picture, as_svg
 from mitsim.report.view_data import LIMITS
 from mitsim.report.view_figures import agreement_figure, uncertainty_figure
 from mitsim.study.run_folder import Run
+from mitsim.study.scene_geometry import SceneGeometry
 
 
 def _picture(figure: Any, alt: str, caption: str) -> Picture:
@@ -149,3 +152,32 @@ def cloud_picture(run: Run, view: int) -> Picture:
     )
     alt = f"Depth and status of the predicted and the decoded cloud. {caption}"
     return _picture(cloud_figure(predicted, decoded), alt, caption)
+
+
+def placement_picture(
+    geometry: SceneGeometry | None, poses: Sequence[tuple[str, ArrayLike]], verdicts: Mapping[str, str], caption: str
+) -> Picture | None:
+    """Return the picture of a page, wide and narrow, with its caption; None without a part or a pose.
+
+    Parameters
+    ----------
+    geometry, poses, verdicts
+        As of :func:`mitsim.report.placement_figure.draw_placement`.
+    caption
+        Words on sensor and pose.
+
+    See Also
+    --------
+    mitsim.report.placement_figure.placement_figure : one of both figures
+    """
+    if geometry is None or not len(geometry.corners) or not poses:
+        return None
+    by_verdict: dict[str, Any] = {}
+    for name, verdict in verdicts.items():
+        by_verdict.setdefault(verdict, []).append(name)
+    faces = (f"{verdict}: {', '.join(names)}" for verdict, names in by_verdict.items())
+    alt = "The part and the sensor. " + "; ".join(faces)
+    drawn = f"{caption}. Drawn to scale; beside it or below, the part enlarged, from the same viewpoint."
+    # a narrow window shows the second: text would shrink to 4 px in the first
+    both = [as_svg(placement_figure(geometry, poses, verdicts, stacked), alt) for stacked in (False, True)]
+    return Picture(Markup('<div class="wide">{}</div><div class="narrow">{}</div>').format(*map(Markup, both)), drawn)

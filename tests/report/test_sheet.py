@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from characterisation.files.atomic_io import write_netcdf
 from characterisation.statements.statement import AT_THE_LIMIT
 from characterisation.tasks.decision_table import Decision as TaskDecision
+from mitsim.report import page_pictures
 from mitsim.report.choice_page import write_choice_page
 from mitsim.report.declaration import pose_in_full, read_declaration
 from mitsim.report.page import write_report
@@ -248,6 +249,17 @@ def test_a_sheet_is_one_page_of_pdf_and_the_same_at_every_call(run_folder, tmp_p
     first = write_sheet(folder).read_bytes()
     assert first.startswith(b"%PDF") and len(re.findall(rb"/Type /Page\b", first)) == 1
     assert write_sheet(folder).read_bytes() == first
+
+
+def test_a_sheet_draws_no_picture_of_the_page(run_folder, tmp_path, monkeypatch):
+    """Sheet, DCC and QIF drew the first picture of the page twice, and threw it away: 15 of 25 s for a bracket."""
+    folder, drawn = shutil.copytree(run_folder, tmp_path / "run"), []
+    draw = page_pictures.placement_figure
+    monkeypatch.setattr(page_pictures, "placement_figure", lambda *given: drawn.append(given) or draw(*given))
+    write_sheet(folder)
+    assert not drawn
+    write_report(folder)
+    assert len(drawn) == 2  # for wide and for narrow windows
 
 
 def test_the_sheet_of_a_comparison_has_the_statement_of_the_best_sensor(tmp_path):
