@@ -272,11 +272,11 @@ def _influences(document: StatementDocument, lay_open: bool) -> list[tuple[str, 
     idle |= set() if _is_sprayed(document) else {"coat"}
     drawn = {group: table for group, table in document.unknowns.items() if group not in idle}
     out = [
-        ("Varied", ", ".join(_names(varied) + marks * document.draws_lay)),
+        ("Varied", "; ".join(_names(varied) + marks * document.draws_lay)),
         ("Sizes (σ or range)", unknowns_in_words(drawn)),
     ]
-    out += [("Fixed", ", ".join(_names(fixed)))] if fixed else []
-    return [*out, ("Left out", ", ".join(missing))]
+    out += [("Fixed", "; ".join(_names(fixed)))] if fixed else []
+    return [*out, ("Left out", "; ".join(missing))]
 
 
 def _names(influences: Sequence[InfluenceEntry]) -> list[str]:

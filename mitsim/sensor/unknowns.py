@@ -9,6 +9,7 @@ docs/reference/unknowns.md grades each of them.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
@@ -131,6 +132,12 @@ class FinishUnknowns(Document):
         measured = self.measured.get(finish, MeasuredFinish())
         names = MeasuredFinish.model_fields
         return {name: getattr(measured, name) or (0.0, float(getattr(self, name))) for name in names}
+
+    def of_finishes(self, names: Iterable[str]) -> FinishUnknowns:
+        """Return the same without what no finish of some names can have: a matt white has a reflectance alone."""
+        if set(names) != {"matt_white"}:
+            return self
+        return self.model_copy(update=dict.fromkeys(MeasuredFinish.model_fields.keys() - {"reflectance"}, 0.0))
 
     @property
     def varies(self) -> bool:

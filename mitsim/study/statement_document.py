@@ -9,6 +9,7 @@ from typing import Any
 from characterisation.files.atomic_io import json_values
 from characterisation.statements.statement import Statement
 from characterisation.words.version import __version__
+from mitsim.sensor.pattern import DotPattern
 from mitsim.study.maker_accuracy import maker_sigma
 from mitsim.study.session import Session
 from mitsim.study.virtual.influences import influences
@@ -20,18 +21,21 @@ def statement_document(session: Session, stated: StatedView) -> dict[str, Any]:
     """Return the statement as JSON values; see docs/reference/formats/statement.md."""
     study, unknowns, view = session.study, session.unknowns, stated.view
     flight = study.sensor.technology == "time_of_flight"
+    table = unknowns.table.model_copy(
+        update={
+            "temperature": unknowns.table.temperature.model_copy(update={"expansion_per_kelvin": unknowns.expansion}),
+            "calibration": unknowns.table.calibration.of_kind(flight),
+            "finish": unknowns.table.finish.of_finishes(finish.name for finish in study.scene.finishes if finish),
+        }
+    )
     declared = influences(
-        unknowns.table,
+        table,
         session.source,
         study.file.measure.light_path_depth,
         "coat" in unknowns.varied,
         flight,
+        isinstance(study.sensor.pattern, DotPattern),
     )
-    kelvin = {"expansion_per_kelvin": unknowns.expansion}
-    used = {
-        "temperature": unknowns.table.temperature.model_copy(update=kelvin),
-        "calibration": unknowns.table.calibration.of_kind(flight),
-    }
     exposed = {} if stated.planned is None else {"exposure": asdict(stated.planned)}
     return exposed | {
         "schema_version": 1,
@@ -45,7 +49,7 @@ def statement_document(session: Session, stated: StatedView) -> dict[str, Any]:
         "world_from_sensor": view.world_from_sensor.matrix().tolist(),
         "coverage_probability": 0.95,
         "calibration": unknowns.calibration.source,
-        "unknowns": unknowns.table.model_copy(update=used).model_dump(mode="json"),
+        "unknowns": table.model_dump(mode="json"),
         "measurements": {
             statement.measurement: _measurement(statement)
             | {"maker_sigma": maker_sigma(study.sensor, study.task.measurements[statement.measurement], view.standoff)}

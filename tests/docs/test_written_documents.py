@@ -38,7 +38,8 @@ def stated():
 def test_keys_of_a_statement(stated):
     study = SimpleNamespace(
         path=Path("study.toml"),
-        sensor=SimpleNamespace(name="ensenso-n10", technology="active_stereo"),
+        sensor=SimpleNamespace(name="ensenso-n10", technology="active_stereo", pattern=None),
+        scene=SimpleNamespace(finishes=[]),
         performance_map=None,
         file=SimpleNamespace(seed=1, measure=SimpleNamespace(light_path_depth=2)),
         task=SimpleNamespace(measurements={"radius": SimpleNamespace(unit="deg")}),

@@ -23,7 +23,7 @@ from mitsim.report.page import write_report
 from mitsim.report.sheet import sheet_figures, write_sheet
 from mitsim.report.sheet_layout import text_width, wrapped
 from mitsim.report.unknowns_words import unknowns_in_words
-from mitsim.sensor.unknowns import MeasuredFinish
+from mitsim.sensor.unknowns import MeasuredFinish, UnknownsTable
 from mitsim.study.choice_document import PoseEntry
 from mitsim.study.scene_geometry import read_scene_geometry
 from mitsim.study.statement_file import read_statement
@@ -169,7 +169,7 @@ def test_a_sheet_has_what_iso_ts_15530_4_and_jcgm_101_ask_for(run_folder, tmp_pa
     declaration = read_declaration(folder, None)
     facts = dict(declaration.facts)
     assert facts["Varied"] == "noise" and facts["Fixed"] == "form" and facts["Left out"] == "coatings"
-    assert facts["Sizes (σ or range)"] == "pose: placement 1 mm"
+    assert facts["Sizes (σ or range)"] == "pose, for each axis: position of the part 1 mm"
     assert {"Part", "Sensor", "Pose of the sensor", "Method", "Calibration", "Exposure", "Decision rule"} <= set(facts)
     assert "not by a metal part with calibrated values" in facts["Verified by"]
     assert "200 virtual measurements" in facts["Method"] and "seed 7" in facts["Made with"]
@@ -324,7 +324,7 @@ def test_sizes_of_unknowns_have_units_and_meanings():
     table = {
         "calibration": {"covariance": "rig.nc", "vergence_mrad": 0.24, "scale": 1.0},
         "temperature": {"body_per_kelvin": 2.3e-5, "part_kelvin": 1.0, "expansion_per_kelvin": None},
-        "finish": {"alpha": 1.0, "measured": {}},
+        "finish": {"alpha": 1.0, "lay": 0.5, "measured": {}},
         "form": {"features": {"plane": 0.02, "pin": 0.0}},
         "light": {"room": "office", "daylight": 0.2},
         "unit": {},
@@ -332,27 +332,51 @@ def test_sizes_of_unknowns_have_units_and_meanings():
         "coat": {"thickness_um": [5.0, 20.0], "spread": 0.3},
     }
     assert unknowns_in_words(table).split("; ") == [
-        "calibration: vergence 0.24 mrad",
-        "temperature: body 2.3e-05 per K, part 1 K",
-        "finish, shares of its range: alpha 1",
-        "form: plane 0.02 mm",
-        "light: room office, daylight 0.2 of it",
-        "coat: thickness 5 to 20 µm, spread 0.3 relative",
-        "decoder: drawn from the ranges in statement.json",
+        "drift since the calibration: vergence 0.24 mrad",
+        "finish, each over the known spread of such surfaces: width of the lobe, lay (0.5 of it)",
+        "form deviation: plane 0.02 mm",
+        "light: room of 500 lx (office), 20 % of it daylight",
+        "temperature: part 1 K about 20 °C, expansion of the sensor 23 × 10⁻⁶ per K",
+        "coat: mean thickness 5 to 20 µm, 30 % from place to place",
+        "decoder: settings within the ranges in statement.json",
     ]
     assert unknowns_in_words({"calibration": {"scale": 0.5}, "decoder": {"known": True}}) == (
-        "calibration: scale 0.5 times all of these"
-    )
-    assert unknowns_in_words({"calibration": {"vergence_mrad": 0.2, "scale": 0.0}}) == (
-        "calibration: vergence 0.2 mrad, scale 0 times all of these"
+        "drift since the calibration: 0.5 times all of these and the errors of the calibration itself"
     )
     plate = MeasuredFinish(alpha=(1.4, 0.2), wide_angle=(-0.5, 0)).model_dump(mode="json")
-    assert unknowns_in_words({"finish": {"alpha": 0.0, "measured": {"plate": plate}}}) == (
-        "finish, shares of its range: alpha of plate 1.4 ± 0.2, wide angle of plate -0.5 ± 0"
+    assert unknowns_in_words({"finish": {"alpha": 0.0, "measured": {"plate": plate}}}).endswith(
+        ": width of the lobe of plate 1.4 ± 0.2 σ, light at wide angles of plate -0.5 ± 0 σ"
     )
     dark = {"room_factor": 1.6, "daylight": 0.2, "power_relative": 0.05}
-    assert unknowns_in_words({"light": {"room": 0.0} | dark}) == "light: power 0.05 relative"
-    assert unknowns_in_words({"light": {"room": "dark cell"} | dark}) == "light: room dark cell, power 0.05 relative"
+    assert unknowns_in_words({"light": {"room": 0.0} | dark}) == (
+        "light: no light of the room, power of the projector 5 %"
+    )
+    assert "no light of the room (dark cell), power" in unknowns_in_words({"light": {"room": "dark cell"} | dark})
+
+
+def test_every_unknown_has_a_size_in_words():
+    """The sheet gave keys: "finish, shares of its range: alpha 1", "room factor 1.6", "body 2.3e-05 per K"."""
+    table = UnknownsTable().model_dump(mode="json")
+    table["calibration"]["path_offset_mm"], table["light"]["exposure_relative"] = 1.0, 0.01
+    table["form"]["features"], table["temperature"]["expansion_per_kelvin"] = {"plane": 0.02}, 1e-5
+    words = unknowns_in_words(table)
+    for group, keys in table.items():
+        for key, value in keys.items() if group not in ("decoder", "unit") else ():
+            if key != "measured" and value:
+                changed = table | {
+                    group: keys
+                    | {
+                        key: 2.0
+                        if key == "scale"
+                        else [0, 0]
+                        if key == "thickness_um"
+                        else {}
+                        if key == "features"
+                        else 0
+                    }
+                }
+                assert (unknowns_in_words(changed) == words) == (key == "covariance"), key
+    assert "_" not in words.replace("statement.json", "")
 
 
 @pytest.mark.parametrize(("spray", "shown"), [("thickness of the spray on the part", True), ("dirt, oil", False)])

@@ -25,12 +25,35 @@ class Influence:
     simulated: bool = True
 
 
+#: keys of a finish that are drawn, in words
+_OF_FINISH = {
+    "alpha": "width of the lobe",
+    "tail": "its tail",
+    "wide_angle": "light at wide angles",
+    "reflectance": "reflectance",
+    "lay": "lay, and its direction where it is not given",
+}
+
+#: how an influence is fixed in a map
+_AS_COUPONS = "as during the characterisation"
+
+#: how an influence is fixed whose unknown is 0
+_NOMINAL = "nominal: [unknowns] gives it no size"
+
+#: how an influence is included that every trial draws
+_ANEW = "drawn anew in every virtual measurement"
+
 #: how a statement from a map includes effects outside the map
 _OTHER_PARTS = "not in the map; drawn with the size found on other parts, see effects outside the map"
 
 
 def influences(
-    table: UnknownsTable, source: str, depth: int, sprayed: bool = False, flight: bool = False
+    table: UnknownsTable,
+    source: str,
+    depth: int,
+    sprayed: bool = False,
+    flight: bool = False,
+    dots: bool = False,
 ) -> list[Influence]:
     """Return the influences of a statement.
 
@@ -46,9 +69,14 @@ def influences(
         Whether a face of the part has a coat.
     flight
         Whether the sensor measures time of flight.
+    dots
+        Whether it projects a mask of random dots.
     """
     rendered = source == "render"
     form, pose, temperature, light = table.form.features, table.pose, table.temperature, table.light
+    finish = [words for key, words in _OF_FINISH.items() if getattr(table.finish, key) > 0]
+    finish += ["measured values"] * bool(table.finish.measured)
+    mask = "another" if table.unit.mask == "another" else "that of the sensor file"
     drift = [(TRIANGULATION_DRIFT | FLIGHT_DRIFT)[key] for key in table.calibration.drifting(flight)]
     low, high = table.coat.thickness_um
     coat = f"drawn: mean thickness {low:g} to {high:g} um, {100 * table.coat.spread:.0f} % from place to place"
@@ -63,15 +91,15 @@ def influences(
             bool(drift),
             f"drawn: {', '.join(drift)}" if drift else "none: the sensor is calibrated just before",
         ),
-        Influence("temperature of the sensor", temperature.sensor_kelvin > 0, "drawn; expands the baseline evenly"),
-        Influence("temperature of the part", temperature.part_kelvin > 0, "drawn; expands the part evenly"),
+        _drawn("temperature of the sensor", temperature.sensor_kelvin, "drawn; expands the baseline evenly"),
+        _drawn("temperature of the part", temperature.part_kelvin, "drawn; expands the part evenly"),
         Influence(
             "temperature gradients and warming up", False, "let the sensor warm up, and measure its drift", False
         ),
         Influence(
             "finish of the part",
             not rendered or table.finish.varies,
-            "drawn: width and tail of the lobe, wide-angle share, reflectance, and a lay that is not given"
+            (f"drawn: {', '.join(finish)}" if finish else _NOMINAL)
             if rendered
             else "drawn from errors and spread of the map; the finish is that of the map",
         ),
@@ -79,7 +107,7 @@ def influences(
             "form of the part",
             any(size > 0 for size in form.values()),
             "drawn for the features with a value"
-            if form
+            if any(size > 0 for size in form.values())
             else "give [unknowns.form] for the features whose form is not negligible",
         ),
         Influence(
@@ -89,41 +117,47 @@ def influences(
             if rendered
             else "as during the characterisation of the sensor",
         ),
-        Influence("power of the projector", rendered and light.power_relative > 0, "drawn"),
-        Influence(
-            "step of the exposure",
-            rendered and light.exposure_relative > 0,
-            f"drawn within {100 * light.exposure_relative:g} %" if rendered else "as during the characterisation",
-        ),
-        Influence("position of the part", pose.placement_mm > 0 or pose.placement_deg > 0, "drawn anew in every trial"),
-        Influence("error of the assumed pose", pose.told_mm > 0 or pose.told_deg > 0, "drawn anew in every trial"),
-        Influence("noise of the imager, speckle", True, "drawn anew in every trial"),
-        Influence(
-            "fixed pattern and mask of dots of another unit",
+        _drawn("power of the projector", light.power_relative, "drawn", rendered),
+        _drawn(
+            "resolution of the exposure setting",
+            light.exposure_relative,
+            f"drawn within {100 * light.exposure_relative:g} %",
             rendered,
-            ("drawn" if table.unit.mask == "another" else "drawn; the mask is that of the sensor file")
-            if rendered
-            else "that of the unit that the map was made with",
+        ),
+        _drawn("position of the part", max(pose.placement_mm, pose.placement_deg), _ANEW),
+        _drawn("error of the assumed pose of the part", max(pose.told_mm, pose.told_deg), _ANEW),
+        Influence("noise of the imager and speckle", True, _ANEW),
+        Influence(
+            f"fixed pattern of the imager{' and mask of dots' * dots} of another unit",
+            rendered,
+            f"drawn{f'; mask: {mask}' * dots}" if rendered else "that of the unit that the map was made with",
         ),
         Influence(
             "interreflections",
             not rendered or depth > 1,
-            f"rendered, up to {depth} surfaces on a path" if rendered else _OTHER_PARTS,
+            (f"rendered, up to {depth} surfaces on a path" if depth > 1 else "none: one surface on a path")
+            if rendered
+            else _OTHER_PARTS,
         ),
         Influence("edges and curved faces", True, "rendered and decoded" if rendered else _OTHER_PARTS),
         Influence(
-            "the maker's own software",
+            "decoding software of the maker",
             rendered and not table.decoder.known,
             "drawn from decoders within published ranges; compare with captures of your unit"
             if rendered and not table.decoder.known
             else "mitsim decodes with the settings of the sensor file; compare with captures of your unit",
             rendered,
         ),
-        Influence("vibration, motion during a capture", False, "hold the sensor and the part still", False),
+        Influence("vibration and motion during a capture", False, "hold the sensor and the part still", False),
         *([Influence("thickness of the spray on the part", True, coat)] if sprayed else []),
         Influence(
-            "dirt, oil, other coats, marks on the part", False, "clean the part as for the characterisation", False
+            "dirt, oil, marks and other coats on the part", False, "clean the part as for the characterisation", False
         ),
         Influence("deformation by clamping", False, "clamp as in use", False),
         Influence("datums and choice of features", False, "the task is assumed to agree with the drawing", False),
     ]
+
+
+def _drawn(name: str, size: float, how: str, rendered: bool = True) -> Influence:
+    """Return an influence that is drawn if it has a size, or else nominal; in a map it is that of the coupons."""
+    return Influence(name, rendered and size > 0, (how if size > 0 else _NOMINAL) if rendered else _AS_COUPONS)

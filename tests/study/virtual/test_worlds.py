@@ -112,8 +112,9 @@ def test_exposures_that_are_drawn_are_listed(name, included):
     unknowns = Unknowns(table, sensor.rig, nothing, 850.0, 0.0, np.zeros(3), 7)
     assert (np.ptp([unknowns.draw(Trial(day)).exposure for day in range(9)]) > 0) == included
     for source in ("render", "map"):
-        listed = {one.name: one for one in influences(table, source, 1)}["step of the exposure"]
+        listed = {one.name: one for one in influences(table, source, 1)}["resolution of the exposure setting"]
         assert listed.included == (included and source == "render") and listed.simulated
+        assert listed.how.startswith("drawn") == listed.included  # it was "drawn within 0 %"
 
 
 def drift_in_order(drawn):
