@@ -63,13 +63,16 @@ _MOST_VIEWS = 8
 _SEARCH_S = 5.0
 
 
-def changes(now: Shortfall) -> Iterator[Change]:
-    """Yield the changes with which some measurement that is missed can fit, the least effort first."""
+def changes(now: Shortfall, short: bool = False) -> Iterator[Change]:
+    """Yield the changes with which some measurement that is missed can fit, the least effort first.
+
+    If time is ``short``, the spray comes before all that need virtual measurements: it acts on all errors of the light,
+    which are most of those of a bare part, and other views share them.
+    """
+    first = (_spray, _views, _nearer) if short else (_views, _nearer, _spray)
     proposals: Sequence[Callable[[Shortfall], Iterator[Change]]] = (
         _bias,
-        _views,
-        _nearer,
-        _spray,
+        *first,
         _exposure,
         _repeats,
         _room,

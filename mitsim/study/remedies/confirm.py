@@ -170,9 +170,9 @@ def _without_sensors(remedies: Remedies) -> Remedies:
     return replace(remedies, untried=[*(entry for entry in remedies.untried if entry.change != "sensor"), sensors])
 
 
-def all_changes(now: Shortfall, limit: TimeLimit) -> Iterator[Change]:
-    """Yield the changes of a study that may help, the least effort first; other sensors come last."""
-    yield from changes(now)
+def all_changes(now: Shortfall, limit: TimeLimit, short: bool = False) -> Iterator[Change]:
+    """Yield the changes of a study that may help, as :func:`changes`; other sensors come last."""
+    yield from changes(now, short)
     yield from other_sensors(now, limit.part(_SCREENING_SHARE))
 
 

@@ -1,8 +1,9 @@
 """Share the time after the race between the statement and the changes with which its measurements would fit.
 
-Signal chain: statement of the best view from its share of the time -> while a verdict is open, changes of the same
-sensor within half of the time, then the statement until every verdict is decided -> the changes that are left, other
-sensors the last -> the statement until it is settled, with the time that is left.
+Signal chain: statement of the best view from its share of the time -> while a verdict is open, the statement within
+half of the time until a measurement is missed, changes of the same sensor within half of the rest, then the statement
+until every verdict is decided -> the changes that are left, other sensors the last -> the statement until it is
+settled, with the time that is left.
 
 Verdicts come before other sensors, because those need the most time: each is prepared, screened and compiled.
 """
@@ -23,7 +24,8 @@ from mitsim.study.session import Session
 from mitsim.study.statement_document import statement_document
 from mitsim.study.virtual.stated import StatedView
 
-#: share of the time that is left which changes may take while a verdict is open
+#: share of the time that is left which changes may take while a verdict is open, and before it the statement if it
+#: misses nothing yet; chosen
 _SHARE_WHILE_OPEN = 0.5
 
 #: goes on with a statement within a limit, until a function of the statement so far returns that it is enough
@@ -66,7 +68,8 @@ def state_and_mend(
         shortfall = replace(now, stated=stated)
         if not shortfall.missed or not seeks_remedies(session.study):
             return before
-        proposed = all_changes(shortfall, within) if sensors else changes(shortfall)
+        short = limit.end is not None
+        proposed = all_changes(shortfall, within, short) if sensors else changes(shortfall, short)
         made = max((statement.trials for statement in stated.statements), default=0)
         trial_s = clock.steps.get("state", 0.0) / made if made else 0.0
         tried = find_remedies(shortfall.missed, proposed, table.trials, within, before, trial_s)
@@ -94,8 +97,12 @@ def in_turn(stated: StatedView, state: Stating, mend: Mending, limit: TimeLimit)
     """
     remedies, all_tried = None, False
     if not _decided(stated):
+        if not missed_by(stated):
+            share = limit.part(_SHARE_WHILE_OPEN)
+            stated = state(share, lambda now: _decided(now) or bool(missed_by(now)))
         remedies = mend(stated, None, limit.part(_SHARE_WHILE_OPEN), False)
-        stated = state(limit, _decided)
+        if not _decided(stated):
+            stated = state(limit, _decided)
     if missed_by(stated) and not limit.over():
         remedies, all_tried = mend(stated, remedies, limit, True), True
     if not limit.over():

@@ -26,7 +26,9 @@ def played(verdicts: list[tuple[str, ...]], seconds: float = 100.0) -> tuple[lis
 
     def state(limit: TimeLimit, enough: Callable[[StatedView], bool]) -> StatedView:
         decisive = enough(stated(*GOOD)) and not enough(stated(*OPEN))
-        done.append(f"state {'until decided' if decisive else 'on'}, {limit.left:.0f} s")
+        missing = decisive and enough(stated("does not fit", "not decided"))
+        until = "until missed" if missing else "until decided" if decisive else "on"
+        done.append(f"state {until}, {limit.left:.0f} s")
         return stated(*next(left))
 
     def mend(now: Any, before: Remedies | None, limit: TimeLimit, sensors: bool) -> Remedies | None:
@@ -47,16 +49,23 @@ def test_decided_verdicts_leave_their_time_to_changes_of_all_kinds() -> None:
 
 
 def test_a_measurement_that_fits_after_all_needs_no_change() -> None:
-    done, remedies = played([OPEN, GOOD, GOOD])
+    done, remedies = played([("fits", "not decided", "does not fit"), GOOD, GOOD])
     assert [one.split(",")[0] for one in done] == ["changes", "state until decided", "state on"]
     assert remedies is None
 
 
+def test_a_statement_that_misses_nothing_yet_leaves_time_to_changes() -> None:
+    """Of a bare bracket it took all time: all were open after the first trials, and no change was tried."""
+    done, remedies = played([OPEN, ("does not fit", "not decided"), MISSED, MISSED])
+    assert done[:3] == ["state until missed, 50 s", "changes, 50 s", "state until decided, 100 s"]
+    assert remedies is not None and list(remedies.missed) == ["m1"]
+
+
 def test_what_was_not_tried_for_lack_of_time_is_named() -> None:
-    done, remedies = played([OPEN, MISSED], seconds=0.0)
+    done, remedies = played([("does not fit", "not decided"), ("does not fit", "does not fit")], seconds=0.0)
     assert [one.split(",")[0] for one in done] == ["changes", "state until decided"]
     assert remedies is not None
     assert [(one.words, one.measurements) for one in remedies.untried] == [
         ("any change", ["m1"]),
-        ("with another sensor", ["m1"]),
+        ("with another sensor", ["m0", "m1"]),
     ]
