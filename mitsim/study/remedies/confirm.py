@@ -29,7 +29,8 @@ from mitsim.study.remedies.sensors import other_sensors
 #: first trials of a change, and those of the next steps while a verdict is open, over the trials of the study's table
 _STEPS = (0.25, 1.0, 4.0)
 
-#: share of the time that is left which one change may take, so that later ones have a chance
+#: share of the time that is left which one change may take, so that later ones have a chance, unless the fewest trials
+#: need more; chosen
 _CHANGE_SHARE = 0.5
 
 #: share of the time that is left for screening other sensors
@@ -101,8 +102,7 @@ def find_remedies(
     before
         What was tried before. It is not tried again, and is part of the result.
     trial_s
-        Expected time of a virtual measurement [s]: a change whose share of the time is too short for the fewest is not
-        tried.
+        Expected time of a virtual measurement [s]: a change that time does not suffice for the fewest of is not tried.
     """
     earlier = Remedies(missed) if before is None else before
     remedies, limit = Remedies(missed, list(earlier.tried), list(earlier.failed)), limit or TimeLimit()
@@ -120,8 +120,9 @@ def find_remedies(
         if not wanted or change.words in done:
             continue
         untried = UntriedChange(change=change.kind, words=change.words, measurements=wanted)
-        change_limit = limit.part(_CHANGE_SHARE)
-        if change_limit.left <= (_FEWEST * trial_s if change.needs_trials else 0.0):
+        needed_s = _FEWEST * trial_s if change.needs_trials else 0.0
+        change_limit = limit.part(_CHANGE_SHARE if _CHANGE_SHARE * limit.left > needed_s else 1.0)
+        if change_limit.left <= needed_s:
             remedies.untried.append(untried)
             continue
         began = time.monotonic()

@@ -57,11 +57,18 @@ def state_and_mend(
     clock
         Times of the steps of the run.
     """
+    made = _trials(now.stated)
+    trial_s = clock.steps.get("state", 0.0) / made if made else 0.0
 
     def state(within: TimeLimit, enough: Callable[[StatedView], bool]) -> StatedView:
+        nonlocal made, trial_s
+        before = clock.steps.get("state", 0.0)
         longer = session.state(now.stated.view, None, within, enough)
         write_json(session.folder / "statement.json", statement_document(session, longer))
         clock.lap("state")
+        if _trials(longer) > made:  # the first trials had to prepare the view, too
+            trial_s = min(trial_s, (clock.steps["state"] - before) / (_trials(longer) - made))
+            made = _trials(longer)
         return longer
 
     def mend(stated: StatedView, before: Remedies | None, within: TimeLimit, sensors: bool) -> Remedies | None:
@@ -70,8 +77,6 @@ def state_and_mend(
             return before
         short = limit.end is not None
         proposed = all_changes(shortfall, within, short) if sensors else changes(shortfall, short)
-        made = max((statement.trials for statement in stated.statements), default=0)
-        trial_s = clock.steps.get("state", 0.0) / made if made else 0.0
         tried = find_remedies(shortfall.missed, proposed, table.trials, within, before, trial_s)
         clock.lap("remedies")
         return tried
@@ -108,6 +113,10 @@ def in_turn(stated: StatedView, state: Stating, mend: Mending, limit: TimeLimit)
     if not limit.over():
         stated = state(limit, lambda _: False)
     return stated, of_missed(remedies, missed_by(stated), all_tried)
+
+
+def _trials(stated: StatedView) -> int:
+    return max((statement.trials for statement in stated.statements), default=0)
 
 
 def _decided(stated: StatedView) -> bool:
