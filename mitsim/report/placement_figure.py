@@ -21,6 +21,7 @@ from matplotlib.figure import Figure, FigureBase
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
+from matplotlib.transforms import offset_copy
 from numpy.typing import ArrayLike, NDArray
 
 from characterisation.files.arrays import Floats
@@ -55,6 +56,9 @@ _ASIDE_DEG = 62.0
 
 #: minimum elevation of the viewpoint [deg]; chosen
 _LOWEST_DEG = 18.0
+
+#: length of the axes of the part [pt]: their heads and names do not shrink in a low picture of a full sheet; chosen
+_AXES_PT = 16.0
 
 #: largest number of times that a picture is widened for its texts: it shrinks, and they do not
 _WIDENINGS = 12
@@ -279,16 +283,24 @@ def _labels(axes: Axes, geometry: SceneGeometry, flat: Floats, depth: Floats, ve
 
 def _axes_of_part(axes: Axes, turn: Floats) -> None:
     """Draw the directions x, y and z of the part below it, each as long as it appears from the viewpoint."""
-    (low, high), (bottom, top) = axes.get_xlim(), axes.get_ylim()
-    size = 0.07 * (high - low)
-    origin = np.array([(low + high) / 2, bottom - 1.3 * size])
+    (low, high), bottom = axes.get_xlim(), axes.get_ylim()[0]
+
+    def at(place: Floats) -> Any:
+        return offset_copy(axes.transData, axes.figure.figure, float(place[0]), float(place[1]), "points")
+
+    below, origin = ((low + high) / 2, bottom), np.array([0.0, -1.4 * _AXES_PT])
     for number, name in enumerate("xyz"):
-        tip = origin + size * turn[:2, number]
-        axes.annotate("", tuple(tip), tuple(origin), arrowprops={"arrowstyle": "->", "color": MUTED, "lw": 1.0})
-        way = tip - origin
-        beyond = tip + 0.35 * size * way / max(float(np.linalg.norm(way)), 0.2 * size)
-        axes.text(float(beyond[0]), float(beyond[1]), name, ha="center", va="center", fontsize=8, color=MUTED)
-    axes.set_ylim(bottom - 2.6 * size, top)
+        way = _AXES_PT * turn[:2, number]
+        axes.annotate(
+            "",
+            below,
+            below,
+            xycoords=at(origin + way),
+            textcoords=at(origin),
+            arrowprops={"arrowstyle": "->", "color": MUTED, "lw": 1.0, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 8},
+        )
+        beyond = origin + way + 5.0 * way / max(float(np.linalg.norm(way)), 0.2 * _AXES_PT)
+        axes.text(*below, name, transform=at(beyond), ha="center", va="center", fontsize=8, color=MUTED)
 
 
 def _make_room_for_texts(axes: Axes) -> None:

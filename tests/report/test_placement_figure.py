@@ -114,6 +114,24 @@ def test_the_legend_of_a_small_picture_touches_no_part_of_it(tmp_path, height):
     assert len(boxes) > 10 and min(box.y0 for box in boxes) >= legend.y1
 
 
+def test_the_axes_of_the_part_keep_their_size_in_a_low_picture(tmp_path):
+    """On a full sheet the heads of x and y ran into one another, beside names that overlapped."""
+    write_scene_geometry(tmp_path)
+    geometry = read_scene_geometry(tmp_path)
+    pose, spreads = np.diag([1.0, -1.0, -1.0, 1.0]), []
+    pose[2, 3] = 500.0
+    for height in (1.4, 3.4):
+        figure = Figure((7.27, height))
+        draw_placement(figure, geometry, [("view 3", pose)], dict.fromkeys(geometry.names, "fits"))
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        names = [one for axes in figure.axes for one in axes.texts if one.get_text() in "xyz" and one.get_text()]
+        boxes = [one.get_window_extent(canvas.get_renderer()) for one in names]
+        spreads.append([box.x0 - boxes[0].x0 for box in boxes] + [box.y0 - boxes[0].y0 for box in boxes])
+    assert len(names) == 3 and np.abs(np.subtract(*spreads)).max() < 1.0
+    assert max(spreads[0]) - min(spreads[0]) > 15
+
+
 def test_of_many_triangles_each_pixel_shows_the_nearest():
     rng = np.random.default_rng(7)
     corners = rng.uniform(-5, [35, 25], (60, 1, 2)) + rng.normal(0, 6, (60, 3, 2))
