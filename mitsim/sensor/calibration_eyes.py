@@ -1,7 +1,6 @@
 """Find the cameras and the projector of a calibration whose values stand in maps, as programs write YAML and JSON.
 
-Signal chain: maps of one file, nested in any way -> eyes: each map that has a camera matrix -> values in OpenCV's form
-under names that begin with a plus.
+Signal chain: nested maps of one file -> eyes, the maps with a camera matrix -> values in OpenCV's form, names with +.
 
 A camera matrix is a matrix under a usual name (:mod:`mitsim.sensor.calibration_names`); or the single numbers ``fx``,
 ``fy``, ``cx``, ``cy`` (``ppx``, ``ppy`` of librealsense); or two lists, such as ``focal_length`` and

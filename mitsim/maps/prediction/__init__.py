@@ -13,6 +13,7 @@ Not included: clusters of lost points, since the map has only their share F, and
 """
 
 from mitsim.maps.prediction.characterised_scene import CharacterisedScene
+from mitsim.maps.prediction.ideal import Ideal
 from mitsim.maps.prediction.perturbation import Effect, Perturbation, SceneView, together
 from mitsim.maps.prediction.point_statistics import (
     ViewPoints,
@@ -21,7 +22,7 @@ from mitsim.maps.prediction.point_statistics import (
     map_answers,
     performance,
 )
-from mitsim.maps.prediction.predictor import EDGE_MARGIN_PX, Ideal, Predicted, Predictor, surfaces_of
+from mitsim.maps.prediction.predictor import EDGE_MARGIN_PX, Predicted, Predictor, surfaces_of
 
 __all__ = [
     "EDGE_MARGIN_PX",

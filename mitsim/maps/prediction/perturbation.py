@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from characterisation.files.arrays import Floats
-from mitsim.maps.prediction.predictor import Ideal
+from mitsim.maps.prediction.ideal import Ideal
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.raycast import Surfaces
 from mitsim.sensor.transforms import Transform

@@ -27,6 +27,7 @@ from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.region_of_interest import Roi
 from mitsim.decoding.cloud import Geometry
 from mitsim.maps.prediction.characterised_scene import CharacterisedScene
+from mitsim.maps.prediction.ideal import Ideal
 from mitsim.maps.prediction.noise_field import correlated_noise
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.mapped_scene import MappedView, ViewRays
@@ -39,26 +40,6 @@ from mitsim.sensor.transforms import Transform
 #: smallest margin at the edge of a feature whose pixels belong to no feature: a matching block there covers two
 #: surfaces
 EDGE_MARGIN_PX = 3
-
-
-@dataclass(frozen=True)
-class Ideal:
-    """Measured pixels of a perfect sensor; flat arrays over the n pixels that meet a surface.
-
-    ``pixel`` (n,) flat index into the grid; ``point`` (n, 3) and ``ray`` (n, 3) in the sensor frame [mm]; ``distance``
-    (n,) |V| [mm]; ``normal`` (n, 3) in the view frame; ``shape`` (n,) index into the scene's names; ``status`` (n,)
-    VALID where every eye sees the point; ``along`` (n, 3) the direction of the surface's parameter u in the view frame,
-    None in a scene without a lay.
-    """
-
-    pixel: NDArray[np.int64]
-    point: NDArray[np.float64]
-    ray: NDArray[np.float64]
-    distance: NDArray[np.float64]
-    normal: NDArray[np.float64]
-    shape: NDArray[np.int16]
-    status: NDArray[np.uint8]
-    along: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
