@@ -38,9 +38,11 @@ _ALL = (slice(None), slice(None))
 #: number of points of the reference that determine the surface at a point: it has six coefficients
 NEIGHBOURS = 12
 
-#: pixels of an organised reference, about a point, that determine the slope of its surface, and the surface: rows and
-#: columns before and behind it; chosen
-_SLOPE_PIXELS, _PIXELS = np.arange(-3, 5), slice(2, 6)
+#: rows and columns of an organised reference, from a point's pixel on, that determine the slope of its surface; chosen
+_SLOPE_PIXELS = np.arange(-3, 5)
+
+#: those among them that determine the surface; chosen
+_PIXELS = slice(2, 6)
 
 #: least noise of a reference over the distance of its points that moves the difference; chosen: there by 4 %
 _NOISY = 0.2
