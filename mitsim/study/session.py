@@ -21,6 +21,7 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.statements.statement import Statements
 from characterisation.tasks.measurement_model import InputQuantity
 from characterisation.words.progress import say
+from mitsim.capture.simulated.rendering import Rendering
 from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.prediction import Predictor
 from mitsim.running.executor import Executor
@@ -65,6 +66,8 @@ class Session:
         Processes or cluster that make the trials; by default this process makes them.
     separate_light
         Whether trials share nothing: each renders all of its light at its own pose, with its own finish.
+    rendering
+        How statements are rendered; by default as :func:`mitsim.study.virtual.plan.rendering_of`.
     """
 
     def __init__(
@@ -73,8 +76,9 @@ class Session:
         folder: str | Path | None = None,
         workers: Executor | None = None,
         separate_light: bool = False,
+        rendering: Rendering | None = None,
     ) -> None:
-        self.study, self.workers, self.separate_light = study, workers, separate_light
+        self.study, self.workers, self.separate_light, self.rendering = study, workers, separate_light, rendering
         self._folder = None if folder is None else Path(folder)
         self._exposures: dict[int, PlannedExposure] = {}
 
@@ -97,12 +101,12 @@ class Session:
     @cached_property
     def digest(self) -> str:
         """Return the digest of everything that determines a trial."""
-        return trial_digest(self.study, self.unknowns, self.source, self.separate_light)
+        return trial_digest(self.study, self.unknowns, self.source, self.separate_light, self.rendering)
 
     @cached_property
     def measurements(self) -> RenderedMeasurements | MappedMeasurements:
         """Return the virtual measurements of this process: a sensor prepared on the device, or its map."""
-        return measurements_of(self.study, self.unknowns, self.separate_light)
+        return measurements_of(self.study, self.unknowns, self.separate_light, self.rendering)
 
     @property
     def renderer(self) -> RenderedMeasurements | None:

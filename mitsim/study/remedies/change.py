@@ -22,7 +22,7 @@ from mitsim.study import StatementTable, Study, StudyFile, open_study
 from mitsim.study.remedies.bounds import Effect, can_fit, least_uncertainty
 from mitsim.study.session import Session
 from mitsim.study.view_sets.confirmed_set import Search
-from mitsim.study.virtual.plan import measured_by
+from mitsim.study.virtual.plan import change_rendering, measured_by
 from mitsim.study.virtual.race import Raced
 from mitsim.study.virtual.stated import StatedView
 from mitsim.views import View
@@ -109,6 +109,16 @@ class Change:
     needs_trials: bool = True
 
 
+def session_of_views(session: Session, folder: Path) -> Session:
+    """Return the session of other views that a remedy tries, which have fewer light paths if a statement has many."""
+    rendering = change_rendering(session.study)
+    if session.renderer is None or rendering == session.renderer.rendering:
+        return session
+    other = Session(session.study, folder, session.workers, session.separate_light, rendering)
+    other.unknowns, other.measurements = session.unknowns, session.renderer.rendered_as(rendering)
+    return other
+
+
 class ChangedStudy:
     """Virtual measurements of one view of a changed study, prepared at the first use."""
 
@@ -120,7 +130,8 @@ class ChangedStudy:
         """State every measurement from a number of trials, or those within a limit."""
         if self.session is None:
             self.now.session.release()
-            self.session = Session(self.study(), self.now.folder / self.name, self.now.session.workers)
+            study, workers = self.study(), self.now.session.workers
+            self.session = Session(study, self.now.folder / self.name, workers, rendering=change_rendering(study))
         return self.session.state(self.view(self.session.study), StatementTable(trials=count), limit).statements
 
     def release(self) -> None:

@@ -37,6 +37,7 @@ from mitsim.study.remedies.change import (
     possible,
     reopened,
     same_direction,
+    session_of_views,
 )
 from mitsim.study.remedies.repeats import state_mean
 from mitsim.study.screened_errors import needed_by_tolerance
@@ -154,10 +155,11 @@ def _views(now: Shortfall) -> Iterator[Change]:
             u = ratio * statement.standard_uncertainty / SCREENING_FACTOR
             if number != stated and ratio < 1 and can_fit(statement, u, unbiased=True):
                 by_view.setdefault(number, {})[name] = u
+    session = session_of_views(now.session, now.folder / "view")
     for number, expected in sorted(by_view.items(), key=lambda row: -len(row[1]))[:_MOST_OTHER_VIEWS]:
 
         def state(count: int, limit: TimeLimit, view: int = number) -> list[Statement]:
-            return now.session.state(now.study.view(view), StatementTable(trials=count), limit).statements
+            return session.state(now.study.view(view), StatementTable(trials=count), limit).statements
 
         yield Change("view", f"from view {number}", {}, (number,), expected, state)
 

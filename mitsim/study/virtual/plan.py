@@ -77,6 +77,10 @@ _FEWER_OF_MATCHER_IN_RACE = 4
 #: errors, of the angle between pillars, change by 0.3 to 0.8 of their root mean square: by the same benchmark
 _FEWER_IN_RACE = 16
 
+#: the same for the change of a study that a remedy tries, which ten trials can exclude: tracing all paths of a view
+#: takes as long as thirty
+_FEWER_IN_CHANGES = 4
+
 
 def rendering_of(study: Study) -> Rendering:
     """Return the settings for rendering the virtual measurements of a study.
@@ -101,12 +105,29 @@ def race_rendering(study: Study) -> Rendering:
     --------
     rendering_of : those of its statements
     """
-    rendering = rendering_of(study)
+    is_matcher = isinstance(study.sensor.settings, MatcherSettings)
+    return _with_fewer(rendering_of(study), _FEWER_OF_MATCHER_IN_RACE if is_matcher else _FEWER_IN_RACE)
+
+
+def change_rendering(study: Study) -> Rendering:
+    """Return the settings for rendering a change of a study that may make its measurements fit.
+
+    Matchers have the paths of their statements, which are few.
+
+    See Also
+    --------
+    rendering_of : those of its statements
+    """
+    is_matcher = isinstance(study.sensor.settings, MatcherSettings)
+    return _with_fewer(rendering_of(study), 1 if is_matcher else _FEWER_IN_CHANGES)
+
+
+def _with_fewer(rendering: Rendering, factor: int) -> Rendering:
+    """Return a rendering with fewer kept paths."""
     kept = rendering.kept
     assert kept is not None  # of every study
-    fewer = _FEWER_OF_MATCHER_IN_RACE if isinstance(study.sensor.settings, MatcherSettings) else _FEWER_IN_RACE
-    side = math.isqrt(kept.samples // fewer)  # of the square of samples in a pixel
-    return replace(rendering, kept=replace(kept, samples=side**2, kept=kept.kept // fewer))
+    side = math.isqrt(kept.samples // factor)  # of the square of samples in a pixel
+    return replace(rendering, kept=replace(kept, samples=side**2, kept=kept.kept // factor))
 
 
 def measured_by(study: Study) -> str:
@@ -132,15 +153,22 @@ def measured_by(study: Study) -> str:
 
 
 def measurements_of(
-    study: Study, unknowns: Unknowns, separate_light: bool = False
+    study: Study, unknowns: Unknowns, separate_light: bool = False, rendering: Rendering | None = None
 ) -> RenderedMeasurements | MappedMeasurements:
     """Prepare a study's sensor, or its map, for virtual measurements.
 
-    With ``separate_light``, renderings share no light.
+    Parameters
+    ----------
+    study, unknowns
+        The study, and its unknowns prepared for drawing.
+    separate_light
+        Whether every trial renders all of its light.
+    rendering
+        By default that of statements.
     """
     if measured_by(study) == "map":
         return MappedMeasurements(study, unknowns)
-    return RenderedMeasurements(study, unknowns, rendering_of(study), separate_light)
+    return RenderedMeasurements(study, unknowns, rendering or rendering_of(study), separate_light)
 
 
 def map_digest(study: Study) -> str:

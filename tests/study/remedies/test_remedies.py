@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
@@ -13,6 +14,7 @@ import pytest
 from pydantic import ValidationError
 from scipy.stats import norm
 
+from characterisation.files.documents import read_toml
 from characterisation.files.errors import InputError
 from characterisation.statements.budget import BudgetLine
 from characterisation.statements.decision import demand
@@ -20,14 +22,15 @@ from characterisation.statements.statement import Statement, statement
 from characterisation.statements.tolerance import plus_minus
 from characterisation.tasks.decision_table import Decision
 from mitsim.running.time_limit import TimeLimit
-from mitsim.study import Study
+from mitsim.study import Study, open_study
 from mitsim.study.remedies import changes as proposals
 from mitsim.study.remedies.bounds import EXPOSURE, Effect, can_fit, least_shares, least_uncertainty
-from mitsim.study.remedies.change import Change, Shortfall, changed_file
+from mitsim.study.remedies.change import Change, Shortfall, changed_file, session_of_views
 from mitsim.study.remedies.changes import changes
 from mitsim.study.remedies.confirm import Remedies, find_remedies, of_missed, remedies_document
 from mitsim.study.remedies.entries import MissedEntry, RemediesEntry, UntriedChange, remedies_in_words
 from mitsim.study.remedies.sensors import _with_sensor
+from mitsim.study.session import Session
 from mitsim.study.tables import StudyFile
 from mitsim.views import View
 from tests.two_balls import TASK
@@ -242,6 +245,20 @@ def test_the_spray_comes_before_other_views_if_time_is_short(
     kinds = [one.kind for one in changes(cast(Shortfall, None), short)]
     assert kinds[:2] == ["bias", first]
     assert sorted(kinds) == sorted(one.kind for one in changes(cast(Shortfall, None)))
+
+
+@pytest.mark.parametrize(("sensor", "share"), [("zivid-2-m70", 0.25), ("ensenso-n10", 1.0)])
+def test_other_views_that_a_remedy_tries_have_fewer_paths_of_fringes(sensor: str, share: float, tmp_path: Path) -> None:
+    path = Path("scenes/two_pillars/tolerances.toml")
+    file = read_toml(path, StudyFile).model_copy(update={"sensor": sensor})
+    session = Session(open_study(path, file, mapped=False), tmp_path)
+    others = session_of_views(session, tmp_path / "view")
+    stated, tried = session.renderer, others.renderer
+    assert stated is not None and tried is not None
+    assert tried.rendering.kept.kept == share * stated.rendering.kept.kept
+    assert tried.rendering.kept.samples == share * stated.rendering.kept.samples
+    assert tried.simulated is stated.simulated, "prepared once"
+    assert (others.digest == session.digest) == (share == 1), "trials of one kind are not taken for the other"
 
 
 def test_keys_of_a_change_replace_single_keys_of_the_study() -> None:
