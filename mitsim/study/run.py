@@ -56,7 +56,7 @@ from mitsim.study.view_sets.confirmed_set import (
     tried_entries,
     write_set_csv,
 )
-from mitsim.study.virtual.plan import measured_by
+from mitsim.study.virtual.plan import change_rendering, measured_by
 from mitsim.study.virtual.race import ALL, Raced
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.stated import StatedView
@@ -297,8 +297,11 @@ def _show(
     planned: dict[int, PlannedExposure | None],
     limit: TimeLimit,
 ) -> list[int]:
-    """Write image and cloud of views, with best estimates of all unknowns, within a limit; return those written."""
-    shown = []
+    """Write image and cloud of views, with best estimates of all unknowns, within a limit; return those written.
+
+    Pictures need no more light paths than a change that a remedy tries.
+    """
+    renderer, shown = renderer.rendered_as(change_rendering(renderer.study)), []
     for number in track(numbers, "render pictures"):
         if limit.over():
             break

@@ -124,6 +124,8 @@ class RenderedMeasurements:
 
     def rendered_as(self, rendering: Rendering) -> RenderedMeasurements:
         """Return the same measurements with other light paths; prepared data is shared, but for those of views."""
+        if rendering == self.rendering:
+            return self
         other = copy.copy(self)
         other.rendering, other.views = rendering, LightOfViews()
         return other
