@@ -33,7 +33,7 @@ class KnownMaker:
     source = "render"
     made = 0
 
-    def __init__(self, study, unknowns, apart=False, wider=1.0):
+    def __init__(self, study, unknowns, apart=False, rendering=None, wider=1.0):
         self.seed, self.wider = unknowns.seed, wider if apart else 1.0
 
     def rendered_as(self, _):
