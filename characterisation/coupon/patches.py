@@ -38,10 +38,10 @@ from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, PointCloud, ViewGrid
 
-#: radius of a patch [px]: 113 possible points
+#: radius of a patch [px]: 113 possible points; chosen
 RADIUS_PX = 6.0
 
-#: distance of a patch from the edge of the coupon [px]: about one matching block
+#: distance of a patch from the edge of the coupon [px]: about one matching block; chosen
 MARGIN_PX = 5.0
 
 

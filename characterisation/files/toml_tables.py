@@ -10,7 +10,7 @@ from typing import Any
 from characterisation.files.checked_files import read_text_bounded
 from characterisation.files.errors import InputError, nearest
 
-#: largest TOML file [bytes]
+#: largest TOML file [bytes]; chosen
 LARGEST_TOML = 4 * 1024**2
 
 #: deepest nesting of a TOML file

@@ -7,7 +7,6 @@ mean sigma of a feature's points, or the input of :mod:`characterisation.tasks.c
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,13 +82,15 @@ def map_answers(
         mask = (ideal.shape == index) & (ideal.status == Status.VALID)
         if used is None or not mask.any():
             continue
-        answer: Any = of_scene
-        if of_scene is None or scene_finish is None or not _same_surface(performance_map, used, scene_finish):
+        if of_scene is not None and scene_finish is not None and _same_surface(performance_map, used, scene_finish):
+            answers = [values[mask] for values in vars(of_scene).values()]
+        else:
             along = None if ideal.along is None else ideal.along[mask]
             distance, normal = ideal.distance[mask], ideal.normal[mask]
             answer = performance_map.query(used.name, used.roughness, distance, normal, used.light, along)
-        for name, values in vars(out).items():
-            values[mask] = getattr(answer, name) if answer is not of_scene else getattr(answer, name)[mask]
+            answers = [answer.fraction, answer.sigma, answer.fraction_error]
+        for all_values, values in zip(vars(out).values(), answers, strict=True):
+            all_values[mask] = values
     out.fraction[ideal.status != Status.VALID] = 0.0
     return out
 

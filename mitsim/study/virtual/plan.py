@@ -78,7 +78,7 @@ _FEWER_OF_MATCHER_IN_RACE = 4
 _FEWER_IN_RACE = 16
 
 #: the same for the change of a study that a remedy tries, which ten trials can exclude: tracing all paths of a view
-#: takes as long as thirty
+#: takes as long as fifty (Zivid, PhoXi). Chosen: the number of paths that statements had before
 _FEWER_IN_CHANGES = 4
 
 
