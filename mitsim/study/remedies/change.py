@@ -24,6 +24,7 @@ from mitsim.study.session import Session
 from mitsim.study.view_sets.confirmed_set import Search
 from mitsim.study.virtual.plan import change_rendering, measured_by
 from mitsim.study.virtual.race import Raced
+from mitsim.study.virtual.spread_out import is_room_for_another
 from mitsim.study.virtual.stated import StatedView
 from mitsim.views import View
 
@@ -129,7 +130,8 @@ class ChangedStudy:
     def state(self, count: int, limit: TimeLimit) -> list[Statement]:
         """State every measurement from a number of trials, or those within a limit."""
         if self.session is None:
-            self.now.session.release()
+            if not is_room_for_another():
+                self.now.session.release()
             study, workers = self.study(), self.now.session.workers
             self.session = Session(study, self.now.folder / self.name, workers, rendering=change_rendering(study))
         return self.session.state(self.view(self.session.study), StatementTable(trials=count), limit).statements

@@ -11,6 +11,7 @@ machine. Workers read the study's scene, task and sensor at the same paths.
 from __future__ import annotations
 
 import copy
+import os
 import statistics
 import time
 from collections import deque
@@ -20,7 +21,7 @@ from itertools import groupby
 from pathlib import Path
 
 from mitsim.capture.simulated.rendering import Rendering
-from mitsim.running.executor import Executor
+from mitsim.running.executor import Executor, available_memory
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import StudyFile, open_study
 from mitsim.study.virtual.race import Job
@@ -104,7 +105,10 @@ def _light_of(order: TrialOrder) -> tuple[tuple[str, Rendering], int]:
     return (order.digest, order.rendering), order.jobs[0].view.number
 
 
-#: digest of a study, and its measurements with the light paths of the last order
+#: memory of a sensor that is prepared with the light of a view [bytes]: up to 2.5e9 (Zivid, two pillars)
+_PREPARED = 3 << 30
+
+#: digests of the first study and of the last, and their measurements with the light paths of the last order
 _prepared: dict[str, RenderedMeasurements] = {}
 
 
@@ -115,13 +119,26 @@ def timed_trials(order: TrialOrder) -> tuple[list[Outcome], float]:
     return outcomes, (time.monotonic() - began) / len(order.jobs)
 
 
+def is_room_for_another() -> bool:
+    """Return whether every core has memory for another prepared sensor."""
+    return available_memory() > _PREPARED * (os.cpu_count() or 1)
+
+
+def _make_room() -> None:
+    """Forget the last study, or all if memory is scarce: changes are tried in turn, then the first study goes on."""
+    if len(_prepared) > 1:
+        _prepared.popitem()
+    if not is_room_for_another():
+        _prepared.clear()
+
+
 def make_trials(order: TrialOrder) -> list[Outcome]:
     """Make the trials of an order; workers call this function."""
     if order.digest not in _prepared:
         from mitsim.scene import backend
 
         backend.activate(None)
-        _prepared.clear()
+        _make_room()
         study = open_study(order.path, order.file, mapped=False)  # trials are rendered
         _prepared[order.digest] = RenderedMeasurements(study, order.unknowns, order.rendering, order.separate_light)
     if order.rendering != _prepared[order.digest].rendering:

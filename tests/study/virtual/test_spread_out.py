@@ -1,6 +1,7 @@
 """Workers make the trials of an order with the light paths that it names; called here as a worker calls it."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +61,24 @@ def test_the_race_has_fewer_paths_and_trials_of_its_own(study, tmp_path, monkeyp
     assert len(spread_out._prepared) == 1
     assert session.race_trials.digest != session.trials.digest
     assert session.race_trials.folder != session.trials.folder
+
+
+@pytest.mark.parametrize(("free_bytes", "kept"), [(1 << 50, True), (1 << 20, False)])
+def test_a_worker_keeps_the_first_study_while_changes_are_tried_if_memory_allows(study, monkeypatch, free_bytes, kept):
+    monkeypatch.setattr(spread_out, "_prepared", {})
+    monkeypatch.setattr(spread_out, "available_memory", lambda: free_bytes)
+    spread = SpreadMeasurements(_Here(), Session(study).renderer, "stated")
+    jobs = [Job(study.views[1], Trial(0))]
+    first, prepared = None, []
+    for digest in ("stated", "change 1", "change 2", "stated"):
+        spread._order = replace(spread._order, digest=digest)
+        ((_, outcome),) = spread.run(jobs)
+        first = first or outcome
+        assert outcome.errors == pytest.approx(first.errors, rel=0, abs=0, nan_ok=True)
+        prepared.append(list(spread_out._prepared))
+    together = [["stated"], ["stated", "change 1"], ["stated", "change 2"], ["stated", "change 2"]]
+    alone = [["stated"], ["change 1"], ["change 2"], ["stated"]]
+    assert prepared == (together if kept else alone)
 
 
 def test_orders_of_slow_trials_are_short(study, tmp_path, monkeypatch):
