@@ -46,14 +46,30 @@ _RESIDUALS = 1000
 _ROUNDING = 1e-6
 
 
-def places_seen(nominal: Surface, rays: ArrayLike, viewpoint: ArrayLike) -> Array:
-    """Return the places (k, 3) [mm] where rays (n, 3) from a viewpoint (3,) [mm] meet a surface.
+def places_seen(nominal: Surface, rays: ArrayLike, viewpoint: ArrayLike, points: ArrayLike) -> Array:
+    """Return the places (k, 3) [mm] where a sensor sees a surface.
 
     Rays that miss, or meet the surface at grazing incidence, are left out. Of many places, evenly chosen ones remain.
+
+    Parameters
+    ----------
+    nominal
+        The surface.
+    rays
+        (n, 3), from the viewpoint.
+    viewpoint
+        (3,) [mm].
+    points
+        (m, 3) [mm] on the surface, which tell whether rays meet it from outside, or from inside as in a bore.
     """
+    eye, array = np.asarray(viewpoint, float), np.asarray(points, float).reshape(-1, 3)
     directions = np.asarray(rays, float).reshape(-1, 3)
     directions = directions[:: max(-(-len(directions) // PLACES), 1)]
-    at = nominal.meet(np.broadcast_to(np.asarray(viewpoint, float), directions.shape), directions)
+    starts = np.broadcast_to(eye, directions.shape)
+    if len(array) and np.median(nominal.meet(array, rays_from(eye, array)).cosine) > 0:
+        # a ray enters a bore in the air, and meets its wall where it leaves: the nearer place from beyond
+        starts = eye + 2 * np.linalg.norm(array - eye, axis=1).max() * directions
+    at = nominal.meet(starts, directions)
     met: Array = at.foot[(np.abs(at.cosine) > GRAZING_COSINE) & np.isfinite(at.foot).all(axis=1)]
     return met
 

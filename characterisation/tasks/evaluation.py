@@ -99,7 +99,7 @@ def _selected(cloud: PointCloud, task: Task, sensor_from_part: ArrayLike, minimu
             raise InputError("task", f"features.{name}", repr(name), labels, nearest(name, names))
         points, nominal = cloud.of_feature(name), task.features[name].nominal(sensor_from_part)
         near = points[belonging(points, nominal, cloud.grid.origin)]
-        positions = places_seen(nominal, cloud.rays_of_feature(name, PLACES), cloud.grid.origin)
+        positions = places_seen(nominal, cloud.rays_of_feature(name, PLACES), cloud.grid.origin, near)
         selected[name] = _Selected(near, len(points), positions)
         if len(near) < minimum_points:
             few = FitError(f"{len(near)} points, at least {minimum_points} are required")

@@ -7,7 +7,7 @@ from scipy.ndimage import gaussian_filter
 from characterisation.features.credibility import check_surface, places_seen
 from characterisation.features.fits import belonging, fit_surface
 from characterisation.features.robust_fit import FitError, UndeterminedError
-from characterisation.features.surfaces import Cylinder, Plane, Sphere
+from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
 from characterisation.features.vectors import unit
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.tasks.evaluation import measure, measure_points
@@ -50,8 +50,33 @@ def checked(nominal, points, rays):
     """The fit to the points that belong to the nominal surface; an error unless it is credible."""
     near = points[belonging(points, nominal, EYE)]
     fit = fit_surface(near, nominal, EYE)
-    check_surface(fit, nominal, near, places_seen(nominal, rays, EYE), EYE)
+    check_surface(fit, nominal, near, places_seen(nominal, rays, EYE, near), EYE)
     return fit
+
+
+def inside(kind):
+    """Places (n, 3) on the far wall of a bore, a socket or a countersink in a plate that is seen at 45 degrees."""
+    angle, depth = (grid.ravel() for grid in np.meshgrid(np.radians(np.linspace(-40, 40, 25)), np.linspace(0, 5, 9)))
+    radius = {"bore": 10.0, "socket": np.sqrt(12.0**2 - depth**2), "countersink": 10.0 - 0.5 * depth}[kind]
+    places = np.column_stack([radius * np.sin(angle), radius * np.cos(angle), depth])  # the plate faces -z
+    turn = np.array([[1, 0, 0], [0, 0.5**0.5, -(0.5**0.5)], [0, 0.5**0.5, 0.5**0.5]])
+    about, axis = np.array([0.0, 0.0, 500.0]), turn @ [0.0, 0.0, 1.0]
+    surfaces = {
+        "bore": Cylinder(about, axis, 10.0),
+        "socket": Sphere(about, 12.0),
+        "countersink": Cone(about, -axis, 10.0, np.arctan(0.5)),
+    }
+    return surfaces[kind], places @ turn.T + about
+
+
+@pytest.mark.parametrize("kind", ["bore", "socket", "countersink"])
+def test_the_wall_of_a_bore_is_seen_from_inside(kind):
+    """Before, a bore was compared with nominal on the wall nearer to the sensor, which it does not see."""
+    nominal, places = inside(kind)
+    rays = places / np.linalg.norm(places, axis=1, keepdims=True)
+    noisy = places + 0.05 * np.random.default_rng(0).standard_normal((len(places), 1)) * rays
+    np.testing.assert_allclose(places_seen(nominal, rays, EYE, noisy), places, rtol=0, atol=1e-6)
+    checked(nominal, noisy, rays)
 
 
 @pytest.mark.parametrize("nominal, true", [(BALL, SHIFTED_BALL), (BAR, TURNED_BAR), (FACE, TILTED_FACE)])

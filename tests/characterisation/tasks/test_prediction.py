@@ -261,7 +261,7 @@ def test_the_chance_of_a_credible_fit_is_the_share_of_credible_fits(clouds, away
     rng, points, nominal = np.random.default_rng(5), clouds["plane"], TASK.features["plane"].nominal()
     shared = np.column_stack([np.full(len(points), away_mm), tilt_mm * points[:, 0] / 60])
     face = replace(seen("plane", points), shared=shared)
-    places = places_seen(nominal, face.ray, EYE)
+    places = places_seen(nominal, face.ray, EYE, points)
     credible = 0
     for _ in range(400):
         moved = (
