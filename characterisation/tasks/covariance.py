@@ -47,7 +47,7 @@ from characterisation.coupon.offsets import own_area
 from characterisation.features.credibility import PLACES, most_uncertain
 from characterisation.features.fits import COVERAGE, GATE, LEAST_BELONGING, LEAST_GATE_MM
 from characterisation.features.robust_fit import FitError
-from characterisation.features.surfaces import GRAZING_COSINE, Surface
+from characterisation.features.surfaces import GRAZING_COSINE, Cylinder, Sphere, Surface
 from characterisation.files.arrays import Floats
 from characterisation.maps.pooled_offsets import DISC_RADIUS
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE
@@ -197,7 +197,22 @@ def _credible_chance(surface: Surface, expected: ExpectedPoints, used: ExpectedP
         for rows, reduce in ((jacobian, np.max), (of_used, np.median))
     )
     allowed = (limit + COVERAGE * spread) / np.maximum(largest - median, 1e-12)
-    return float(chdtr(len(values), allowed**2).mean())
+    return min(float(chdtr(len(values), allowed**2).mean()), _chance_of_radius(surface, fit))
+
+
+def _chance_of_radius(surface: Surface, fit: ExpectedFit) -> float:
+    """Return the probability that the points determine the radius (:func:`~characterisation.features.fits.check_radius`).
+
+    The curvature of an arc of sagitta h over a chord c is 8 h / c^2: its error is normal, and its uncertainty by noise
+    u / r^2 for any radius r. It passes if it is at least 2 k u / r^2.
+    """
+    if not isinstance(surface, Cylinder | Sphere):
+        return 1.0
+    radius, all_errors = surface.radius, math.sqrt(max(float(fit.covariance[-1, -1]), 0.0))
+    noise = math.sqrt(max(float(fit.noise_covariance[-1, -1]), 0.0))
+    if min(noise, all_errors) < 1e-9 * radius:
+        return 1.0
+    return float(ndtr((radius - 2 * COVERAGE * noise) / all_errors))
 
 
 def usable(surface: Surface, expected: ExpectedPoints) -> ExpectedPoints:

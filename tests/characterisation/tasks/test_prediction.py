@@ -277,6 +277,25 @@ def test_the_chance_of_a_credible_fit_is_the_share_of_credible_fits(clouds, away
     assert expected_fit(nominal, face, 100).chance == pytest.approx(credible / 400, abs=0.07)
 
 
+@pytest.mark.parametrize("arc_deg", [10.0, 14.0, 20.0, 40.0])
+def test_the_chance_of_a_credible_arc_includes_that_of_its_radius(clouds, arc_deg) -> None:
+    """Before, an arc of 10 degrees had a chance of 1: its surface is determined where it is seen, not its radius."""
+    rng, nominal = np.random.default_rng(6), TASK.features["pillar"].nominal()
+    angle = np.degrees(np.arctan2(clouds["pillar"][:, 1], clouds["pillar"][:, 0]))
+    points = clouds["pillar"][np.abs(angle + 90) < arc_deg / 2]
+    arc = seen("pillar", points)
+    credible = 0
+    for _ in range(200):
+        moved = points + arc.ray * SIGMA * rng.standard_normal((len(points), 1))
+        try:
+            fit = fit_surface(moved, nominal, EYE)
+            check_surface(fit, nominal, moved, places_seen(nominal, arc.ray, EYE, moved), EYE)
+            credible += 1
+        except FitError:
+            pass
+    assert expected_fit(nominal, arc, 20).chance == pytest.approx(credible / 200, abs=0.1)
+
+
 def test_what_is_not_seen_makes_a_measurement_impossible(clouds) -> None:
     half = {name: seen(name, points) for name, points in clouds.items()}
     half["pillar"] = seen("pillar", clouds["pillar"][:0])
