@@ -1,8 +1,8 @@
 """Write the statement of a run as a digital calibration certificate: DCC 3.2.1 of PTB, numbers after D-SI 2.1.0.
 
 Signal chain: results of a run, who issues them -> administrative data, then for each measurement its nominal value,
-error of the stated part with u and 95 % interval, its expected reading with U and k, number of virtual measurements,
-verdict -> one document.
+error of the stated part with u and 95 % interval, its expected reading with U and k, accepted readings, number of
+virtual measurements, verdict -> one document.
 
 The elements are those of PTB's schema (https://ptb.de/dcc/v3.2.1/dcc.xsd), which is LGPL-3.0 and no part of mitsim. The
 document calls itself simulated and not traceable: it is the statement of a virtual experiment in the form that programs
@@ -207,6 +207,12 @@ def _result(to: Element, expected_result: ExpectedResult) -> None:
     for name, value in zip(("lower deviation", "upper deviation"), deviations, strict=True):
         if value is not None:
             _real(_quantity(table, f"tolerance, {name}"), value, unit)
+    readings = expected_result.accepted_low, expected_result.accepted_high
+    for name, value in zip(("lowest", "highest"), readings, strict=True):
+        if value is not None:
+            _real(_quantity(table, f"accepted readings, {name}"), value, unit)
+    if expected_result.tolerance is not None and expected_result.accepted_high is None:
+        _text(_quantity(table, "accepted readings"), "noQuantity", "none")
     _real(_quantity(table, "number of virtual measurements"), float(expected_result.trials), r"\one")
     _real(_quantity(table, "share without a value"), expected_result.without_value, r"\one")
     _text(_quantity(table, "verdict on the measurement, not on a part"), "noQuantity", expected_result.verdict)

@@ -226,6 +226,8 @@ def _measurement(ids: Ids, run_results: RunResults, result: ExpectedResult) -> E
         "bias_uncertainty": result.bias_uncertainty,
         "low_95": result.low,
         "high_95": result.high,
+        "accepted_low": result.accepted_low,
+        "accepted_high": result.accepted_high,
         "view": result.view,
         "trials": result.trials,
         "without_value": float(result.without_value),

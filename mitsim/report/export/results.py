@@ -35,7 +35,8 @@ class ExpectedResult:
     ``expected`` is the mean reading of this part, its value + ``bias``; ``low`` to ``high`` contain 95 % of its
     readings. The value of any part is the nominal one; a part far from nominal has none, and no reading.
     ``uncertainty`` is the standard deviation about the mean (k = 1). ``verdict`` compares them with the tolerance: it
-    states whether the sensor is good enough, and nothing about a real part.
+    states whether the sensor is good enough, and nothing about a real part. The decision rule accepts readings from
+    ``accepted_low``, None without a lower limit, to ``accepted_high``, None where it accepts none.
     """
 
     measurement: str
@@ -57,6 +58,8 @@ class ExpectedResult:
     error_low: float | None
     error_high: float | None
     errors_of: str
+    accepted_low: float | None = None
+    accepted_high: float | None = None
 
 
 @dataclass(frozen=True)
@@ -152,6 +155,7 @@ def expected_result(name: str, asked: Measurement, stated: StatedMeasurement, vi
     expected, low, high = (
         None if end is None or value is None else value + end for end in (stated.bias, *stated.interval)
     )
+    accepted = None if stated.decision is None else stated.decision.accepted
     return ExpectedResult(
         name,
         asked.kind,
@@ -171,6 +175,7 @@ def expected_result(name: str, asked: Measurement, stated: StatedMeasurement, vi
         stated.verdict,
         *stated.interval,
         stated.errors_of,
+        *(accepted or (None, None)),
     )
 
 

@@ -173,6 +173,24 @@ def test_a_lower_limit_without_an_effect_is_none(every_kind, tmp_path, nominal, 
     assert found == {f"tolerance, {name}": value for name, value in deviations.items()}
 
 
+@pytest.mark.parametrize(
+    ("tolerance", "accepted", "written"),
+    [
+        (0.1, (12.46, 12.54), {"accepted readings, lowest": "12.46", "accepted readings, highest": "12.54"}),
+        (0.1, (None, 0.07), {"accepted readings, highest": "0.07"}),  # a zone
+        (0.1, (None, None), {"accepted readings": "none"}),
+        (None, (None, None), {}),
+    ],
+)
+def test_the_accepted_readings_are_those_of_the_statement(every_kind, tmp_path, tolerance, accepted, written):  # noqa: F811
+    low, high = accepted
+    result = replace(every_kind.results[0], tolerance=tolerance, accepted_low=low, accepted_high=high)
+    write_dcc(replace(every_kind, results=[result]), declared(), ISSUER, tmp_path / "dcc.xml")
+    names = etree.parse(tmp_path / "dcc.xml").findall(f".//{{{DCC}}}quantity/{{{DCC}}}name/{{{DCC}}}content")
+    found = {name.text: name.getparent().getnext() for name in names if name.text.startswith("accepted")}
+    assert {name: "".join(value[0].itertext()).strip() for name, value in found.items()} == written
+
+
 def test_the_country_is_the_laboratorys_alone(document):
     countries = [one.getparent().getparent().getparent() for one in document.iter(f"{{{DCC}}}countryCode")]
     assert [tag(one) for one in countries] == ["calibrationLaboratory"]

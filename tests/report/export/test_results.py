@@ -367,6 +367,26 @@ def test_readings_are_those_of_the_part_whose_errors_are_stated(kind, nominal, t
         assert (one.expected, one.low, one.high) == (value - 0.01, value - 0.11, value + 0.09)
 
 
+def test_results_have_the_accepted_readings_of_the_statement(tmp_path):
+    """Those of the sheet to sign: of a length, of a zone, and of one that accepts none."""
+    folder = with_names_of_tasks(write_expecting_run(tmp_path / "run"))
+    (tmp_path / "task.toml").write_text(TASK)
+    statement = json.loads((folder / "statement.json").read_text())
+    rule = {"rule": "ISO 14253-1", "fits_corrected": True, "needed": None, "false_accept": None, "false_reject": None}
+    rule |= {"consumer_risk": None, "producer_risk": None}
+    readings = [[19.82, 20.18], [None, 0.07], None]
+    for one, accepted in zip(statement["measurements"].values(), readings, strict=False):
+        one["decision"] = rule | {"accepted": accepted}
+    (folder / "statement.json").write_text(json.dumps(statement))
+    read = read_results(folder, tmp_path / "task.toml")
+    ends = [(one.accepted_low, one.accepted_high) for one in read.results]
+    assert ends == [(19.82, 20.18), (None, 0.07), (None, None)][: len(ends)]
+    write_qif(read, tmp_path / "out.qif")
+    said = pytest.importorskip("lxml.etree").parse(tmp_path / "out.qif").findall(".//{*}CharacteristicMeasurements/*")
+    written = [one.get("value") for one in said[0].iter("{*}AttributeD1") if "accepted" in one.get("name")]
+    assert written == ["19.82", "20.18"]
+
+
 def test_results_are_read_from_a_run(tmp_path):
     folder = with_names_of_tasks(write_expecting_run(tmp_path / "run"))
     statement = json.loads((folder / "statement.json").read_text())
