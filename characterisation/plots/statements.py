@@ -25,7 +25,7 @@ GROUPS = {
     "coat": ("#6a51a3", "coat of the part"),
     "light": ("#cc79a7", "room light, power, exposure"),
     "temperature": ("#d55e00", "temperature"),
-    "unit": ("#999999", "fixed pattern and dots of the unit"),
+    "unit": ("#999999", "fixed patterns of the unit"),
     "decoder": ("#882255", "decoder of the maker"),
     "pose": ("#009e73", "place and pose of the part"),
     "noise": ("#56b4e9", "noise and speckle"),

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, expon, norm
 
+from characterisation.plots.statements import GROUPS
 from characterisation.statements.coverage import coverage_interval, errors_of_ends, expanded_interval
 from characterisation.statements.selection import (
     EXCESS,
@@ -265,3 +266,8 @@ def test_a_form_that_is_lost_in_the_noise_does_not_make_its_view_certain():
     of_views = standing(errors, [0.02, 0.02, 0.01], [0.9, 0.9, 0.9])
     assert 0.002 < of_views.risk[0] < 0.2
     assert of_views.near[0] < 0.9
+
+
+def test_the_legend_of_budgets_promises_no_dots():
+    """It is one for all sensors, and those that project fringes have none: only the pattern of their imager."""
+    assert not [words for _, words in GROUPS.values() if "dot" in words]
