@@ -192,6 +192,21 @@ def test_print_shows_what_is_folded(browser, long_report):
     assert browser.tell("document.getElementById('map-in').checkVisibility({contentVisibilityAuto: true})")
 
 
+def test_a_page_read_in_dark_colours_is_printed_on_white_paper(browser, pages):
+    set_size(browser, 703, "screen", "dark")
+    browser.open(pages["run"])
+    # sums of red, green and blue: of the letters, the paper, and the part in the interactive views
+    sums = """(() => {
+      const style = getComputedStyle(document.body), sum = (text) => text.match(/\\d+/g).reduce((a, b) => a + +b, 0);
+      return [sum(style.color), sum(style.backgroundColor)];
+    })()"""
+    ink, paper = browser.tell(sums)
+    assert ink > 600 and paper < 150
+    set_size(browser, 703, "print", "dark")
+    ink, paper = browser.tell(sums)
+    assert ink < 150 and paper > 600
+
+
 def test_the_verdicts_fit_a_telephone_without_scrolling(browser, pages):
     set_size(browser, 400, "screen", "light")
     for page in pages.values():
