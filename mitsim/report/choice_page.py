@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from characterisation.files.errors import InputError
-from characterisation.words.numbers import NONE, listed, percent, quantity, rounded, two_digits, with_degree_signs
-from mitsim.report.first_rows import breakable, exact, tolerance_words
+from characterisation.words.numbers import NONE, listed, quantity, rounded, two_digits, with_degree_signs
+from mitsim.report.first_rows import breakable, exact, share_words, tolerance_words
 from mitsim.report.first_screen import of_choice, sensor_rows
 from mitsim.report.placement_figure import VERDICTS
 from mitsim.report.pose_texts import pose_texts
@@ -102,7 +102,7 @@ def _cell(cell: CellEntry, unit: str) -> dict[str, str]:
     if cell.uncertainty is None:
         why = f"no value in {cell.trials} trials" if cell.trials else "no view, by screening"
         return {"u": "none", "view": why, "verdict": cell.verdict, "colour": VERDICTS[cell.verdict], "by": "none"}
-    share = "" if cell.share_of_tolerance is None else f"{percent(cell.share_of_tolerance)}; "
+    share = "" if cell.share_of_tolerance is None else f"{share_words(cell.share_of_tolerance)}; "
     return {
         "u": quantity(cell.uncertainty, unit),
         "view": f"{share}view {cell.view}",

@@ -132,7 +132,7 @@ class RowValues:
             bias=bias_words(self.bias, self.uncertainty, self.unit),
             uncertainty=quantity(self.uncertainty, self.unit),
             needed=quantity(self.needed, self.unit),
-            share=NONE if self.share is None else _share(self.share),
+            share=NONE if self.share is None else share_words(self.share),
             share_interval="" if limit is None else _interval(self.demand_interval, limit),
             share_limit="" if limit is None else percent(limit),
             accepted=accepted,
@@ -194,16 +194,20 @@ def accepted_words(readings: tuple[float | None, float] | None, unit: str, toler
     return accepted_text(-math.inf if low is None else low, high, tolerance) + _suffix(unit)
 
 
-def _share(share: float) -> str:
+def share_words(share: float) -> str:
+    """Format a share of the tolerance: ``22 %``, or ``over 1000 %``."""
     return percent(share) if share < _LARGEST_SHARE else f"over {percent(_LARGEST_SHARE)}"
 
 
 def _interval(ends: tuple[float | None, float | None] | None, limit: float) -> str:
-    """Return the interval of a share from that of the demand: ``22 to 130 %``; few trials leave its upper end open."""
+    """Return the interval of a share from that of the demand: ``22 to 130 %``; few trials leave its upper end open.
+
+    There is none if both ends are beyond the largest share that is written.
+    """
     if ends is None or ends[0] is None:
         return ""
-    low, high = _share(ends[0] * limit), _share(math.inf if ends[1] is None else ends[1] * limit)
-    return f"{low.removesuffix('%').rstrip()} to {high}"
+    low, high = share_words(ends[0] * limit), share_words(math.inf if ends[1] is None else ends[1] * limit)
+    return "" if low == high and ends[0] * limit >= _LARGEST_SHARE else f"{low.removesuffix('%').rstrip()} to {high}"
 
 
 def _suffix(unit: str) -> str:

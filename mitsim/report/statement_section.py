@@ -14,7 +14,7 @@ from characterisation.plots.statements import GROUPS
 from characterisation.statements.losses import Loss, lost_features
 from characterisation.statements.statement import AT_THE_LIMIT, FAR_FROM_NOMINAL
 from characterisation.words.numbers import NONE, SPACE, interval_text, listed, percent, quantity
-from mitsim.report.first_rows import bias_words, exact
+from mitsim.report.first_rows import bias_words, exact, share_words
 from mitsim.report.unknowns_words import unknowns_in_words
 from mitsim.study.dependence_words import dependences_in_words, remedies_in_words
 from mitsim.study.statement_file import BudgetEntry, ExposureEntry, StatedMeasurement, StatementDocument
@@ -103,7 +103,7 @@ def _row(name: str, measurement: StatedMeasurement) -> dict[str, str]:
         "interval": interval_words(measurement.interval, measurement.unit),
         "corrected": interval_words(measurement.interval_corrected, measurement.unit),
         "without": percent(measurement.without_value),
-        "share": percent(measurement.share_of_tolerance),
+        "share": NONE if measurement.share_of_tolerance is None else share_words(measurement.share_of_tolerance),
         "tolerance": NONE if measurement.tolerance is None else exact(measurement.tolerance, measurement.unit),
         "verdict": measurement.verdict,
         "repeatability": quantity(measurement.repeatability, measurement.unit),

@@ -99,6 +99,8 @@ def test_a_share_is_given_with_its_limit_and_its_interval():
     assert far.share_interval.endswith("over 1000\N{NO-BREAK SPACE}%")
     few = values(share=0.61, demand=2.43, demand_interval=(0.88, None)).texts()  # of four trials
     assert few.share_interval.replace("\N{NO-BREAK SPACE}", " ") == "22 to over 1000 %"
+    beyond = values(share=172.0, demand=688.0, demand_interval=(520.0, 990.0)).texts()
+    assert (beyond.share.replace("\N{NO-BREAK SPACE}", " "), beyond.share_interval) == ("over 1000 %", "")
 
 
 @pytest.mark.parametrize(
