@@ -33,6 +33,10 @@ class RecordedTarget:
     distance: float | None = None
 
 
+#: ratio to the other value below which a value is the rounding of sums, as the sigma of a patch in one step of a coarse
+#: depth image is, 2e-13 mm [chosen: far above 1e-13, far below any ratio of two sensors]
+_ROUNDING = 1e-9
+
 #: figures of one target in a window of a cloud
 Figures = Callable[[PointCloud, str, Roi | None], list[Result]]
 
@@ -118,7 +122,8 @@ def beside_table(recorded: Sequence[Result], simulated: Sequence[Result], sensor
     """Return the table of both, with the ratio of simulated to recorded where both have a value other than 0."""
     rows = [["measurement", "recorded", "u", sensor, "u", "unit", "simulated / recorded"]]
     for result, other in zip(recorded, simulated, strict=True):
-        ratio = other.value / result.value if result.possible and other.possible and result.value else math.nan
+        both = result.possible and other.possible and abs(result.value) > _ROUNDING * abs(other.value)
+        ratio = other.value / result.value if both else math.nan
         rows.append(
             [
                 result.name,

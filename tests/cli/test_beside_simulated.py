@@ -10,9 +10,11 @@ from characterisation.features.fits import fit_plane, fit_sphere
 from characterisation.features.surfaces import Plane
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
+from characterisation.tasks.result import Result
 from characterisation.tasks.windows import window_points
 from mitsim.capture.folder import write_capture
 from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.cli.simulated_beside import beside_table
 from mitsim.scene import backend
 from mitsim.scene.test_targets import plate
 from mitsim.sensor.fitted_to import images_digest
@@ -120,3 +122,11 @@ def test_a_simulation_needs_a_target_and_a_grid(tmp_path, small):
     write_cloud(cloud_of(plane([0, 0, 600], [0, 0, -1])), tmp_path / "wall.ply")
     done = mitsim_here("measure", tmp_path / "wall.ply", "--picture", "a.png", "--simulated", small, code=2)
     assert "a plane or a sphere to simulate" in done.stderr
+
+
+@pytest.mark.parametrize(("recorded", "ratio"), [(2.2e-13, "-"), (0.0, "-"), (0.2, "2.05"), (2e-4, "2.05e+03")])
+def test_no_ratio_to_the_rounding_of_a_patch_in_one_step_of_depth(recorded, ratio):
+    """The depths of an OAK's card have whole millimetres: in most patches all are equal, sigma is 2.2e-13 mm."""
+    sigma = [Result("card sigma", "mm", value, 0.018, "fit") for value in (recorded, 0.41)]
+    row = beside_table(sigma[:1], sigma[1:], "oak-d-pro").splitlines()[1]
+    assert row.split()[-1] == ratio
