@@ -202,7 +202,7 @@ def test_screening_alone_says_nothing_of_readings_and_of_losses(tmp_path):
     document = json.loads((folder / "choice.json").read_text(encoding="utf-8"))
     document["sensors"] = [document["sensors"][2]]
     for cell in document["sensors"][0]["measurements"].values():
-        cell |= {"trials": 0, "without_value": 0.0, "accepted": None}
+        cell |= {"trials": 0, "without_value": 0.0, "accepted": None, "verdict": "not decided"}
     (folder / "choice.json").write_text(json.dumps(document), encoding="utf-8")
     choice = read_choice(folder)
     assert {(row.accepted, row.without_value) for row in sensor_rows(choice, choice.sensors[0])} == {("–", "–")}
@@ -210,6 +210,8 @@ def test_screening_alone_says_nothing_of_readings_and_of_losses(tmp_path):
         write_choice_page(folder)
     text = html.unescape(re.sub(r"<[^>]*>|\s+", " ", (folder / "choice.html").read_text(encoding="utf-8")))
     assert "0 virtual measurements" not in text
+    # an interval is of virtual measurements; the page has none, and says why the verdict is open
+    assert "that interval" not in text and "predicted by screening alone" in text
 
 
 def test_a_row_names_the_largest_line_of_the_budget_only_if_the_trials_tell_it(run_folder, tmp_path):

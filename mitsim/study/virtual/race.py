@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.arrays import Floats
 from characterisation.statements.selection import Standing, joint_samples, judge
+from characterisation.words.numbers import how_many
 from characterisation.words.progress import say, say_progress, track
 from mitsim.running.time_limit import in_time
 from mitsim.study import RaceTable
@@ -278,10 +279,10 @@ def _next_round(raced: Raced, counts: dict[int, int], rules: RaceTable) -> dict[
 
 
 def _say_state(raced: Raced, counts: dict[int, int], seconds: float) -> None:
-    best = raced.standings[ALL]
+    trials, views = how_many(sum(counts.values()), "trial"), how_many(len(counts), "view")
     say_progress(
-        f"race: {sum(counts.values())} trials in all, {len(counts)} views, {seconds:.0f} s; view {raced.leader(ALL)} "
-        f"leads, {in_words(best, raced.margin)}"
+        f"race: {trials} in all, {views}, {seconds:.0f} s; view {raced.leader(ALL)} leads, "
+        f"{in_words(raced.standings[ALL], raced.margin)}"
     )
 
 
