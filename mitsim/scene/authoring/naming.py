@@ -154,11 +154,9 @@ def described_name(face: Face, low: Floats, high: Floats) -> str:
     if isinstance(surface, Plane):
         return _plane_name(face, surface, low, high)
     if isinstance(surface, Cylinder):
-        angle = round_angle(face.vertices, surface.axis, surface.point)
-        if angle > ROUND:
-            return f"{'boss' if face.convex else 'bore'}_{size(2 * surface.radius)}mm"
-        kind = "round" if face.convex else "slot_end" if angle > _HALF else "fillet"
-        return f"{kind}_r{size(surface.radius)}mm"
+        kind = cylinder_kind(face, surface)
+        whole = kind in ("boss", "bore")
+        return f"{kind}_{size(2 * surface.radius)}mm" if whole else f"{kind}_r{size(surface.radius)}mm"
     if isinstance(surface, Cone):
         angle = np.rad2deg(2 * surface.half_angle)
         if not face.convex:
@@ -170,6 +168,14 @@ def described_name(face: Face, low: Floats, high: Floats) -> str:
     if isinstance(surface, Torus):
         return f"{'round' if face.convex else 'fillet'}_r{size(surface.tube)}mm"
     return "freeform" if face.normals is not None else "face"
+
+
+def cylinder_kind(face: Face, surface: Cylinder) -> str:
+    """Return what a cylindrical face is called: ``boss`` or ``bore`` if it goes round far enough to be measured."""
+    angle = round_angle(face.vertices, surface.axis, surface.point)
+    if angle > ROUND:
+        return "boss" if face.convex else "bore"
+    return "round" if face.convex else "slot_end" if angle > _HALF else "fillet"
 
 
 def _plane_name(face: Face, surface: Plane, low: Floats, high: Floats) -> str:
@@ -185,7 +191,9 @@ def _plane_name(face: Face, surface: Plane, low: Floats, high: Floats) -> str:
     extent = np.sort(_extents(face))
     narrow = extent[0] < _CHAMFER_SHARE * float(np.linalg.norm(high - low))
     upright = abs(surface.normal[2]) < np.sqrt(1 - _ALONG**2)  # like the sides of a hexagonal nut
-    return f"{'chamfer' if narrow else 'side' if upright else 'slope'}_{degrees(off)}deg"
+    if narrow or upright:
+        return f"{'chamfer' if narrow else 'side'}_{degrees(off)}deg"
+    return f"slope_{degrees(np.rad2deg(np.arccos(abs(surface.normal[2]))))}deg"  # against the horizontal
 
 
 def _extents(face: Face) -> Floats:

@@ -24,7 +24,7 @@ from characterisation.files.atomic_io import FULL, write_folder
 from characterisation.files.errors import InputError, nearest
 from mitsim.scene.authoring.drawing_task import DrawnTask, drawn_task
 from mitsim.scene.authoring.face import Face, Torus
-from mitsim.scene.authoring.naming import with_names
+from mitsim.scene.authoring.naming import cylinder_kind, with_names
 from mitsim.scene.authoring.product_information import read_product_information
 from mitsim.scene.authoring.read_mesh import STEP, check_part_file, check_size, read_mesh
 from mitsim.scene.authoring.read_step import Fineness, read_step
@@ -278,9 +278,8 @@ def described(face: Face) -> str:
     if isinstance(surface, Plane):
         description = f"normal {numbers(surface.normal, 3)}, at {numbers(surface.point, 3)}"
     elif isinstance(surface, Cylinder):
-        description = (
-            f"{'boss' if face.convex else 'bore'}, radius {number(surface.radius)}, axis {numbers(surface.axis, 3)}"
-        )
+        kind = cylinder_kind(face, surface).replace("_", " ")
+        description = f"{kind}, radius {number(surface.radius)}, axis {numbers(surface.axis, 3)}"
     elif isinstance(surface, Cone):
         angle = number(float(np.rad2deg(2 * surface.half_angle)), 3)
         description = (

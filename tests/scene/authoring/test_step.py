@@ -15,7 +15,7 @@ from characterisation.files.errors import InputError
 from mitsim.scene.authoring.check_task import read_features
 from mitsim.scene.authoring.fineness import fineness_for, sensor_sigma_mm
 from mitsim.scene.authoring.naming import identifier, size, with_names
-from mitsim.scene.authoring.part_folder import Finishing, finish_names, scene_xml
+from mitsim.scene.authoring.part_folder import Finishing, described, finish_names, scene_xml
 from mitsim.scene.authoring.read_step import Fineness, read_step, step_installed
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
@@ -124,10 +124,24 @@ def test_upright_faces_between_the_axes_are_sides_and_inclined_ones_are_slopes(t
         motion.SetRotation(gp_Ax1(gp_Pnt(0, 0, 0), gp_Dir(*axis)), math.radians(30))
         return BRepBuilderAPI_Transform(BRepPrimAPI_MakeBox(30, 40, 50).Shape(), motion).Shape()
 
-    for axis, kinds in (((0, 0, 1), {"side_30deg": 4}), ((1, 0, 0), {"slope_30deg": 4})):
+    for axis, kinds in (((0, 0, 1), {"side_30deg": 4}), ((1, 0, 0), {"slope_30deg": 2, "slope_60deg": 2})):
         path = write_step([("box", turned(axis), None)], tmp_path / "box.step")
         names = [face.name for face in with_names(read_step(path).faces)]
         assert {kind: sum(name.startswith(kind) for name in names) for kind in kinds} == kinds, names
+
+
+def test_a_rounded_corner_is_described_as_it_is_named(tmp_path):
+    from OCP.BRepAlgoAPI import BRepAlgoAPI_Fuse
+    from OCP.BRepPrimAPI import BRepPrimAPI_MakeBox
+    from OCP.gp import gp_Pnt
+
+    # a plate whose one end is a quarter of a cylinder of radius 12 mm
+    plate = BRepPrimAPI_MakeBox(gp_Pnt(-30, 0, 0), gp_Pnt(0, 12, 8)).Shape()
+    corner = BRepAlgoAPI_Fuse(plate, solid("Cylinder", 12.0, 8.0, math.pi / 2)).Shape()
+    faces = {
+        face.name: face for face in with_names(read_step(write_step([("p", corner, None)], tmp_path / "p.step")).faces)
+    }
+    assert described(faces["round_r12mm"]).startswith("round, radius 12.0")
 
 
 def test_the_ends_of_a_slot_are_no_fillets(tmp_path):
