@@ -27,6 +27,8 @@ _TABLE = re.compile(r"<table.*?</table>", re.DOTALL)
 _HEAD = re.compile(r"<thead.*?</thead>", re.DOTALL)
 _ROW = re.compile(r"<tr.*?</tr>", re.DOTALL)
 _HEADING = re.compile(r'<th\b(?:[^>"]|"[^"]*")*>(.*?)</th>', re.DOTALL)
+#: in a label, which has no tags, for <wbr>: a browser may break a line there [zero-width space]
+_BREAK = "\N{ZERO WIDTH SPACE}"
 _CELL = re.compile(r'<(t[hd])\b((?:[^>"]|"[^"]*")*)>')
 
 
@@ -99,6 +101,6 @@ def _labelled_row(row: str, labels: list[str]) -> str:
 
 def _text(heading: str) -> str:
     """Return the words of a head."""
-    words = re.sub(r"<br>", " ", heading).replace("<small>", ", ")
+    words = re.sub(r"<br>", " ", heading).replace("<wbr>", _BREAK).replace("<small>", ", ")
     words = unescape(re.sub(r"<[^>]*>", "", words))
     return " ".join(words.split()).removeprefix(", ")

@@ -197,8 +197,10 @@ function path(context, line, colour, width) {
   context.stroke();
 }
 
+const font = (size) => `${size}px system-ui, sans-serif`;
+
 function write(context, text, x, y, colour, halo, size = 12) {
-  Object.assign(context, { font: `${size}px system-ui, sans-serif`, textAlign: 'center', textBaseline: 'middle', lineJoin: 'round' });
+  Object.assign(context, { font: font(size), textAlign: 'center', textBaseline: 'middle', lineJoin: 'round' });
   Object.assign(context, { lineWidth: 4, strokeStyle: halo, fillStyle: colour });
   context.strokeText(text, x, y);
   context.fillText(text, x, y);
@@ -234,10 +236,11 @@ function drawSensor(context, i, colour) {
   }
 }
 
-// Draw the names of the features at the centre of their points, and a scale.
+// Draw the names of the features at the centre of their points, or in the next free line below, and a scale.
 function drawNames(context) {
-  const ink = style('--ink'), paper = style('--paper');
+  const ink = style('--ink'), paper = style('--paper'), line = 15, written = [];
   if (state.cloud !== undefined) {
+    context.font = font(12);
     const { places: where, feature } = cloud(state.cloud), count = feature.length;
     data.features.forEach(({ name }, k) => {
       const mean = [0, 0, 0];
@@ -247,7 +250,12 @@ function drawNames(context) {
         number++;
         for (let axis = 0; axis < 3; axis++) mean[axis] += where[axis * count + i];
       }
-      if (number) write(context, name, ...seen.project(mean.map((value) => value / number)).slice(0, 2), ink, paper);
+      if (!number) return;
+      let [x, y] = seen.project(mean.map((value) => value / number));
+      const half = context.measureText(name).width / 2;
+      while (written.some((one) => Math.abs(one.x - x) < one.half + half && Math.abs(one.y - y) < line)) y += line;
+      written.push({ x, y, half });
+      write(context, name, x, y, ink, paper);
     });
   }
   const [length, wide] = seen.scaleBar(), y = seen.height - 14;

@@ -281,3 +281,6 @@ def test_cells_of_tables_are_labelled_by_their_columns():
     table = f"<table>{head}{body}</table>"
     cells = '<td class="x" data-label="Bias, its u">1</td><td data-label="A B">2</td>'
     assert with_labels(f"<p>a</p>{table}") == f"<p>a</p>{table}".replace('<td class="x">1</td><td>2</td>', cells)
+    # a name that may break in the head may break in the label as well
+    narrow = with_labels("<table><thead><tr><th>bore_<wbr>left</th></tr></thead><tr><td>1</td></tr></table>")
+    assert 'data-label="bore_\N{ZERO WIDTH SPACE}left"' in narrow

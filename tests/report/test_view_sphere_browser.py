@@ -413,3 +413,23 @@ def test_the_raster_covers_what_a_square_covers_and_the_nearer_face_hides_the_fa
         # edges: a pixel on both sides of the inner outline, one on the inner side of the outer; corners add a few
         assert abs(found["edges"] - (8 * side + 4 * whole)) < 20
         assert found["hidden"] and not found["free"]
+
+
+def test_names_of_features_do_not_cover_each_other_however_the_part_is_turned(opened):
+    """The top of a boss is in the middle of the plate around it."""
+    opened.tell("""(() => {
+      const draw = CanvasRenderingContext2D.prototype, fill = draw.fillText, measure = draw.measureText;
+      window.written = [];
+      draw.fillText = function (text, x, y) {
+        if (this.canvas.id === 'sphere-seen') window.written.push([text, y]);
+        fill.call(this, text, x, y);
+      };
+      draw.measureText = function (text) { return { width: 1e4 }; };  // names so long that each is beside every other
+      document.getElementById('sphere-seen').focus();
+    })()""")
+    for _ in range(12):
+        opened.tell("window.written = []")
+        opened.press("ArrowUp")
+        opened.rest()
+        lines = sorted(y for name, y in opened.tell("window.written") if name in FEATURES)
+        assert len(lines) > 1 and min(np.diff(lines)) >= 12  # letters of 12 px
