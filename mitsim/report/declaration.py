@@ -84,6 +84,11 @@ class Declaration:
     facts: list[tuple[str, str]]
     notes: list[Note]
 
+    @property
+    def stated(self) -> bool:
+        """Return whether there is a statement of uncertainty, which one can sign."""
+        return bool(self.number)
+
     def marked(self, name: str) -> str:
         """Return the name of a measurement with the marks of its notes."""
         return "\N{NO-BREAK SPACE}".join([name, *(note.mark for note in self.notes if name in note.names)])
@@ -110,6 +115,8 @@ def _of_run(run: Run, geometry: SceneGeometry | None) -> Declaration:
         facts += _of_statement(document, "" if document.exposure else run.about.exposure_rule)
         facts += _influences(document, bool(run.about.lay))
         facts += _rules(stated_rules(document))
+    else:
+        facts.append(("Made by", "screening, from a performance map: u is predicted. The same mitsim run continues"))
     digests = _digests(run.folder, ("statement.json", "task.json", "part.ply", "map.nc"))
     facts.append(("Made with", f"mitsim {run.about.mitsim}, seed {run.about.seed}; SHA-256 of {digests}"))
     date = run.about.date or _day(run.folder / "run.json")

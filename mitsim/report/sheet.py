@@ -32,6 +32,10 @@ _PICTURE = 3.4
 #: height of the lines to sign [in]
 _SIGNATURE = 0.9
 
+#: head of a sheet with a statement, and without one, which has no lines to sign
+_STATEMENT = "Statement of measurement uncertainty by virtual measurements"
+_PREDICTION = "Prediction by screening. Not a statement of measurement uncertainty"
+
 #: facts that only the user knows, to be written by hand
 _TO_FILL_IN = (
     ("Part: drawing number and revision", "Sensor: serial number, date of its calibration", "Valid until"),
@@ -149,7 +153,9 @@ def sheet_figures(declaration: Declaration, geometry: SceneGeometry | None) -> l
             _table(page, _taken(rows, page.room, columns) or [rows.pop(0)], columns)
         if below > page.room:
             page = continued()
-        _sign(_facts(page, declaration, layout.facts, continued))
+        last = _facts(page, declaration, layout.facts, continued)
+        if declaration.stated:
+            _sign(last)
         for number, sheet_page in enumerate(pages, 1):
             _foot(sheet_page, number, len(pages))
     return [sheet_page.figure for sheet_page in pages]
@@ -170,7 +176,7 @@ def _picture(figure: Figure, heights: Sequence[float], declaration: Declaration,
 
 
 def _head(page: Page, declaration: Declaration, lines: int) -> None:
-    page.put(0, "Statement of measurement uncertainty by virtual measurements", 8.5, MUTED)
+    page.put(0, _STATEMENT if declaration.stated else _PREDICTION, 8.5, MUTED)
     right = f"{declaration.date}" + (f"   No. {declaration.number}" if declaration.number else "")
     page.put(ACROSS - text_width(right, 8.5), right, 8.5, MUTED)
     page.place -= 0.22

@@ -262,6 +262,20 @@ def test_a_sheet_draws_no_picture_of_the_page(run_folder, tmp_path, monkeypatch)
     assert len(drawn) == 2  # for wide and for narrow windows
 
 
+def test_a_sheet_without_a_statement_calls_itself_a_prediction_and_cannot_be_signed(run_folder, tmp_path):
+    """Five minutes gave u = 0.016 mm by screening, where virtual measurements find 0.48 mm, above lines to sign."""
+    folder = shutil.copytree(run_folder, tmp_path / "run")
+
+    def words():
+        pages = sheet_figures(read_declaration(folder, None), read_scene_geometry(folder))
+        return " ".join(one.get_text() for page in pages for one in page.texts)
+
+    assert "Signature" in words() and "Statement of measurement uncertainty" in words()
+    (folder / "statement.json").unlink()
+    assert "Signature" not in words() and "Not a statement of measurement uncertainty" in words()
+    assert "u is predicted. The same mitsim run continues" in words()
+
+
 def test_the_sheet_of_a_comparison_has_the_statement_of_the_best_sensor(tmp_path):
     folder = write_choice(tmp_path / "choice")
     declaration = read_declaration(folder, read_scene_geometry(folder))

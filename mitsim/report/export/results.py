@@ -25,6 +25,9 @@ from mitsim.study.run_files import TASK
 from mitsim.study.run_folder import read_run
 from mitsim.study.statement_file import StatedMeasurement
 
+#: what to do about a run without a statement
+_GO_ON = "run the same mitsim run again: it continues; with more --minutes it comes to the statement"
+
 
 @dataclass(frozen=True)
 class ExpectedResult:
@@ -88,7 +91,7 @@ def read_results(folder: str | Path, task_file: str | Path | None = None) -> Run
     """
     run = read_run(folder)
     if run.statement is None:
-        raise InputError(Path(folder) / "statement.json", "", "no such file", "a run with a statement")
+        raise InputError(Path(folder) / "statement.json", "", "no such file", "a run with a statement", _GO_ON)
     task = run.task() if task_file is None else read_task(task_file)
     if list(task.measurements) != list(run.about.measurements):
         raise InputError(

@@ -387,6 +387,13 @@ def test_results_have_the_accepted_readings_of_the_statement(tmp_path):
     assert written == ["19.82", "20.18"]
 
 
+def test_a_run_without_a_statement_says_how_to_go_on(tmp_path):
+    folder = write_expecting_run(tmp_path / "run")
+    (folder / "statement.json").unlink()
+    with pytest.raises(InputError, match=r"statement\.json.*run the same mitsim run again"):
+        read_results(folder)
+
+
 def test_results_are_read_from_a_run(tmp_path):
     folder = with_names_of_tasks(write_expecting_run(tmp_path / "run"))
     statement = json.loads((folder / "statement.json").read_text())
