@@ -138,7 +138,9 @@ def open_study(
     >>> study.views[0].number
     0
     """
-    file = read_toml(path, StudyFile) if file is None else file
+    if file is None:
+        _check_study_file(Path(path))
+        file = read_toml(path, StudyFile)
     if performance_map is not None:
         file = _with_map(file, performance_map)
     path = Path(path)
@@ -232,6 +234,25 @@ def read_map(name: str | Path, sensor: Sensor, folder: str | Path = ".") -> Perf
     if attributes.get("sensor_checksum", sensor_checksum(sensor)) != sensor_checksum(sensor):
         say(f"{file} was made with another version of {sensor.name}, whose parameters have changed since")
     return performance_map
+
+
+def _check_study_file(path: Path) -> None:
+    """Refuse a folder, a scene, and a file that is missing beside a part without a study; say where a study is made."""
+    missing = not path.exists()
+    if path.is_file() and path.suffix.lower() != ".xml":
+        return
+    folder = path if path.is_dir() else path.parent
+    studies = sorted(one.name for one in folder.glob("*.toml") if one.name != "task.toml") if folder.is_dir() else []
+    if missing and (studies or not (folder / "task.toml").is_file()):
+        return  # the reader names the nearest file
+    hint = (
+        f"there is {', '.join(studies[:3])}"
+        if studies
+        else "mitsim part SCENE.xml --edit writes study.toml once something is measured; or copy that of "
+        "docs/how-to/your-own-part.md"
+    )
+    found = "no such file" if missing else "a folder" if path.is_dir() else "a scene"
+    raise InputError(path, "", found, "a study TOML", hint)
 
 
 def _with_map(file: StudyFile, performance_map: str | Path) -> StudyFile:
