@@ -201,10 +201,11 @@ def _credible_chance(surface: Surface, expected: ExpectedPoints, used: ExpectedP
 
 
 def _chance_of_radius(surface: Surface, fit: ExpectedFit) -> float:
-    """Return the probability that the points determine the radius (:func:`~characterisation.features.fits.check_radius`).
+    """Return the probability that the points determine the radius.
 
-    The curvature of an arc of sagitta h over a chord c is 8 h / c^2: its error is normal, and its uncertainty by noise
-    u / r^2 for any radius r. It passes if it is at least 2 k u / r^2.
+    The rule is :func:`~characterisation.features.fits.check_radius`. The curvature of an arc of sagitta h over a chord
+    c is 8 h / c^2: its error is normal, and its uncertainty by noise u / r^2 for any radius r. It passes if it is at
+    least 2 k u / r^2.
     """
     if not isinstance(surface, Cylinder | Sphere):
         return 1.0
