@@ -30,6 +30,7 @@ from mitsim.scene.authoring.read_mesh import STEP, check_part_file, check_size, 
 from mitsim.scene.authoring.read_step import Fineness, read_step
 from mitsim.scene.authoring.segment_mesh import segment_mesh
 from mitsim.scene.authoring.task_text import number, numbers, task_toml
+from mitsim.scene.authoring.units import stated_units
 from mitsim.scene.surface.metals import CONSTANTS
 from mitsim.scene.surface.named_finishes import NAMED_FINISHES, NamedFinish
 from mitsim.scene.surface.processes import PROCESSES
@@ -122,10 +123,11 @@ def read_part(
         made = segment_mesh(mesh.vertices, mesh.triangles, angle_deg, str(path))
         return Part(with_names(made.faces), [*mesh.remarks, *made.remarks])
     drawn = read_step(path, fineness or Fineness(), units)
-    check_size(path, np.concatenate([face.vertices for face in drawn.faces]))
+    size = float(np.linalg.norm(np.ptp(np.concatenate([face.vertices for face in drawn.faces]), axis=0)))
+    remarks = drawn.remarks + check_size(path, size, stated_units(drawn.text))
     faces = with_names(drawn.faces)
     information = read_product_information(drawn.text)
-    return Part(faces, drawn.remarks, drawn_task(information, faces) if information.found else None)
+    return Part(faces, remarks, drawn_task(information, faces) if information.found else None)
 
 
 def write_part(

@@ -17,6 +17,7 @@ import trimesh
 from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError, nearest
 from mitsim.scene.authoring.face import Ints
+from mitsim.scene.authoring.step_mesh import LARGE_MM
 from mitsim.scene.authoring.units import commented_unit, unit_assumed, unit_words
 from mitsim.scene.authoring.unread_mesh import GLTF, unread
 from mitsim.sensor.calibration_qualifiers import LENGTHS_MM, UNITS_MM
@@ -34,6 +35,13 @@ _FOLDED = -0.99999
 _Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 _LARGEST_FILE = 1024**3
+
+#: diagonal of a part that is read [mm]: single precision of a mesh is 8 um at 100 m
+_SIZES_MM = (1.0, 1e5)
+
+#: diagonal of a part without a remark [mm]: a sensor of the presets resolves a smaller one with few points, and none
+#: works at over 5 m; chosen
+_USUAL_MM = (3.0, LARGE_MM)
 
 
 @dataclass(frozen=True)
@@ -65,6 +73,7 @@ def read_mesh(path: str | Path, units: str | None = None) -> Mesh:
     scene = _load(path)
     scale, remarks = _scale(path, scene, units)
     mesh = _gathered(path, scene, scale)
+    remarks += mesh.remarks
     if path.suffix.lower() not in GLTF:
         return Mesh(mesh.vertices, mesh.triangles, remarks)
     remarks += (f"{path.name} has y up, as glTF defines it: turned, so that z is up",)
@@ -176,11 +185,11 @@ def _gathered(path: Path, scene: Any, scale: float) -> Mesh:
     corners = np.concatenate(triangles)
     if not np.isfinite(points).all() or corners.min() < 0 or corners.max() >= len(points):
         raise InputError(path, "", "vertices that are not numbers, or triangles without vertices", "a valid mesh")
-    check_size(path, points[np.unique(corners)])
+    remarks = check_size(path, float(np.linalg.norm(np.ptp(points[np.unique(corners)], axis=0))))
     if path.suffix.lower() in _POLYGONS and (folded := _folded(points, corners)):
         hint = "export triangles, or STEP or STL: polygons that are not convex are not divided correctly"
         raise InputError(path, "", f"{folded} triangles that fold back on a neighbour", "a surface without folds", hint)
-    return Mesh(points, corners)
+    return Mesh(points, corners, tuple(remarks))
 
 
 def _folded(points: Floats, triangles: Ints) -> int:
@@ -207,15 +216,22 @@ def _folded(points: Floats, triangles: Ints) -> int:
     return int((np.einsum("ij,ij->i", normals[every[:, 0]], normals[every[:, 1]]) < _FOLDED).sum())
 
 
-def check_size(path: Path, points: Floats) -> None:
-    """Check that a part with these points (n, 3) [mm] measures 1 mm to 100 m across.
+def check_size(path: Path, size: float, stated: str = "") -> list[str]:
+    """Return a remark about the unit if a part of this diagonal [mm] is not of a usual size.
+
+    ``stated`` is the unit of a file in which ``--units`` cannot change it.
 
     Raises
     ------
     InputError
-        If it does not.
+        If the part does not measure 1 mm to 100 m across.
     """
-    size = float(np.linalg.norm(np.ptp(points, axis=0)))
-    if not 1.0 <= size <= 1e5:
-        hint = "give --units if the file has another unit: m or inch, for example" if size < 1 else "see --units"
-        raise InputError(path, "", f"a part {size:g} mm across", "1 mm to 100 m", hint)
+    hint = "give --units if the file has another unit: m or inch, for example"
+    if stated:
+        hint = f"the file states {stated}: if that is wrong, export it again from the CAD program in the right unit"
+    across = f"{size / 1e3:.3g} m" if size > _USUAL_MM[1] else f"{size:.3g} mm"
+    if not _SIZES_MM[0] <= size <= _SIZES_MM[1]:
+        raise InputError(path, "", f"a part {across} across", "1 mm to 100 m", hint)
+    if _USUAL_MM[0] <= size <= _USUAL_MM[1]:
+        return []
+    return [f"the part is {across} across, which is unusual; {hint}"]

@@ -16,7 +16,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,8 @@ from mitsim.scene.authoring.face import Face, Ints, Surface, Torus, centred, mes
 from mitsim.scene.authoring.join_faces import join_faces
 from mitsim.scene.authoring.part21 import StepText, read_step_text
 from mitsim.scene.authoring.placements import check_placements
-from mitsim.scene.authoring.units import step_units, unit_assumed, unit_words
+from mitsim.scene.authoring.read_mesh import check_size
+from mitsim.scene.authoring.units import stated_units, step_units, unit_assumed
 from mitsim.sensor.calibration_qualifiers import LENGTHS_MM
 
 #: distance of the default mesh from the true surface, without a sensor [mm]; chosen
@@ -46,7 +47,11 @@ _LINE_EVERY_S = 5.0
 #: finest mesh [mm]; finer ones exceed every sensor, and single precision for a part of a metre
 FINEST_MM = 1e-4
 
-_SECONDS = 3600
+#: most triangles of a part without a sensor: 85 MB of files, and a minute; chosen
+MOST_TRIANGLES = 1_000_000
+
+#: most time of the process [s]: some ten times what the most triangles take; chosen
+_SECONDS = 1800
 _INSTALL = 'pip install "cadquery-ocp-novtk<8" (or "mitsim[step]"), or save the part as STL'
 _MESHES = "an STL, OBJ, PLY, OFF, 3MF or glTF file"
 
@@ -57,15 +62,14 @@ class Fineness:
 
     - ``chord_mm`` of faces that a task can measure.
     - ``others_mm`` of tori and free forms; None for the same.
-    - ``most`` triangles of a file, beyond which the largest faces become coarser, measured ones first; None: no limit.
+    - ``most`` triangles of a file, beyond which the largest faces become coarser, measured ones first.
     - ``fitted_mm2``: chord error [mm] of a sphere or cylinder per standard uncertainty of its fitted radius, for one
-      point of noise 1 on each mm^2. Faces of few points have up to ``others_mm``; None: all have ``chord_mm``. It needs
-      ``most``.
+      point of noise 1 on each mm^2. Faces of few points have up to ``others_mm``; None: all have ``chord_mm``.
     """
 
     chord_mm: float = CHORD_MM
     others_mm: float | None = None
-    most: int | None = None
+    most: int = MOST_TRIANGLES
     fitted_mm2: float | None = None
 
 
@@ -114,10 +118,10 @@ def read_step(path: str | Path, fineness: Fineness = _DEFAULT, units: str | None
             repr(BEND),
             repr(scale),
             repr(_requested(fineness.others_mm or fineness.chord_mm)),
-            repr(fineness.most or 0),
+            repr(fineness.most),
             repr((fineness.fitted_mm2 or 0.0) / 2),  # as the others, for what OpenCASCADE exceeds
         ]
-        done = run_worker(command, path)
+        done = run_worker(command, path, lambda size: check_size(path, size * scale, stated_units(text)))
         if "ImportError" in done.stderr or "ModuleNotFoundError" in done.stderr:
             found = "a STEP file, and an unsupported version of OpenCASCADE"
             raise InputError(path, "", found, _MESHES, _INSTALL)
@@ -147,7 +151,8 @@ def read_step(path: str | Path, fineness: Fineness = _DEFAULT, units: str | None
         coarse = 2 * read["chord_mm"]
         remarks.append(
             f"the largest curved faces are meshed to {coarse:.2g} mm instead of {fineness.chord_mm:.2g} mm, which would"
-            f" take over {fineness.most:,} triangles; --chord has no such limit"
+            f" take over {fineness.most:,} triangles, or too long for a part of over 10 m"
+            + (f"; --chord allows {MOST_TRIANGLES:,}" if fineness.most < MOST_TRIANGLES else "")
         )
     closed = all(record["closed"] for record in read["faces"])
     if not closed:
@@ -160,13 +165,13 @@ def _requested(chord_mm: float) -> float:
     return max(chord_mm / 2, FINEST_MM)
 
 
-def run_worker(command: list[str], path: Path) -> subprocess.CompletedProcess[str]:
-    """Run the process that reads ``path``, and report its progress.
+def run_worker(command: list[str], path: Path, check: Callable[[float], list[str]]) -> subprocess.CompletedProcess[str]:
+    """Run the process that reads ``path``, check the size of the part before it is meshed, and report the progress.
 
     Raises
     ------
     InputError
-        If it takes more than an hour.
+        If it takes more than half an hour, or as ``check``.
     """
     with (
         tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors,
@@ -184,13 +189,14 @@ def run_worker(command: list[str], path: Path) -> subprocess.CompletedProcess[st
         limit.start()
         try:
             assert process.stdout is not None
-            _report(process.stdout, path)
+            _report(process.stdout, path, check)
             code = process.wait()
         finally:
             limit.cancel()
             process.kill()
         if over.is_set():
-            raise InputError(path, "", "a part that cannot be meshed within an hour", "a simpler one")
+            hint = "check its unit and size, give a larger --chord, or leave out details"
+            raise InputError(path, "", f"a part that cannot be meshed within {_SECONDS // 60} minutes", "others", hint)
         errors.seek(0)
         return subprocess.CompletedProcess(command, code, "", errors.read())
 
@@ -202,11 +208,14 @@ def _environment() -> dict[str, str]:
     return os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
 
 
-def _report(lines: Iterable[str], path: Path) -> None:
-    """Report how many triangles are made, and the time that the others will take."""
+def _report(lines: Iterable[str], path: Path, check: Callable[[float], list[str]]) -> None:
+    """Check the size, and report how many triangles are made, and the time that the others will take."""
     start = last = time.monotonic()
     say_progress(f"{path.name}: reading and meshing its faces")
     for line in lines:
+        if line.startswith(step_mesh.SPANS):
+            for remark in check(float(line.removeprefix(step_mesh.SPANS))):
+                say_progress(f"{path.name}: {remark}")
         if not line.startswith(step_mesh.TOLD):
             continue
         made, total = map(float, line.removeprefix(step_mesh.TOLD).split())
@@ -228,7 +237,7 @@ def _scale(path: Path, text: StepText, units: str | None) -> tuple[float, list[s
             return 1.0, [unit_assumed(path.name)]
         return LENGTHS_MM[units], []
     if units is not None and not all(math.isclose(length, LENGTHS_MM[units]) for length in stated):
-        words = " and ".join(map(unit_words, stated))
+        words = stated_units(text)
         hint = "leave out --units: the file's dimensions and tolerances have units of their own, too"
         raise InputError("--units", "", repr(units), f"{words}, the unit that {path.name} states", hint)
     return 1.0, []

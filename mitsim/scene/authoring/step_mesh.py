@@ -1,6 +1,6 @@
 """Mesh faces with OpenCASCADE, as finely as asked, and report the progress on stdout.
 
-Signal chain: faces -> a coarse mesh, which counts triangles and shows how well a radius can be fitted -> chord of each
+Signal chain: faces -> coarse meshes, which count triangles and show how well a radius can be fitted -> chord of each
 face within the number of triangles -> meshes, finest first, that share their points on edges -> vertices, normals and
 triangles of each face.
 
@@ -16,14 +16,26 @@ import numpy as np
 #: begin of a line of progress
 TOLD = "mitsim meshed "
 
+#: begin of the line with the part's diagonal [mm], before that mesh is made
+SPANS = "mitsim spans "
+
 #: kinds of surfaces that a task can measure
 MEASURED = ("plane", "cylinder", "cone", "sphere")
 
 #: triangles that are made between two lines of progress
 _STEP = 50_000
 
-#: factor by which the first mesh, which counts triangles, is coarser; chosen
+#: factor by which the mesh that counts triangles is coarser; chosen
 _COARSER = 16.0
+
+#: diagonal of a part [mm] beyond which no sensor sees it, and its unit is probably wrong: its chord grows with it
+LARGE_MM = 1e4
+
+#: least chord of such a part as a share of its diagonal: a fifth of that of a part of 100 mm at the default; chosen
+LARGE_SHARE = 1e-5
+
+#: chord of the first mesh as a share of the part's diagonal; chosen
+_FIRST = 1e-3
 
 #: largest angle between its facets [rad]: only the chord limits them; chosen
 _FLAT = 1.0
@@ -144,20 +156,74 @@ def chords(
     --------
     mesh : meshes with them
     """
-    straight = np.array([kind in ("plane", "cylinder") for kind in kinds])
     measured = np.array([kind in MEASURED for kind in kinds])
     out = np.where(measured, chord, other_chord)
-
-    def expected() -> np.ndarray:
-        return np.maximum(counts * (coarse / out) ** np.where(straight, 0.5, 1.0), 1.0)
-
-    while most and (now := expected()).sum() > most:
+    while most and (now := expected(kinds, counts, coarse, out)).sum() > most:
         finer = measured & (2 * out <= other_chord)
         chosen = finer if finer.any() else now > 2
         if not chosen.any():
             break
         out[chosen & (now >= 0.5 * now[chosen].max())] *= 2
-    return out, expected()
+    return out, expected(kinds, counts, coarse, out)
+
+
+def expected(kinds: list[str], counts: np.ndarray, coarse: float, chord: float | np.ndarray) -> np.ndarray:
+    """Return about how many triangles (n,) faces have at ``chord``, from their ``counts`` at the chord ``coarse``.
+
+    Parameters
+    ----------
+    kinds, counts, coarse, chord
+        As for :func:`chords`.
+
+    See Also
+    --------
+    chords : within a number of triangles
+    """
+    straight = np.array([kind in ("plane", "cylinder") for kind in kinds])
+    return np.maximum(counts * (coarse / chord) ** np.where(straight, 0.5, 1.0), 1.0)
+
+
+def counted(shapes: list[Any], faces: list[Any], kinds: list[str], chord: float, most: int) -> tuple[np.ndarray, float]:
+    """Mesh faces coarsely, and print the part's diagonal; return their triangles (n,), and the chord of that mesh.
+
+    The first mesh is as coarse as the part is large, so that its time has a limit. It becomes finer, down to ``chord``,
+    as long as that takes at most about ``most`` triangles.
+
+    Parameters
+    ----------
+    shapes, faces, kinds, chord, most
+        As for :func:`mesh`.
+
+    See Also
+    --------
+    mesh : as finely as asked
+    """
+    from OCP.BRepTools import BRepTools
+
+    coarse = max(chord, _FIRST * diagonal(shapes, False))
+    mesh_together(faces, coarse, _FLAT)
+    print(f"{SPANS}{diagonal(shapes, True)!r}", flush=True)
+    while True:
+        counts = np.array([triangle_count(face) for face in faces], float)
+        finer = max(chord, coarse / _COARSER)
+        if finer == coarse or expected(kinds, counts, coarse, finer).sum() > most:
+            return counts, coarse
+        for shape in shapes:
+            BRepTools.Clean_s(shape)
+        coarse = finer
+        mesh_together(faces, coarse, _FLAT)
+
+
+def diagonal(shapes: list[Any], meshed: bool) -> float:
+    """Return the diagonal of some shapes, from their meshes or from a box that may be larger."""
+    from OCP.Bnd import Bnd_Box
+    from OCP.BRepBndLib import BRepBndLib
+
+    box = Bnd_Box()
+    for shape in shapes:
+        BRepBndLib.Add_s(shape, box, meshed)
+    box.SetGap(0.0)  # else it adds the chord
+    return 0.0 if box.IsVoid() else float(np.sqrt(box.SquareExtent()))
 
 
 def mesh(  # noqa: PLR0913 - one number each
@@ -195,13 +261,12 @@ def mesh(  # noqa: PLR0913 - one number each
     if most:
         from OCP.BRepTools import BRepTools
 
-        mesh_together(faces, _COARSER * chord, _FLAT)
-        counts = np.array([triangle_count(face) for face in faces], float)
+        counts, coarse = counted(shapes, faces, kinds, _COARSER * chord, most)
         wanted = fitted_chords(faces, kinds, chord, other_chord, fitted) if fitted else np.full(len(faces), chord)
         for shape in shapes:
             BRepTools.Clean_s(shape)
-        chord_of, planned = chords(kinds, counts, _COARSER * chord, wanted, other_chord, most)
-        coarsened = float((chord_of / wanted)[measured].max(initial=1.0))
+        chord_of, planned = chords(kinds, counts, coarse, wanted, other_chord, most)
+        coarsened = float((chord_of / np.where(measured, wanted, other_chord)).max(initial=1.0))
     order = np.lexsort((planned, chord_of))
     made, told = np.cumsum(planned[order]), 0.0
     for number, here in enumerate(order):
@@ -211,11 +276,10 @@ def mesh(  # noqa: PLR0913 - one number each
             told = float(made[number])
             if most:
                 print(f"{TOLD}{told:.0f} {made[-1]:.0f}", flush=True)
-    for number, face in enumerate(faces):
-        if not triangle_count(face):
-            mesh_together(
-                [*(meshed for meshed in faces if triangle_count(meshed)), face], float(chord_of[number]), bend, False
-            )
+    lost = [number for number, face in enumerate(faces) if not triangle_count(face)]
+    for here in np.unique(chord_of[lost]):
+        again = [faces[number] for number in lost if chord_of[number] == here]
+        mesh_together([*(face for face in faces if triangle_count(face)), *again], float(here), bend, False)
     return chord * coarsened
 
 

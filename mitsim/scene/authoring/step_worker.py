@@ -12,7 +12,7 @@ B-splines, extrusions and revolutions within :data:`SAME_MM` of a simple surface
 
 UNIT_MM is the size of the unit that OpenCASCADE takes for mm: 1, except in a file that states no unit. Tori and free
 forms are meshed to OTHERS_MM. The largest faces become coarser where all would have over MOST triangles; 0 is no limit
-(:mod:`mitsim.scene.authoring.step_mesh`).
+(:mod:`mitsim.scene.authoring.step_mesh`). The chord of a part of over 10 m is at least 1e-5 of its diagonal.
 
 It imports no other module of ``mitsim``, so that it starts quickly.
 """
@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from mitsim.scene.authoring.step_mesh import mesh, triangles_of
+from mitsim.scene.authoring.step_mesh import LARGE_MM, LARGE_SHARE, diagonal, mesh, triangles_of
 
 #: a spline within this of a plane, cylinder, cone or sphere is written as such [mm]
 SAME_MM = 1e-4
@@ -270,6 +270,8 @@ def convert(  # noqa: PLR0913 - the arguments of the command
     there = bodies(document)
     other_chord = chord_mm if others_mm is None else others_mm
     shapes = [shape for _, shape, _ in there]
+    if (size := diagonal(shapes, False) * unit_mm) > LARGE_MM:
+        chord_mm, other_chord = (max(one, LARGE_SHARE * size) for one in (chord_mm, other_chord))
     surfaces = FaceSurfaces(shapes, SAME_MM / unit_mm)
     kinds = [surfaces.of(face)["kind"] for face in surfaces.faces]
     fitted = fitted_mm2 / unit_mm**2

@@ -85,6 +85,11 @@ def step_units(text: StepText) -> list[float]:
     return list(sizes)
 
 
+def stated_units(text: StepText) -> str:
+    """Return the units of length that a STEP file states, in words; an empty text without one."""
+    return " and ".join(map(unit_words, step_units(text)))
+
+
 def _is_length(unit: Entity) -> bool:
     si = unit.of("SI_UNIT")
     metre = si is not None and any(isinstance(value, Enumeration) and value.name == "METRE" for value in si)

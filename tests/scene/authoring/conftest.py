@@ -9,7 +9,7 @@ import pytest
 from mitsim.scene.authoring import read_step, step_worker
 
 
-def convert_here(command, path):
+def convert_here(command, path, check):
     """What :func:`read_step.run_worker` does, in this process."""
     *_, worker, path, out = command[:6]
     assert worker == step_worker.__name__
