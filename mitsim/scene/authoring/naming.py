@@ -18,6 +18,7 @@ from dataclasses import replace
 from decimal import ROUND_HALF_UP, Decimal
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
 from characterisation.files.arrays import Floats
@@ -48,6 +49,9 @@ _GAP = 0.55
 #: noise of a file, and facets of the default mesh at the rim of a round face, move its place by less [mm]; chosen
 _NOISE_MM = 0.02
 
+#: faces touch where their vertices are this close [mm]; the faces of a CAD file share the points of their edges; chosen
+_TOUCHING_MM = 1e-3
+
 #: placeholders of CAD programs for faces without a name
 _NO_NAME = re.compile(r"(none|null|unnamed|advanced_?face|face|surface|shape|body|solid|\W)*[\d\W_]*", re.IGNORECASE)
 
@@ -74,7 +78,15 @@ def with_names(faces: Sequence[Face]) -> list[Face]:
     parts = _part_names(faces)
     groups = defaultdict(list)
     for number, face in enumerate(faces):
-        groups[parts[number] + (_given(face) or described_name(face, low, high))].append(number)
+        given, described = _given(face), described_name(face, low, high)
+        if (
+            not given
+            and described.startswith("chamfer_")
+            and isinstance(face.surface, Plane)
+            and _is_floor(face, faces)
+        ):
+            described = _oblique(face.surface)
+        groups[parts[number] + (given or described)].append(number)
     names: dict[int, str] = {}
     for base, members in groups.items():
         for number, suffix in zip(members, _distinguished([faces[n] for n in members], high - low), strict=True):
@@ -187,13 +199,38 @@ def _plane_name(face: Face, surface: Plane, low: Floats, high: Floats) -> str:
         if abs(at - (high if up else low)[along]) < 1e-3 * max(float(high[along] - low[along]), 1.0):
             return name
         return f"{name}_at_{'xyz'[along]}{size(at)}mm"
-    off = float(np.rad2deg(np.arccos(np.abs(surface.normal).max())))
-    extent = np.sort(_extents(face))
-    narrow = extent[0] < _CHAMFER_SHARE * float(np.linalg.norm(high - low))
+    narrow = _extents(face).min() < _CHAMFER_SHARE * float(np.linalg.norm(high - low))
+    return f"chamfer_{degrees(_off_axis(surface))}deg" if narrow else _oblique(surface)
+
+
+def _off_axis(surface: Plane) -> float:
+    """Return the angle [deg] of a plane's normal to the nearest axis."""
+    return float(np.rad2deg(np.arccos(np.abs(surface.normal).max())))
+
+
+def _oblique(surface: Plane) -> str:
     upright = abs(surface.normal[2]) < np.sqrt(1 - _ALONG**2)  # like the sides of a hexagonal nut
-    if narrow or upright:
-        return f"{'chamfer' if narrow else 'side'}_{degrees(off)}deg"
+    if upright:
+        return f"side_{degrees(_off_axis(surface))}deg"
     return f"slope_{degrees(np.rad2deg(np.arccos(abs(surface.normal[2]))))}deg"  # against the horizontal
+
+
+def _is_floor(face: Face, faces: Sequence[Face]) -> bool:
+    """Return whether a plane's neighbours rise from it, as from the floor of a bore, along most of its outline."""
+    surface, tree, rise = face.surface, cKDTree(face.vertices), 0.0
+    low, high = face.vertices.min(axis=0) - _TOUCHING_MM, face.vertices.max(axis=0) + _TOUCHING_MM
+    assert isinstance(surface, Plane)
+    for other in faces:
+        near = ((other.vertices >= low) & (other.vertices <= high)).all(axis=1)
+        if other is face or other.body != face.body or not near.any():
+            continue
+        near[near] = tree.query(other.vertices[near], distance_upper_bound=_TOUCHING_MM)[0] < np.inf
+        touching = near[other.triangles]
+        corners, touches = other.vertices[other.triangles][(two := touching.sum(axis=1) == 2)], touching[two]
+        ends = corners[touches].reshape(-1, 2, 3)
+        beyond = (corners[~touches] - surface.point) @ surface.normal
+        rise += float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) @ np.sign(beyond))
+    return rise > 0
 
 
 def _extents(face: Face) -> Floats:

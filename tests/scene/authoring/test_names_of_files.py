@@ -1,0 +1,39 @@
+"""Names of faces and bodies that a file does not give, or that a CAD program wrote without meaning."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mitsim.scene.authoring.naming import with_names
+from mitsim.scene.authoring.part_folder import read_part
+from mitsim.scene.authoring.read_step import step_installed
+from mitsim.scene.authoring.segment_mesh import segment_mesh
+from tests.scene.authoring.bracket import edge_at, write_step
+
+pytestmark = [
+    pytest.mark.skipif(not step_installed(), reason="OpenCASCADE, which reads STEP, is not installed"),
+    pytest.mark.usefixtures("step_here"),
+]
+
+
+def test_the_floor_of_an_oblique_blind_bore_is_no_chamfer(tmp_path):
+    from OCP.BRepAlgoAPI import BRepAlgoAPI_Cut
+    from OCP.BRepFilletAPI import BRepFilletAPI_MakeChamfer
+    from OCP.BRepPrimAPI import BRepPrimAPI_MakeBox, BRepPrimAPI_MakeCylinder
+    from OCP.gp import gp_Ax2, gp_Dir, gp_Pnt
+
+    box = BRepPrimAPI_MakeBox(80.0, 60.0, 40.0).Shape()
+    chamfer = BRepFilletAPI_MakeChamfer(box)
+    chamfer.Add(3.0, edge_at(box, (80, 30, 40), (0, 1, 0)))
+    along = gp_Dir(np.sin(np.deg2rad(20)), 0, np.cos(np.deg2rad(20)))
+    bore = BRepPrimAPI_MakeCylinder(gp_Ax2(gp_Pnt(40, 30, 25), along), 4.0, 60.0).Shape()
+    solid = BRepAlgoAPI_Cut(chamfer.Shape(), bore).Shape()
+    drawn = read_part(write_step([("block", solid, None)], tmp_path / "block.step")).faces
+    oblique = {face.name: face for face in drawn if face.kind == "plane" and "deg" in face.name}
+    assert set(oblique) == {"chamfer_45deg", "slope_20deg"}
+    assert np.allclose(oblique["slope_20deg"].surface.point, [40, 30, 25], atol=1e-3)
+    start = np.cumsum([0, *(len(face.vertices) for face in drawn)])
+    triangles = np.concatenate([face.triangles + at for face, at in zip(drawn, start, strict=False)])
+    meshed = with_names(segment_mesh(np.concatenate([face.vertices for face in drawn]), triangles).faces)
+    assert set(oblique) == {face.name for face in meshed if face.kind == "plane" and "deg" in face.name}
