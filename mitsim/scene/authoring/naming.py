@@ -55,6 +55,14 @@ _TOUCHING_MM = 1e-3
 #: placeholders of CAD programs for faces without a name
 _NO_NAME = re.compile(r"(none|null|unnamed|advanced_?face|face|surface|shape|body|solid|\W)*[\d\W_]*", re.IGNORECASE)
 
+#: names of bodies that a program wrote for want of one: OpenCASCADE's product and label, a GUID, the type of the shape
+_NO_PART = re.compile(
+    r"(open cascade step translator.*|=>\[[\d:]*\]|\{?[0-9a-f]{8}(-?[0-9a-f]{4}){3}-?[0-9a-f]{12}\}?"
+    r"|compound|compsolid|(manifold[ _])?solid([ _]brep)?|shell|shape|body|part|unnamed|untitled|no[ _]?name|none|null"
+    r"|\W)*",
+    re.IGNORECASE | re.DOTALL,
+)
+
 #: ids of finishes in a scene (:func:`~mitsim.scene.authoring.part_folder.finish_names`)
 _FINISH = re.compile(r"finish(_[0-9a-f]{6}|_none)?", re.IGNORECASE)
 
@@ -146,17 +154,22 @@ def _is_mark(character: str) -> bool:
 
 def _part_names(faces: Sequence[Face]) -> list[str]:
     """Return a prefix such as ``lid_`` for each face of an assembly's part; empty for a single body."""
-    bodies = {face.body: face.part for face in faces}
+    bodies = defaultdict(list)
+    for face in faces:
+        bodies[face.body].append(face)
     if len(bodies) == 1:
         return [""] * len(faces)
-    middles = [np.concatenate([f.vertices for f in faces if f.body == body]).mean(axis=0) for body in bodies]
+    middles = [np.concatenate([face.vertices for face in members]).mean(axis=0) for members in bodies.values()]
     rank = dict(zip(bodies, _ranks(np.array(middles)), strict=True))
-    order = sorted(bodies, key=lambda body: (bodies[body], rank[body][::-1]))
-    names: dict[int, str] = {}
-    for body in order:
-        name = identifier(bodies[body] or "part", _LONGEST_PART)
-        alike = [part for part in order if identifier(bodies[part] or "part", _LONGEST_PART) == name]
-        names[body] = name if len(alike) == 1 else f"{name}_{alike.index(body) + 1}"
+    given = {body: "" if _NO_PART.fullmatch(members[0].part) else members[0].part for body, members in bodies.items()}
+    groups = defaultdict(list)
+    for body in sorted(bodies, key=lambda body: (given[body], rank[body][::-1])):
+        groups[identifier(given[body] or "part", _LONGEST_PART)].append(body)
+    names = {
+        body: name if len(alike) == 1 else f"{name}_{number}"
+        for name, alike in groups.items()
+        for number, body in enumerate(alike, 1)
+    }
     return [f"{names[face.body]}_" for face in faces]
 
 

@@ -37,3 +37,32 @@ def test_the_floor_of_an_oblique_blind_bore_is_no_chamfer(tmp_path):
     triangles = np.concatenate([face.triangles + at for face, at in zip(drawn, start, strict=False)])
     meshed = with_names(segment_mesh(np.concatenate([face.vertices for face in drawn]), triangles).faces)
     assert set(oblique) == {face.name for face in meshed if face.kind == "plane" and "deg" in face.name}
+
+
+@pytest.mark.parametrize(
+    ("written", "prefixes"),
+    [
+        (("Open CASCADE STEP translator 7.9 10", "Open CASCADE STEP translator 7.9 9"), ("part_1_", "part_2_")),
+        (("{3F2504E0-4F89-11D3-9A0C-0305E82C3301}", "lid"), ("part_", "lid_")),
+        (("=>[0:1:1:2]", "SOLID"), ("part_1_", "part_2_")),
+        (("COMPOUND", "Solid 2"), ("part_", "Solid_2_")),
+        (("Part1", "Body 2"), ("Part1_", "Body_2_")),
+        (("lid", "lid"), ("lid_1_", "lid_2_")),
+        (("a/b", "it''s \\X2\\00F6\\X0\\l"), ("a_b_", "it_s_öl_")),
+    ],
+)
+def test_a_body_without_a_name_of_its_own_is_a_numbered_part(tmp_path, written, prefixes):
+    from OCP.BRepPrimAPI import BRepPrimAPI_MakeBox
+    from OCP.gp import gp_Pnt
+
+    boxes = [BRepPrimAPI_MakeBox(gp_Pnt(30.0 * at, 0, 0), 10.0, 10.0, 10.0).Shape() for at in range(2)]
+    path = write_step([("FIRST", boxes[0], None), ("SECOND", boxes[1], None)], tmp_path / "two.step")
+    text = path.read_text()
+    for placeholder, name in zip(("FIRST", "SECOND"), written, strict=True):
+        assert f"'{placeholder}'" in text
+        text = text.replace(f"'{placeholder}'", f"'{name}'")
+    path.write_text(text)
+    for prefix, at in zip(prefixes, range(2), strict=True):
+        names = {face.name for face in read_part(path).faces if abs(face.vertices[:, 0].mean() - 30 * at - 5) < 10}
+        assert len(names) == 6
+        assert all(name.startswith(prefix) for name in names)
