@@ -44,6 +44,9 @@ BEND = 0.2
 #: seconds between lines of progress
 _LINE_EVERY_S = 5.0
 
+#: seconds between lines that say that the process still runs: one face with thousands of holes takes minutes; chosen
+_STILL_EVERY_S = 30.0
+
 #: finest mesh [mm]; finer ones exceed every sensor, and single precision for a part of a metre
 FINEST_MM = 1e-4
 
@@ -179,20 +182,28 @@ def run_worker(command: list[str], path: Path, check: Callable[[float], list[str
             command, stdout=subprocess.PIPE, stderr=errors, text=True, errors="replace", env=_environment()
         ) as process,
     ):
-        over = threading.Event()
+        over, ended = threading.Event(), threading.Event()
 
         def stop() -> None:
             over.set()
             process.kill()
 
+        def say_still() -> None:
+            start = time.monotonic()
+            while not ended.wait(_STILL_EVERY_S):
+                taken = time.monotonic() - start
+                say_progress(f"{path.name}: still meshing after {taken:.0f} s; it ends after {_SECONDS / 60:.0f} min")
+
         limit = threading.Timer(_SECONDS, stop)
         limit.start()
+        threading.Thread(target=say_still, daemon=True).start()
         try:
             assert process.stdout is not None
             _report(process.stdout, path, check)
             code = process.wait()
         finally:
             limit.cancel()
+            ended.set()
             process.kill()
         if over.is_set():
             hint = "check its unit and size, give a larger --chord, or leave out details"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 
 import numpy as np
@@ -56,3 +57,10 @@ def test_a_part_that_cannot_be_meshed_in_time_is_told(ring_in, monkeypatch):
     with pytest.raises(InputError, match=r"cannot be meshed within .* check its unit and size, give a larger --chord"):
         read_part(ring_in(".MILLI."))
     assert time.monotonic() - start < 60
+
+
+def test_a_face_that_takes_long_does_not_leave_the_user_without_a_word(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(reading, "_STILL_EVERY_S", 0.2)
+    command = [sys.executable, "-c", "import time; time.sleep(1)"]
+    reading.run_worker(command, tmp_path / "plate.step", lambda size: [])
+    assert "plate.step: still meshing after" in capsys.readouterr().err
