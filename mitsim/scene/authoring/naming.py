@@ -49,6 +49,9 @@ _GAP = 0.55
 #: noise of a file, and facets of the default mesh at the rim of a round face, move its place by less [mm]; chosen
 _NOISE_MM = 0.02
 
+#: the wide end of a cone and the bore that it ends agree within this share of its radius; chosen
+_OF_RADIUS = 0.01
+
 #: faces touch where their vertices are this close [mm]; the faces of a CAD file share the points of their edges; chosen
 _TOUCHING_MM = 1e-3
 
@@ -94,6 +97,8 @@ def with_names(faces: Sequence[Face]) -> list[Face]:
             and _is_floor(face, faces)
         ):
             described = _oblique(face.surface)
+        if not given and described.startswith("countersink_") and any(_ends(face, other) for other in faces):
+            described = described.replace("countersink", "cone")
         groups[parts[number] + (given or described)].append(number)
     names: dict[int, str] = {}
     for base, members in groups.items():
@@ -244,6 +249,20 @@ def _is_floor(face: Face, faces: Sequence[Face]) -> bool:
         beyond = (corners[~touches] - surface.point) @ surface.normal
         rise += float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) @ np.sign(beyond))
     return rise > 0
+
+
+def _ends(face: Face, bore: Face) -> bool:
+    """Return whether the wide end of a cone lies in a bore, as the tip of a drill, and not at a surface."""
+    cone, cylinder = face.surface, bore.surface
+    if not isinstance(cone, Cone) or not isinstance(cylinder, Cylinder) or bore.convex or bore.body != face.body:
+        return False
+    limit = _OF_RADIUS * cone.radius
+    way = cone.point - cylinder.point
+    off = float(np.linalg.norm(way - (way @ cylinder.axis) * cylinder.axis))
+    along = (bore.vertices - cone.point) @ cylinder.axis
+    aligned = abs(float(cone.axis @ cylinder.axis)) >= _ALONG
+    at_end = min(abs(float(along.min())), abs(float(along.max()))) <= limit
+    return aligned and at_end and off <= limit and abs(cone.radius - cylinder.radius) <= limit
 
 
 def _extents(face: Face) -> Floats:

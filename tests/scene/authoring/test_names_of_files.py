@@ -39,6 +39,25 @@ def test_the_floor_of_an_oblique_blind_bore_is_no_chamfer(tmp_path):
     assert set(oblique) == {face.name for face in meshed if face.kind == "plane" and "deg" in face.name}
 
 
+def test_the_tip_of_a_drilled_bore_is_no_countersink(tmp_path):
+    from OCP.BRepAlgoAPI import BRepAlgoAPI_Cut
+    from OCP.BRepPrimAPI import BRepPrimAPI_MakeBox, BRepPrimAPI_MakeCone, BRepPrimAPI_MakeCylinder
+    from OCP.gp import gp_Ax2, gp_Dir, gp_Pnt
+
+    tip = 5 / np.tan(np.deg2rad(59))
+    up = gp_Dir(0, 0, 1)
+    solid = BRepPrimAPI_MakeBox(80.0, 60.0, 20.0).Shape()
+    for tool in (
+        BRepPrimAPI_MakeCylinder(gp_Ax2(gp_Pnt(20, 30, 8), up), 5.0, 20.0),
+        BRepPrimAPI_MakeCone(gp_Ax2(gp_Pnt(20, 30, 8 - tip), up), 0.0, 5.0, tip),
+        BRepPrimAPI_MakeCylinder(gp_Ax2(gp_Pnt(60, 30, -1), up), 3.0, 30.0),
+        BRepPrimAPI_MakeCone(gp_Ax2(gp_Pnt(60, 30, 16), up), 3.0, 7.0, 4.0),
+    ):
+        solid = BRepAlgoAPI_Cut(solid, tool.Shape()).Shape()
+    faces = read_part(write_step([("block", solid, None)], tmp_path / "block.step")).faces
+    assert {face.name for face in faces if face.kind == "cone"} == {"cone_118deg", "countersink_90deg"}
+
+
 @pytest.mark.parametrize(
     ("written", "prefixes"),
     [
