@@ -22,7 +22,7 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.capture.npy import numbers_of_npy
 from mitsim.capture.recordings.array_file import arrays_of_npz, map_in, points_among
-from mitsim.capture.recordings.cloud_numbers import leave_out_marks, scale_to_mm
+from mitsim.capture.recordings.cloud_numbers import leave_out_copies, leave_out_marks, scale_to_mm
 from mitsim.capture.recordings.cloud_text import points_of_text
 from mitsim.sensor.mat_structure import read_mat
 
@@ -82,7 +82,7 @@ def plain_cloud(
         If there is no point, or one is too far away.
     """
     points = np.array(stored, np.float64)
-    note = leave_out_marks(points)
+    notes = leave_out_marks(points), leave_out_copies(points)
     name, distance = scale_to_mm(points, path, unit or stated, "name the unit: --unit")
     organised = points.ndim == 3 and min(points.shape[:2]) > 1
     grid = points if organised else points.reshape(1, -1, 3)
@@ -93,7 +93,7 @@ def plain_cloud(
     why = why or f"which their median distance of {distance:.4g} suggests; if not, --unit"
     step = float(np.spacing(np.float32(np.nanmax(np.abs(grid)))))
     coarse = f"coordinates kept to {step:.2g} mm: subtract their offset" if step > _COARSE_MM else ""
-    return cloud, "; ".join(remark for remark in (f"{path.name}: {shape}, in {name}, {why}", note, coarse) if remark)
+    return cloud, "; ".join(remark for remark in (f"{path.name}: {shape}, in {name}, {why}", *notes, coarse) if remark)
 
 
 def _through(points: NDArray[np.float64]) -> ViewGrid:

@@ -391,3 +391,29 @@ def test_the_command_with_the_options_of_an_error_is_named(tmp_path):
     cv2.imwrite(str(tmp_path / "depth.png"), np.full((48, 64), 500, np.uint16))
     done = mitsim_here("measure", tmp_path / "depth.png", "--plane", "floor", code=2)
     assert "--calibration FILE" in done.stderr and "mitsim import has these options" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("join", "rounded"),
+    [
+        (lambda rows: np.concatenate([rows, rows, rows]), None),
+        (lambda rows: np.repeat(rows, 2, axis=0), None),
+        (lambda rows: np.concatenate([rows, rows[::3]]), 2),
+        (lambda rows: np.concatenate([rows, rows]), 0),
+    ],
+)
+def test_a_cloud_joined_with_itself_measures_as_once(join, rounded, tmp_path, rng):
+    """Each point once, and with it u, is that of the cloud; points that rounding alone made equal all count."""
+    place = rng.uniform(-40, 40, (6000, 2))
+    rows = np.column_stack([place, 500 + 0.3 * rng.standard_normal(6000)])
+    rows = rows if rounded is None else np.round(rows, rounded)
+    once, joined = tmp_path / "once.npy", tmp_path / "joined.npy"
+    np.save(once, rows)
+    np.save(joined, join(rows))
+    cloud, about = read_plain_cloud(once)
+    assert cloud.valid.sum() == 6000
+    assert "copies" not in about
+    found, about = read_plain_cloud(joined)
+    assert f"{len(join(rows)) - 6000} points are copies of others: left out" in about
+    expected, values = (np.sort(each.points[each.valid].view("f4,f4,f4").ravel()) for each in (cloud, found))
+    np.testing.assert_array_equal(values, expected)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from characterisation.files.errors import InputError
 from mitsim.sensor.calibration_qualifiers import LENGTHS_MM, UNITS_MM
@@ -42,6 +43,9 @@ _MORE_THAN_OTHERS = 4
 
 #: ratio of a repeated depth to the median of the others from which it means no depth; chosen
 FAR_BEYOND = 10.0
+
+#: least distance of neighbours, in steps of rounding, from which rounding makes few equal; chosen: at 3 steps 1 in 20
+_STEPS_APART = 3.0
 
 _STATED = re.compile(r"\bunits?\b\s*(?:\bof length\b)?[\s:=,;]*[\"'(\[]?([a-zµμ]+)")
 
@@ -84,6 +88,40 @@ def leave_out_marks(points: NDArray[np.floating]) -> str:
         shown = f"({shown})" if len(mark) == 3 else shown
         return f"{int(marked.sum())} points are {what} {shown}: left out, since measured points do not repeat"
     return ""
+
+
+def leave_out_copies(points: NDArray[np.floating]) -> str:
+    """Set all but the first of equal points (n, 3) or (H, W, 3) to NaN, in place; return a note, or nothing.
+
+    A file that was joined with itself has each point twice, and a copy has no noise of its own. Points may also be
+    equal because their numbers are rounded to about their spacing. Such points are measured ones, which tell where more
+    of them lie: they stay, but for the share that their least common repetition tells to be copies.
+    """
+    flat = points.reshape(-1, 3)
+    seen = np.flatnonzero(np.isfinite(flat).all(axis=-1))
+    values = flat[seen]
+    order = np.lexsort(values.T)  # stable: equal points keep their order
+    values = values[order]
+    first = np.flatnonzero(np.r_[True, (values[1:] != values[:-1]).any(axis=1)])
+    if len(first) >= len(values):
+        return ""
+    times = np.diff(first, append=len(values))
+    kept = times // np.gcd.reduce(times) if _is_rounded(values[first]) else np.ones_like(times)
+    copies = order[np.arange(len(values)) - np.repeat(first, times) >= np.repeat(kept, times)]
+    if not len(copies):
+        return ""
+    flat[seen[copies]] = np.nan
+    points[...] = flat.reshape(points.shape)
+    return f"{len(copies)} points are copies of others: left out, since measured points do not repeat"
+
+
+def _is_rounded(values: NDArray[np.floating]) -> bool:
+    """Return whether different points (n, 3) are rounded to about the distance of their nearest neighbours."""
+    gaps = [np.diff(np.unique(column)) for column in values.T]
+    step = min((float(gap.min()) for gap in gaps if len(gap)), default=0.0)
+    sample = values[:: 1 + len(values) // _SAMPLE]
+    apart = cKDTree(values).query(sample, 2)[0][:, 1]
+    return float(np.median(apart)) < _STEPS_APART * step
 
 
 def _repeated(values: NDArray[np.floating], seen: NDArray[np.bool_]) -> NDArray[np.floating] | None:
