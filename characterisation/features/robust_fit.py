@@ -43,6 +43,9 @@ STEPS = 20
 #: Least ratio of singular values whose squares are distinguished from rounding.
 _PLAIN_RANK = 1e-5
 
+#: Least share of the points of a surface that is on each of its sides if both were scanned; chosen.
+LEAST_BOTH = 0.25
+
 #: The steps end when the sum of squares decreases by less than this share.
 SAME = 1e-12
 
@@ -194,6 +197,19 @@ def _solve(
         raise FitError(f"{len(chosen)} points that do not determine a {shape.kind} (no convergence)")
     moved: Shape = shape.moved(solution.x)
     return moved
+
+
+def on_one_side(cosine: Array, near: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which points (n,) can be on the side of a surface that is seen: the front, or of a bore the back.
+
+    ``cosine`` (n,) is N.V, and ``near`` (n,) tells which points lie on the surface. Outliers that lie on its other side
+    would hold a radius. If :data:`LEAST_BOTH` of the points near are on either side, it was scanned all round.
+    """
+    on_it = cosine[near & (cosine != 0)]
+    share = float(np.mean(on_it > 0)) if len(on_it) else 0.5
+    if LEAST_BOTH <= share <= 1 - LEAST_BOTH:
+        return np.ones(len(cosine), bool)
+    return np.asarray((cosine == 0) | ((cosine > 0) == (share > 0.5)))
 
 
 def covariance_of(residual: Array, jacobian: Array, kind: str) -> tuple[Array, float, int]:

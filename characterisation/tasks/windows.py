@@ -14,17 +14,17 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.features.fits import fit_cylinder, fit_plane, fit_sphere
+from characterisation.features.fits import belonging, fit_plane, fit_surface
 from characterisation.features.fitted import CylinderFit, PlaneFit, SphereFit
 from characterisation.features.form import fit_form, zone
-from characterisation.features.robust_fit import CLIP, FitError, rays_from
-from characterisation.features.starts import cylinder_start
-from characterisation.features.surfaces import GRAZING_COSINE, distances
+from characterisation.features.robust_fit import CHOICES, CLIP, FitError, on_one_side, rays_from
+from characterisation.features.starts import cylinder_start, sphere_start
+from characterisation.features.surfaces import GRAZING_COSINE, Surface, distances
 from characterisation.features.vectors import lengths
 from characterisation.files.errors import InputError, nearest
 from characterisation.point_cloud import PointCloud
@@ -53,6 +53,9 @@ LEAST_SHARE = 0.5
 #: largest noise of a fit over the distance of its points. Points that are all false scatter over the range of a
 #: matcher, by 5 % or more; no sensor has noise of 3 %. *Assumed*
 MOST_NOISE = 0.03
+
+#: most median distance of the points from a fit over that from its start; chosen: of normal noise it is about 1
+MOST_WORSE = 1.2
 
 #: least number of points in a window
 LEAST_POINTS = 30
@@ -198,14 +201,13 @@ def fit_shape(points: NDArray[np.float64], shape: Shape, viewpoint: NDArray[np.f
     """
     if len(points) < LEAST_POINTS:
         raise FitError(f"{len(points)} points in the window, at least {LEAST_POINTS} are needed")
-    fit: ShapeFit
-    match shape:
-        case "plane":
-            fit = fit_plane(points, viewpoint)
-        case "sphere":
-            fit = fit_sphere(points, viewpoint)
-        case "cylinder":
-            fit = fit_cylinder(points, cylinder_start(points), viewpoint)
+    fit, shown = _fit(points, shape, viewpoint), np.ones(len(points), bool)
+    for _ in range(CHOICES):
+        residual, cosine = distances(fit, points, rays_from(viewpoint, points))
+        before, shown = shown, on_one_side(cosine, np.abs(residual) <= CLIP * fit.residual_std)
+        if np.array_equal(shown, before):
+            break
+        fit = _fit(points[shown], shape, viewpoint)
     if fit.count < LEAST_SHARE * len(points):
         grazing = np.abs(distances(fit, points, rays_from(viewpoint, points))[1]) <= GRAZING_COSINE
         if shape == "plane" and grazing.mean() > 1 - LEAST_SHARE:
@@ -218,6 +220,26 @@ def fit_shape(points: NDArray[np.float64], shape: Shape, viewpoint: NDArray[np.f
         scatter = f"the {len(points)} points scatter by {fit.residual_std:.3g} mm about the fitted {shape}"
         raise FitError(f"{scatter}, {100 * fit.residual_std / distance:.2g} % of their distance")
     return fit
+
+
+def _fit(points: NDArray[np.float64], shape: Shape, viewpoint: NDArray[np.float64]) -> ShapeFit:
+    """Fit a shape to points (n, 3) [mm] alone; outliers that draw it off its start are left out."""
+    if shape == "plane":
+        return fit_plane(points, viewpoint)
+    start = sphere_start(points) if shape == "sphere" else cylinder_start(points)
+    try:
+        fit = fit_surface(points, start, viewpoint)
+        if _median(fit, points, viewpoint) <= MOST_WORSE * _median(start, points, viewpoint):
+            return cast(ShapeFit, fit)
+    except FitError:
+        pass
+    near = belonging(points, start, viewpoint)
+    return cast(ShapeFit, fit_surface(points[near], start, viewpoint))
+
+
+def _median(surface: Surface, points: NDArray[np.float64], viewpoint: NDArray[np.float64]) -> float:
+    """Return the median distance [mm] of points (n, 3) from a surface along their rays."""
+    return float(np.median(np.abs(distances(surface, points, rays_from(viewpoint, points))[0])))
 
 
 def _shape_results(

@@ -219,3 +219,36 @@ def test_a_cylinder_is_found_without_its_nominal_geometry(lean, roll, radius, di
     fit = fit_cylinder(points, cylinder_start(points), np.zeros(3))
     assert abs(fit.axis @ axis) > np.cos(np.deg2rad(2))
     assert abs(fit.radius - radius) < 6 * np.sqrt(fit.covariance[4, 4]) + 0.01
+
+
+@pytest.mark.parametrize("scatter", ["along the rays", "before it"])
+@pytest.mark.parametrize("shape", ["cylinder", "sphere"])
+def test_a_small_arc_among_false_points_has_the_u_of_its_own_points(shape, scatter, rng):
+    """Of 40 deg seen, 35 % false points are left out: u is that of the others alone, and covers the radius."""
+    off, noise, true, stated, alone = [], 0.2, 20.0, [], []
+    for _ in range(6):
+        turn = rng.uniform(-np.pi / 9, np.pi / 9, 4000)
+        along, roll = rng.uniform(-30, 30, 4000), rng.uniform(0, np.pi, 4000)
+        side, depth = true * np.sin(turn), 500 - true * np.cos(turn)
+        x, y = (side, along) if shape == "cylinder" else (side * np.cos(roll), side * np.sin(roll))
+        points = np.column_stack([x, y, depth])
+        rays = points / np.linalg.norm(points, axis=1, keepdims=True)
+        false = np.arange(4000) < 1400
+        points = points + np.where(false, rng.uniform(-50, 50, 4000), noise * rng.standard_normal(4000))[:, None] * rays
+        if scatter == "before it":
+            points[false, 2] = rng.uniform(470, 500, 1400)
+        fit, without = (fit_shape(chosen, shape, np.zeros(3)) for chosen in (points, points[~false]))
+        off.append((fit.radius - true) / np.sqrt(fit.covariance[-1, -1]))
+        stated.append(fit.covariance[-1, -1])
+        alone.append(without.covariance[-1, -1])
+    assert np.mean(stated) == pytest.approx(np.mean(alone), rel=0.45)
+    assert np.sqrt(np.mean(np.square(off))) < 2.5
+
+
+@pytest.mark.parametrize("centre", [(0.0, 0.0, 500.0), (3.0, 2.0, 1.0)])
+def test_a_rod_scanned_all_round_keeps_both_sides(centre, rng):
+    turn, noise = rng.uniform(0, 2 * np.pi, 4000), rng.normal(0, 0.05, 4000)
+    round_it = np.column_stack([(20 + noise) * np.cos(turn), rng.uniform(-30, 30, 4000), (20 + noise) * np.sin(turn)])
+    fit = fit_shape(round_it + centre, "cylinder", np.zeros(3))
+    assert fit.count > 0.8 * 4000
+    assert fit.radius == pytest.approx(20, abs=0.01)
