@@ -53,6 +53,9 @@ _ASIDE = 1.5
 #: stiffness of the terms of second order, which two rows of points leave undetermined; chosen: takes 0.3 % of a bow
 _STIFF = (0.0, 1e-12, 1e-12, 1e-3, 1e-3, 1e-3)
 
+#: least step of rounded depths [mm] that matters; float32 rounds those 10 m away to 1e-3 mm
+_LEAST_STEP_MM = 1e-3
+
 #: about the number of points by which a reference is known to be noisy: if a twentieth of them is there; chosen
 _SOME = 2000
 
@@ -65,7 +68,8 @@ class Difference:
     """Distribution of a difference [mm]: ``count`` of pixels or points in both, of ``points_given`` in the cloud.
 
     ``mean``, ``median``, standard ``deviation``, ``robust_deviation`` (1.4826 times the median distance from the
-    median), ``low`` and ``high``, which enclose 95 % of the values; NaN with too few values.
+    median), ``low`` and ``high``, which enclose 95 % of the values; NaN with too few values. If most values are the
+    same by rounding, the median and its deviation are the mean and the deviation of those within two steps.
     """
 
     count: int
@@ -157,7 +161,12 @@ def distribution(difference: Floats, points_given: int) -> Difference:
         return Difference(len(finite), points_given, *[float("nan")] * 6)
     median = float(np.median(finite))
     low, high = np.quantile(finite, [0.025, 0.975])
-    robust = MEDIAN_TO_STD * float(np.median(np.abs(finite - median)))
+    off = np.abs(finite - median)
+    robust = MEDIAN_TO_STD * float(np.median(off))
+    step = float(off.min(where=off > 0, initial=np.inf))
+    if robust == 0 and _LEAST_STEP_MM < step < np.inf:  # of rounded depths, of which most are the same
+        near = finite[off <= 2 * step]
+        median, robust = float(near.mean()), float(near.std(ddof=1))
     return Difference(
         len(finite),
         points_given,

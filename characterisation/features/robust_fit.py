@@ -274,3 +274,14 @@ def robust_std(residual: Array) -> float:
     sizes.partition(middle)  # np.median looks for three places
     median = sizes[middle] if len(sizes) % 2 else 0.5 * (sizes[middle] + sizes[:middle].max())
     return max(ROUNDED_MEDIAN_TO_STD * float(median), SMALLEST_SCALE)
+
+
+def scatter_of(residual: Array, least_scale: float) -> float:
+    """Return the robust standard deviation of residuals (n,) about 0 [mm].
+
+    Where most are the same by rounding, it is the root mean square of those within :data:`CLIP` times ``least_scale``.
+    """
+    robust = robust_std(residual)
+    if robust >= least_scale:
+        return robust
+    return float(np.sqrt(np.mean(residual[np.abs(residual) <= CLIP * least_scale] ** 2)))

@@ -231,15 +231,25 @@ def rounding_scale(points: Array, surface: Surface) -> float:
     if not isinstance(surface, Plane):
         return SMALLEST_SCALE
     column = points[:: 1 + len(points) // _MOST_ROUNDED, np.argmax(np.abs(surface.normal))]
-    values, counts = np.unique(column, return_counts=True)
-    if len(values) < 2 or counts.max() < _TIED * len(column):
+    counts = np.unique(column, return_counts=True)[1]
+    if counts.max() < _TIED * len(column):
         return SMALLEST_SCALE
-    step = float(np.diff(values).min())
-    steps = (values - values[0]) / step
-    rounded = step > _LEAST_STEP_MM and np.abs(steps - np.rint(steps)).max() < _OFF_STEP
-    if len(values) == 2:  # noise mixes two steps; the two faces of a part lie apart
-        rounded &= np.mean(column[1:] != column[:-1]) > np.prod(counts / len(column))
-    return step / 2 if rounded else SMALLEST_SCALE
+    step = rounding_step(points, surface.normal)
+    if len(counts) == 2:  # noise mixes two steps; the two faces of a part lie apart
+        step *= bool(np.mean(column[1:] != column[:-1]) > np.prod(counts / len(column)))
+    return max(step / 2, SMALLEST_SCALE)
+
+
+def rounding_step(points: Array, normal: Array) -> float:
+    """Return the step [mm] to which points (n, 3) are rounded on the axis nearest to a ``normal`` (3,), 0 if to none.
+
+    The points are in the frame of their rounding.
+    """
+    values = np.unique(points[:: 1 + len(points) // _MOST_ROUNDED, np.argmax(np.abs(normal))])
+    step = float(np.diff(values).min(initial=np.inf))
+    steps = (values - values[0]) / step if len(values) else values
+    rounded = _LEAST_STEP_MM < step < np.inf and np.abs(steps - np.rint(steps)).max() < _OFF_STEP
+    return step if rounded else 0.0
 
 
 #: about the largest number of points that are tried; chosen

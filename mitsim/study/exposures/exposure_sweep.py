@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.features.fits import belonging
-from characterisation.features.robust_fit import CLIP, robust_std
+from characterisation.features.robust_fit import CLIP, robust_std, scatter_of
 from characterisation.features.starts import rounding_scale
 from characterisation.features.surfaces import GRAZING_COSINE, Surface
 from characterisation.files.arrays import Floats
@@ -161,9 +161,7 @@ def feature_result(
         change = np.linalg.lstsq(g[near], residual[near], rcond=None)[0]
         remaining = residual - g @ change
         near = np.abs(remaining) <= CLIP * max(robust_std(remaining), least_scale)
-    scatter = robust_std(remaining)
-    if scatter < least_scale:
-        scatter = float(np.sqrt(np.mean(remaining[near] ** 2)))
+    scatter = scatter_of(remaining, least_scale)
     try:
         covariance = scatter**2 * np.linalg.inv(g[near].T @ g[near])
     except np.linalg.LinAlgError:

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.features.fits import fit_plane
-from characterisation.features.robust_fit import FitError
-from characterisation.files.arrays import MEDIAN_TO_STD, Floats
+from characterisation.features.robust_fit import FitError, scatter_of
+from characterisation.features.starts import rounding_scale, rounding_step
+from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
@@ -123,7 +124,8 @@ def find_specimen(capture: Capture, settings: Settings, roi: Roi | None, where: 
     columns, rows = np.ceil(extent / cell).astype(int)
     xs, ys = np.meshgrid(first[0] + (np.arange(columns) + 0.5) * cell[0], first[1] + (np.arange(rows) + 0.5) * cell[1])
     occupied = shown(pose.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1)))
-    specimen = Specimen(pose, first, cell, occupied, float(MEDIAN_TO_STD * np.median(np.abs(off))))
+    scatter = scatter_of(off, rounding_scale(points, plane))
+    specimen = Specimen(pose, first, cell, occupied, scatter)
     return replace(specimen, bend=_bend_of(specimen, points))
 
 
@@ -170,7 +172,8 @@ def _bend_of(specimen: Specimen, points: Floats) -> Bend | None:
     near = np.abs(local[:, 2]) < _NEAR_PLANE * np.linalg.norm(specimen.world_from_sensor.translation)
     inside = np.zeros(len(local), bool)
     inside[near] = specimen.contains(local[near, :2], np.zeros(int(near.sum())))
-    return fit_bend(local[inside]) if inside.sum() >= _FEWEST_POINTS else None
+    step = rounding_step(points[inside], specimen.world_from_sensor.rotation[2])
+    return fit_bend(local[inside], step) if inside.sum() >= _FEWEST_POINTS else None
 
 
 def on_specimen(specimen: Specimen, origin: Floats, rays: Floats, pitch: float, margin_px: float) -> NDArray[np.bool_]:

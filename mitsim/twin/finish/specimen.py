@@ -258,13 +258,17 @@ def _no_plane(where: str, count: int) -> InputError:
     )
 
 
-def fit_bend(points: Floats) -> Bend | None:
-    """Fit the bend of points (n, 3) [mm] in the frame of their plane, with z along its normal; None for too few."""
+def fit_bend(points: Floats, step: float = 0.0) -> Bend | None:
+    """Fit the bend of points (n, 3) [mm] in the frame of their plane, with z along its normal; None for too few.
+
+    ``step`` [mm] is that of rounded depths. A median of these would be rounded too, so the height of a cell is then the
+    mean of its points within two steps of the median.
+    """
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     cell = float((high - low).max()) / _BEND_CELLS
     if not cell > 0:
         return None
-    centres, heights = _cell_medians(points, low, cell)
+    centres, heights = _cell_heights(points, low, cell, step)
     if len(heights) < _CELLS_PER_TERM * 3:
         return None
     middle, half = (low + high) / 2, np.maximum((high - low) / 2, cell)
@@ -286,17 +290,23 @@ def fit_bend(points: Floats) -> Bend | None:
     return Bend(middle, half, degree, coefficients, rms)
 
 
-def _cell_medians(points: Floats, low: Floats, cell: float) -> tuple[Floats, Floats]:
-    """Return the centres (m, 2) of the cells with enough points, and their median heights (m,), all in mm."""
+def _cell_heights(points: Floats, low: Floats, cell: float, step: float) -> tuple[Floats, Floats]:
+    """Return the centres (m, 2) of the cells with enough points, and their median heights (m,), all in mm.
+
+    Of depths rounded to a ``step`` [mm] they are the means near the median.
+    """
     columns, rows = np.floor((points[:, :2] - low) / cell).astype(int).T
     number = rows * (columns.max() + 1) + columns
     order = np.lexsort((points[:, 2], number))
     labels, first, counts = np.unique(number[order], return_index=True, return_counts=True)
+    ordered = points[order, 2]
+    heights = ordered[first + counts // 2]
+    if step:
+        near = np.abs(ordered - np.repeat(heights, counts)) <= 2 * step
+        heights = np.add.reduceat(ordered * near, first) / np.add.reduceat(near, first, dtype=float)
     kept = counts >= _BEND_POINTS
-    labels, first, counts = labels[kept], first[kept], counts[kept]
-    heights = points[order, 2][first + counts // 2]
-    row, column = np.divmod(labels, columns.max() + 1)
-    return low + (np.stack([column, row], axis=1) + 0.5) * cell, heights
+    row, column = np.divmod(labels[kept], columns.max() + 1)
+    return low + (np.stack([column, row], axis=1) + 0.5) * cell, heights[kept]
 
 
 def _terms(points: Floats, degree: int) -> Floats:

@@ -4,6 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from characterisation.acceptance.cloud_difference import (
     difference_along_rays,
@@ -144,3 +145,15 @@ def test_noise_of_the_reference_does_not_shrink_the_difference(lean, sigma, rng)
     found = difference_to_surface(plane_cloud(0.4 / np.cos(lean), lean, grid), noisy)
     assert np.nanmean(found) == pytest.approx(0.4, abs=0.015)
     assert np.isfinite(found).mean() > 0.99
+
+
+def test_most_depths_that_are_the_same_by_rounding_leave_a_median_and_a_deviation(rng):
+    """The mean of rounded normal noise with a mean of 0.3 steps, and its deviation, from the probabilities of steps."""
+    steps = np.arange(-5, 6)
+    share = norm.cdf(steps + 0.5, 0.3, 0.25) - norm.cdf(steps - 0.5, 0.3, 0.25)
+    mean = share @ steps
+    found = distribution(np.round(rng.normal(0.3, 0.25, 20_000)), 20_000)
+    assert found.median == pytest.approx(mean, abs=0.01)
+    assert found.robust_deviation == pytest.approx(np.sqrt(share @ (steps - mean) ** 2), rel=0.03)
+    mostly_equal = np.where(rng.random(1000) < 0.7, 0.0, 1e-5 * rng.standard_normal(1000))
+    assert distribution(mostly_equal, 1000).robust_deviation == 0

@@ -8,7 +8,8 @@ from characterisation.features.best_fit import best_fit
 from characterisation.features.fits import fit_cylinder, fit_plane
 from characterisation.features.form import fit_form
 from characterisation.features.pose_fit import fit_pose
-from characterisation.features.starts import cylinder_start, rounding_scale
+from characterisation.features.robust_fit import scatter_of
+from characterisation.features.starts import cylinder_start, rounding_scale, rounding_step
 from characterisation.features.surfaces import Plane
 
 EYE = np.zeros(3)
@@ -63,6 +64,21 @@ def test_form_pose_and_joined_views_use_all_rounded_depths(step, rng):
     first, second = best_fit(clouds, shapes, np.array([0, 0, 500.0]), expected, least_scales=scales)
     joined = second @ [0, 0, 500, 1] - first @ [0, 0, 500, 1]
     assert joined[2] == pytest.approx(means[0] - means[1], abs=2 * close)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.05])
+def test_rounded_depths_have_a_step_and_a_scatter(tilt, rng):
+    """The step is found of any tilt, that of depths that are not rounded is 0, and the scatter is that of rounding."""
+    noise = 0.2 * rng.standard_normal(5000)
+    points, normal = face(noise, rng), np.array([0.0, 0.0, -1.0])
+    points[:, 2] += tilt * points[:, 0]
+    assert rounding_step(points, normal) == 0
+    points[:, 2] = np.round(points[:, 2])
+    assert rounding_step(points, normal) == 1
+    if not tilt:
+        expected = np.sqrt(2 * norm.sf(0.5, 0, 0.2))  # of the points at -1 and +1
+        scale = rounding_scale(points, Plane(np.array([0.0, 0, 500]), normal))
+        assert scatter_of(points[:, 2] - 500, scale) == pytest.approx(expected, rel=0.15)
 
 
 def test_a_step_of_a_part_is_no_rounding(rng):

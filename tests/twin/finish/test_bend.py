@@ -39,5 +39,19 @@ def test_stray_points_of_a_matcher_do_not_bend_a_sheet(rng):
     assert np.abs(bend.heights(u * [60, 40]) - 2.0 * u[:, 0] ** 2).max() < 0.25
 
 
+@pytest.mark.parametrize("height", [0.3, 1.0, 3.0])
+def test_depths_in_whole_mm_give_the_bend_that_they_dither(height, rng):
+    """The expected value of a depth with noise of half a step, once rounded, is the depth to 0.5 % of the step."""
+
+    def shape(u):
+        return height * u[:, 0] ** 2
+
+    seen = points(rng, shape, 0.5)
+    seen[:, 2] = np.round(seen[:, 2] + 0.3) - 0.3
+    bend = fit_bend(seen, 1.0)
+    u = rng.uniform(-0.95, 0.95, (500, 2))
+    assert np.abs(bend.heights(u * [60, 40]) - shape(u)).max() < 0.08
+
+
 def test_too_few_points_have_no_bend(rng):
     assert fit_bend(rng.normal(size=(50, 3))) is None
