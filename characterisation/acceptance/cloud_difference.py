@@ -5,8 +5,9 @@ one cloud -> nearest points of the other -> the surface of second order through 
 plane through them would lie inside a ball of 60 mm radius by 0.16 mm, if they are 2.7 mm apart.
 
 Of a reference whose noise is as large as its pitch, the points nearest to a point err toward it, and the distance is
-too small. In such an organised reference the points of the pixels beside the point are taken, wherever all lie on one
-surface: the surface of second order is fitted to their distances along the ray, the slope to more of them.
+too small. Of such a reference the points nearest in direction are taken, which their noise along the ray does not move,
+wherever all lie on one surface: the surface of second order is fitted to their distances along the ray, the slope to
+more of them.
 
 For a window of pixels only the points of the reference near it are searched, and no search extends beyond the distance
 at which a point has no counterpart.
@@ -38,11 +39,11 @@ _ALL = (slice(None), slice(None))
 #: number of points of the reference that determine the surface at a point: it has six coefficients
 NEIGHBOURS = 12
 
-#: rows and columns of an organised reference, from a point's pixel on, that determine the slope of its surface; chosen
-_SLOPE_PIXELS = np.arange(-3, 5)
+#: number of points of a noisy reference nearest to a point in direction, for the slope of its surface; chosen
+_SLOPE_NEIGHBOURS = 64
 
 #: those among them that determine the surface; chosen
-_PIXELS = slice(2, 6)
+_SURFACE_NEIGHBOURS = 16
 
 #: least noise of a reference over the distance of its points that moves the difference; chosen: there by 4 %
 _NOISY = 0.2
@@ -141,12 +142,13 @@ def difference_to_surface(
     searched = _Searched(surface, points, float(farthest.max(initial=0.0)))
     height = np.full(len(points), np.nan)
     some = slice(None, None, 1 + len(points) // _SOME)
-    noisy = np.isfinite(_where_noisy(reference, points[some], farthest[some])).sum() * 20 > len(points[some])
+    beside = _Beside(searched.near, reference.grid.origin)
+    noisy = np.isfinite(beside.heights(points[some], farthest[some])).sum() * 20 > len(points[some])
     for start in progress(range(0, len(points), _BLOCK)):
         block = slice(start, start + _BLOCK)
         heights = height[block]
         if noisy:
-            heights[:] = _where_noisy(reference, points[block], farthest[block])
+            heights[:] = beside.heights(points[block], farthest[block])
         rest = np.isnan(heights)
         heights[rest] = _to_surface(points[block][rest], farthest[block][rest], searched, cloud.grid.origin)
     out = np.full(valid.shape, np.nan)
@@ -213,34 +215,35 @@ class _Searched:
         return met, out
 
 
-def _beside(reference: PointCloud, points: Floats, farthest: Floats) -> tuple[NDArray[np.bool_], Floats]:
-    """Return which points (n, 3) have one surface of an organised reference about them, and its points there.
+class _Beside:
+    """The points (n, 3) of a reference, by their direction from its eye (3,)."""
 
-    They are (m, k, k, 3), in all pixels about these points, and each lies within ``farthest`` (n,) [mm].
-    """
-    grid, side = reference.grid, len(_SLOPE_PIXELS)
-    one = np.zeros(len(points), bool)
-    if min(grid.height, grid.width) < side:
-        return one, np.empty((0, side, side, 3))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        column, row = np.floor(np.nan_to_num(grid.project(points), nan=-side, posinf=-side, neginf=-side)).T
-    first, last = -_SLOPE_PIXELS[0], -1 - _SLOPE_PIXELS[-1]
-    within = (row >= first) & (row <= grid.height + last) & (column >= first) & (column <= grid.width + last)
-    rows, columns = (_SLOPE_PIXELS + start[within, None].astype(np.intp) for start in (row, column))
-    at = rows[:, :, None], columns[:, None]
-    out = reference.points[at].astype(np.float64)
-    apart = np.where(reference.valid[at], np.linalg.norm(out - points[within, None, None], axis=-1), np.inf)
-    one[within] = apart.max(axis=(1, 2)) <= farthest[within]
-    return one, out[one[within]]
+    def __init__(self, surface: Floats, eye: Floats) -> None:
+        self.surface, self.eye = surface, eye
+        self.tree = cKDTree(_directions(surface - eye)) if len(surface) >= _SLOPE_NEIGHBOURS else None
+
+    def heights(self, points: Floats, farthest: Floats) -> Floats:
+        """Return distances (n,) of points (n, 3) from the surface by the points nearest in direction.
+
+        They are NaN where the noise of these is small, one lies deeper or higher by more than ``farthest`` (n,) [mm],
+        or none is as near.
+        """
+        out = np.full(len(points), np.nan)
+        if self.tree is None or not len(points):
+            return out
+        rays = _directions(points - self.eye)
+        beside = self.surface[self.tree.query(rays, _SLOPE_NEIGHBOURS, workers=thread_count())[1]]
+        away = beside - points[:, None]
+        one = np.abs(np.einsum("nki,ni->nk", away, rays)).max(axis=1) <= farthest
+        one &= np.linalg.norm(away, axis=-1).min(axis=1) <= farthest
+        if one.any():
+            out[one] = _along_ray(points[one], beside[one], self.eye)
+        return out
 
 
-def _where_noisy(reference: PointCloud, points: Floats, farthest: Floats) -> Floats:
-    """Return distances (n,) of points from an organised reference by its pixels, NaN where its noise is small."""
-    one, beside = _beside(reference, points, farthest)
-    out = np.full(len(points), np.nan)
-    if one.any():
-        out[one] = _along_ray(points[one], beside, reference.grid.origin)
-    return out
+def _directions(away: Floats) -> Floats:
+    """Return the unit vectors of vectors (n, 3)."""
+    return np.asarray(away / np.linalg.norm(away, axis=1, keepdims=True))
 
 
 def _to_surface(points: Floats, farthest: Floats, searched: _Searched, viewpoint: Floats) -> Floats:
@@ -261,21 +264,20 @@ def _to_surface(points: Floats, farthest: Floats, searched: _Searched, viewpoint
 
 
 def _along_ray(points: Floats, beside: Floats, eye: Floats) -> Floats:
-    """Return the distances (n,) of points (n, 3) from the surface of the pixels beside them, (n, k, k, 3), if noisy.
+    """Return the distances (n,) of points (n, 3) from the surface of the points beside them, (n, k, 3), if noisy.
 
     They are distances along the ray times the cosine of the incidence angle, and positive away from the eye (3,). They
-    are NaN where the pixels' noise is small against their pitch: the nearest points give a curved surface more exactly.
+    are NaN where the noise is small against the pitch: the nearest points give a curved surface more exactly.
     """
-    ray = (points - eye) / np.linalg.norm(points - eye, axis=1, keepdims=True)
+    ray = _directions(points - eye)
     across = np.cross(ray, np.eye(3)[np.argmin(np.abs(ray), axis=1)])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     axes = np.stack([ray, across, np.cross(ray, across)], axis=-1)
-    whole = beside.reshape(len(beside), -1, 3)
-    heights, feet = np.split((whole - whole.mean(axis=1, keepdims=True)) @ axes, [1], axis=-1)
+    heights, feet = np.split((beside - beside.mean(axis=1, keepdims=True)) @ axes, [1], axis=-1)
     slope = np.linalg.solve(feet.swapaxes(1, 2) @ feet, feet.swapaxes(1, 2) @ heights)
     cosine = 1 / np.sqrt(1 + np.sum(slope**2, axis=(1, 2)))
     noise = cosine * np.sqrt(np.mean((heights - feet @ slope) ** 2, axis=(1, 2)))
-    patch = beside[:, _PIXELS, _PIXELS].reshape(len(beside), -1, 3)
+    patch = beside[:, :_SURFACE_NEIGHBOURS]
     middle = patch.mean(axis=1)
     spread = patch - middle[:, None]
     apart = np.sqrt(np.mean(np.sum((spread @ axes)[..., 1:] ** 2, axis=-1), axis=1) / 2)

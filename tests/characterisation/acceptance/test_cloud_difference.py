@@ -147,6 +147,27 @@ def test_noise_of_the_reference_does_not_shrink_the_difference(lean, sigma, rng)
     assert np.isfinite(found).mean() > 0.99
 
 
+@pytest.mark.parametrize("lean", [0.0, 0.5])
+@pytest.mark.parametrize("organised", [True, False])
+def test_noise_does_not_shrink_the_difference_from_a_list_or_a_grid_with_holes(organised, lean, rng):
+    """Before, 0.16 mm in place of 0.4 mm from either."""
+    fine = ViewGrid(2000.0, 2000.0, 119.5, 99.5, 240, 200)
+    exact, there = plane_cloud(0.0, lean, fine), rng.random((200, 240)) < 0.9
+    noise = 0.5 * rng.standard_normal((200, 240, 1)) * fine.rays()
+    points = np.where(there[..., None], exact.points + noise, np.nan).astype(np.float32)
+    reference = PointCloud(
+        points, np.where(there, Status.VALID, Status.HIDDEN).astype(np.uint8), fine, "known", "device"
+    )
+    if not organised:
+        rows = rng.permutation(points[there])[None]
+        listed = ViewGrid(1.0, 1.0, 0.0, 0.0, rows.shape[1], 1, normalised=rows[..., :2] / rows[..., 2:])
+        reference = PointCloud(rows, np.zeros(rows.shape[:2], np.uint8), listed, "known", "device")
+    grid = ViewGrid(1700.0, 1700.0, 49.5, 49.5, 100, 100)
+    found = difference_to_surface(plane_cloud(0.4 / np.cos(lean), lean, grid), reference)
+    assert np.nanmean(found) == pytest.approx(0.4, abs=0.02)
+    assert np.isfinite(found).mean() > 0.99
+
+
 def test_most_depths_that_are_the_same_by_rounding_leave_a_median_and_a_deviation(rng):
     """The mean of rounded normal noise with a mean of 0.3 steps, and its deviation, from the probabilities of steps."""
     steps = np.arange(-5, 6)
