@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -61,7 +62,7 @@ def acceptance(
     from characterisation.tasks.result import repeatability
     from mitsim.cli.acceptance_request import Artefacts, cloud_figures, joint_figures, read_artefacts
     from mitsim.cli.simulated_beside import RecordedTarget, beside_simulated, beside_table
-    from mitsim.decoding.input_clouds import cloud_paths, read_cloud
+    from mitsim.decoding.input_clouds import cloud_paths, read_cloud, tell_of_copies
     from mitsim.decoding.measured_document import (
         beside_document,
         measured_document,
@@ -82,6 +83,9 @@ def acceptance(
         options.refuse_unused(context, "no --plane", "a --plane, whose sub-pixel RMS needs it", "baseline")
     chosen = tuple(topic) if topic else None
     input_clouds = [read_cloud(path, sensor, topic=chosen, frame=frame, unit=unit) for path in cloud_paths(clouds)]
+    found: dict[str, Path] = {}
+    for input_cloud in input_clouds:
+        tell_of_copies(found, input_cloud)
     results = [cloud_figures(input_cloud.cloud, artefacts, baseline) for input_cloud in input_clouds]
     several = len(input_clouds) > 1
     together = joint_figures([input_cloud.cloud for input_cloud in input_clouds], artefacts) if several else []

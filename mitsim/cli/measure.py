@@ -120,7 +120,7 @@ def clouds(
     from characterisation.tasks.windows import WindowPlan, measure_windows
     from mitsim.cli.measure_frame import read_frame
     from mitsim.cli.measure_request import read_request
-    from mitsim.decoding.input_clouds import cloud_paths, read_cloud
+    from mitsim.decoding.input_clouds import cloud_paths, read_cloud, tell_of_copies
     from mitsim.decoding.measured_document import beside_document, measured_document, result_tables, summary
 
     options.check_unit(unit)
@@ -169,10 +169,12 @@ def clouds(
 
     whose: list[tuple[Path, str, str]] = []
     results: list[list[Result]] = []
+    found: dict[str, Path] = {}
     for number, path in enumerate(paths):
         if len(paths) > 1:
             say(f"{path} ({number + 1}/{len(paths)})")
         input_cloud = read_cloud(path, sensor, topic=tuple(topic) if topic else None, frame=frame, unit=unit)
+        tell_of_copies(found, input_cloud)
         if picture is not None and input_cloud.cloud.grid.height == 1:
             raise InputError("--picture", "", f"{path}, a cloud without a grid", "a cloud with rows and columns")
         to_frame, about_frame = places_in.of(input_cloud, view)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from characterisation import cloud_files
 from characterisation.files.errors import InputError
+from characterisation.files.value_digest import value_digest
 from characterisation.point_cloud import PointCloud
 from characterisation.words.progress import say
 from mitsim.capture.capture import Capture
@@ -157,6 +158,17 @@ def read_cloud(
     settings, imager = decoder_settings(capture, sensor)
     cloud = kept_cloud((capture, settings, imager), lambda: decoded_once(capture, settings, imager)[0])
     return InputCloud(path, cloud, capture, margin_of(settings))
+
+
+def tell_of_copies(found: dict[str, Path], input_cloud: InputCloud) -> None:
+    """Add the digest of a cloud's points to those ``found``, and say if they are those of another cloud.
+
+    Copies have no scatter, so they make the standard deviation over clouds too small.
+    """
+    cloud = input_cloud.cloud
+    first = found.setdefault(value_digest(cloud.points[cloud.valid]), input_cloud.path)
+    if first is not input_cloud.path and cloud.valid.any():
+        say(f"warning: {input_cloud.path} has the points of {first}: the same noise twice is not a repeat")
 
 
 def _plain(path: Path, cloud: PointCloud, about: str) -> InputCloud:

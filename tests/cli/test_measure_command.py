@@ -61,6 +61,16 @@ def test_a_folder_has_repeatability(clouds):
     assert re.search(r"top distance +3/3 ", run(clouds, "--plane", "top=20,20,100,80").stdout)
 
 
+@pytest.mark.parametrize("asked", [("--plane", "top"), ("acceptance", "--plane", "top=600")])
+def test_a_copy_among_repeats_is_told(asked, clouds):
+    """Before, the standard deviation over a cloud and its copy was 0, without a word."""
+    assert "not a repeat" not in run(*asked, clouds).stderr
+    (clouds / "copy.ply").write_bytes((clouds / "1.ply").read_bytes())
+    told = run(*asked, clouds).stderr
+    assert "copy.ply has the points of" in told or "1.ply has the points of" in told
+    assert told.count("not a repeat") == 1
+
+
 def test_a_difference_with_its_picture(clouds):
     done = run(
         clouds / "0.ply",
