@@ -22,6 +22,7 @@ from characterisation.features.robust_fit import (
     FitError,
     UndeterminedError,
     covariance_of,
+    on_one_side,
     rays_from,
     robust_fit,
     usable,
@@ -262,26 +263,30 @@ def belonging(points: ArrayLike, nominal: Surface, viewpoint: ArrayLike | None =
     Of the rest, points within :data:`GATE` standard deviations of the nominal surface are kept, or within
     :data:`LEAST_GATE_MM` if that is more. The standard deviation is estimated from the nearest quarter of these points:
     a quarter of normal residuals lie within 0.3186 standard deviations. A displaced part increases it accordingly.
+    Points on the far side of a round surface are left out, unless both were scanned
+    (:func:`~characterisation.features.robust_fit.on_one_side`).
     """
     array = np.asarray(points, float).reshape(-1, 3)
     distance = np.abs(distances(nominal, array, None)[0])
-    accepted = np.isfinite(distance)
+    accepted, cosine = np.isfinite(distance), np.zeros(len(array))
     if viewpoint is not None:
-        accepted[accepted] = _not_false(array[accepted], nominal, np.asarray(viewpoint, float))
+        finite = accepted.copy()
+        accepted[finite], cosine[finite] = _not_false(array[finite], nominal, np.asarray(viewpoint, float))
     if not accepted.any():
         return accepted
     scale = float(np.quantile(distance[accepted], 0.25)) / QUARTER_TO_STD
     with np.errstate(invalid="ignore"):
-        return accepted & np.asarray(distance <= max(GATE * scale, LEAST_GATE_MM))
+        near = accepted & np.asarray(distance <= max(GATE * scale, LEAST_GATE_MM))
+    return near if isinstance(nominal, Plane) else near & on_one_side(cosine, near)
 
 
-def _not_false(points: Array, nominal: Surface, viewpoint: Array) -> NDArray[np.bool_]:
-    """Return which points (n, 3) are near enough to a surface along their rays."""
+def _not_false(points: Array, nominal: Surface, viewpoint: Array) -> tuple[NDArray[np.bool_], Array]:
+    """Return which points (n, 3) are near enough to a surface along their rays, and N.V (n,) there."""
     away = points - viewpoint
     distance = lengths(away)
     rays = np.divide(away, distance[:, None], out=np.zeros_like(away), where=distance[:, None] > 0)
-    residual, _ = distances(nominal, points, rays)
-    return np.asarray(np.abs(residual) <= FALSE_SHARE_OF_DISTANCE * (distance - residual))
+    residual, cosine = distances(nominal, points, rays)
+    return np.asarray(np.abs(residual) <= FALSE_SHARE_OF_DISTANCE * (distance - residual)), cosine
 
 
 def _axis(initial: Cylinder | Cone) -> Array:

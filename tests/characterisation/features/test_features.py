@@ -352,3 +352,20 @@ def test_a_nominal_surface_that_is_none_is_refused(fit, axis, radius, named, rng
     initial = Cylinder(*nominal) if fit is fit_cylinder else Cone(*nominal, 0.3)
     with pytest.raises(InputError, match=f"initial.{named}"):
         fit(rng.normal(size=(50, 3)), initial)
+
+
+def test_false_points_near_the_far_wall_do_not_belong_to_a_rod(rng):
+    """Of 40 deg seen, among 35 % false points: u of the radius is that of the true points alone. Before, a tenth."""
+    turn = rng.uniform(-np.pi / 9, np.pi / 9, 4000)
+    points = np.column_stack([20 * np.sin(turn), rng.uniform(-30, 30, 4000), 500 - 20 * np.cos(turn)])
+    rays = points / np.linalg.norm(points, axis=1, keepdims=True)
+    false = np.arange(4000) < 1400
+    points += np.where(false, rng.uniform(-50, 50, 4000), 0.2 * rng.standard_normal(4000))[:, None] * rays
+    nominal = Cylinder(np.array([0.0, 0.0, 500.0]), np.array([0.0, 1.0, 0.0]), 20.0)
+    near = belonging(points, nominal, np.zeros(3))
+    assert near[~false].mean() > 0.99
+    fit, alone = (fit_cylinder(chosen, nominal, np.zeros(3)) for chosen in (points[near], points[~false]))
+    assert fit.covariance[-1, -1] == pytest.approx(alone.covariance[-1, -1], rel=0.3)
+    turn = rng.uniform(0, 2 * np.pi, 4000)
+    round_it = np.column_stack([20 * np.sin(turn), rng.uniform(-30, 30, 4000), 500 - 20 * np.cos(turn)])
+    assert belonging(round_it, nominal, np.zeros(3)).mean() > 0.95
