@@ -21,14 +21,12 @@ from mitsim.sensor.imager import Imager
 from mitsim.sensor.point_spread import point_spread
 from mitsim.sensor.sensor import Sensor
 from mitsim.twin.compare.denoise import denoised
-from mitsim.twin.finish.electrons import linearised
 from mitsim.twin.finish.find_specimen import MARGIN_PX, image_mask
-from mitsim.twin.finish.fine_detail import FINEST, MEDIAN_SQUARE, finest_detail
+from mitsim.twin.finish.fine_detail import FINEST, finest_detail
 from mitsim.twin.finish.specimen import Specimen
 from mitsim.twin.sensor.estimate import FittedKey, Undetermined
 from mitsim.twin.sensor.input_captures import InputCapture
 from mitsim.twin.sensor.photon_transfer import (
-    LEAST_SPREAD,
     Repeats,
     TransferLine,
     dithered,
@@ -36,7 +34,6 @@ from mitsim.twin.sensor.photon_transfer import (
     independent_share,
     one_image_line,
     repeated_line,
-    widths,
 )
 from mitsim.twin.sensor.response import SLOPE, first_knee, quiet_pixels
 
@@ -277,6 +274,7 @@ def _shows_pattern(group: list[InputCapture], specimens: dict[str, Specimen]) ->
 def _from_one_image(
     source: InputCapture, imager: Imager, specimens: dict[str, Specimen]
 ) -> tuple[Imager, list[FittedKey]] | None:
+    """Return the imager and its estimates; None without several levels: one determines a sum of both kinds of noise."""
     image, mask = source.image, _specimen_mask(source, specimens)
     names, method = (source.name,), "finest detail of one image by level, including its fixed pattern"
     estimates = []
@@ -295,28 +293,4 @@ def _from_one_image(
         if line.full_well(imager)[1] < 0.3 * line.full_well(imager)[0] and line.offset >= 0:
             fitted_imager, from_line = _with_line(bare, line, names, method)
             return fitted_imager, [*estimates, *from_line]
-    # nearly one level: keep the file's full well and attribute the rest to read noise; without a rest, fit the well
-    electrons = linearised(image, imager)
-    level = float(np.median(electrons[mask]))
-    fine = finest_detail(electrons)
-    variance = float(np.median(fine[mask] ** 2)) / MEDIAN_SQUARE
-    step = float(widths(np.array(float(np.median(image[mask]))), imager)) ** 2
-    if variance < LEAST_SPREAD * step:
-        return None
-    variance = (variance - step / 12) / gain
-    relative = float(np.sqrt(2 / (mask.sum() * 0.37 * independent_share())))
-    read = imager.read_noise
-    if variance > level + 1.0:
-        value = float(np.sqrt(variance - level))
-        estimates.append(
-            FittedKey("imager.read_noise_e", value, relative * variance / (2 * value), "e-", names, method)
-        )
-        return replace(bare, read_noise=value), estimates
-    # kappa level + kappa^2 read^2 = variance, the share of shot noise as the file has it
-    share = level / (level + read**2)
-    kappa = variance * share / level
-    well = imager.full_well / kappa
-    estimates.append(FittedKey("imager.full_well_e", well, relative * well, "e-", names, method))
-    value = float(np.sqrt(variance * (1 - share))) / kappa
-    estimates.append(FittedKey("imager.read_noise_e", value, relative * value, "e-", names, method))
-    return replace(bare, full_well=well, read_noise=value), estimates
+    return None

@@ -172,6 +172,17 @@ def test_one_dim_image_of_little_noise_has_no_line(read, brightest, monkeypatch)
     assert not found.known and not found.estimates
 
 
+@pytest.mark.parametrize("count", [1, 4])
+def test_one_level_determines_neither_full_well_nor_read_noise(count, monkeypatch):
+    """Before, the file's full well of 18,000 e- was kept, and the read noise was 51 +- 4 e- for 25 e-."""
+    monkeypatch.setattr(noise, "_specimen_mask", lambda source, _: np.ones(source.image.shape, bool))
+    images = repeats(np.random.default_rng(3), TRUE, np.full((200, 240), 9000.0), count)
+    group = [SimpleNamespace(kind="off", name=f"off_{i}", image=image) for i, image in enumerate(images)]
+    sensor = SimpleNamespace(technology="structured_light", imager=replace(TRUE, full_well=18000))
+    found = fit_imager([group], sensor, {})
+    assert not found.known and not found.estimates and found.imager == sensor.imager
+
+
 def test_one_even_image_gives_the_sum_of_noise_and_fixed_pattern():
     rng = np.random.default_rng(5)
     image = expose(np.tile(np.linspace(500, 12000, 400), (400, 1)), TRUE, None, Noise(), rng)
