@@ -6,7 +6,8 @@ power, room light, dots, noise and corner losses by simulated moments (:mod:`mit
 
 The six terms of room light may not explain the level and contrast over the field within chance. The mean square of the
 remainder is then added to the covariance of these terms, and the fit is repeated. It is also repeated without the
-parameters that are not determined, until all are. If the misfit is still significant, the covariance is scaled by the
+parameters that are not determined, until all are; full well and read noise are then held at the file's values, and
+their priors enter the uncertainties of all others. If the misfit is still significant, the covariance is scaled by the
 reduced chi-square (Birge, Phys. Rev. 40 (1932) 207).
 """
 
@@ -29,7 +30,16 @@ from mitsim.twin.finish.specimen import Specimen
 from mitsim.twin.sensor.estimate import scaled, unscaled
 from mitsim.twin.sensor.figures import TERMS, SpecimenField, field_figures
 from mitsim.twin.sensor.moments import MomentFit, Prior, match_moments
-from mitsim.twin.sensor.parameters import CORNER_BLUR, FLUX, SMOOTHING, Parameter, room_parameters, with_room
+from mitsim.twin.sensor.parameters import (
+    CORNER_BLUR,
+    FLUX,
+    FULL_WELL,
+    READ_NOISE,
+    SMOOTHING,
+    Parameter,
+    room_parameters,
+    with_room,
+)
 from mitsim.twin.sensor.specimen_simulator import SpecimenSimulator
 from mitsim.twin.sensor.verdict import CHANCE
 
@@ -38,6 +48,9 @@ PATCH_PX = 40
 
 #: least number of patches of a capture; chosen
 FEWEST_PATCHES = 8
+
+#: keys of the parameters that are held if they are not determined
+NOISE_KEYS = {FULL_WELL.key, READ_NOISE.key}
 
 _ALONE = ("crossings", "sharpness", "noise in the dark half", "noise in the bright half", "grain")
 
@@ -136,7 +149,7 @@ def fit_dots(
     specimen
         Pose and extent of the sheet.
     parameters
-        Parameters to vary, without those of the room.
+        Parameters to vary or held, without those of the room unless it is known.
     where
         Name of the capture in messages.
     room
@@ -196,10 +209,10 @@ def fit_dots(
     undetermined: list[Parameter] = []
     settled = uneven == 0
     while True:
-        kept = np.array(
+        known = np.array(
             [_is_determined(moment_fit, index, parameter) for index, parameter in enumerate(free_parameters)]
         )
-        dropped = [parameter for parameter, is_kept in zip(free_parameters, kept, strict=True) if not is_kept]
+        dropped = [parameter for parameter, is_known in zip(free_parameters, known, strict=True) if not is_known]
         if settled and not dropped:
             break
         # without it no parameter explains the variation of sharpness
@@ -208,9 +221,15 @@ def fit_dots(
             wanted, covariance = real.of(names)
             covariance = covariance + np.diag(np.where(spatial, uneven**2, 0.0))
         undetermined += dropped
-        free_parameters = [parameter for parameter, is_kept in zip(free_parameters, kept, strict=True) if is_kept]
+        kept = np.array([p.key in NOISE_KEYS or is_known for p, is_known in zip(free_parameters, known, strict=True)])
+        again_from = np.where(known, moment_fit.values, start)[kept]
+        free_parameters = [
+            parameter if is_known else replace(parameter, held=True)
+            for parameter, is_known, is_kept in zip(free_parameters, known, kept, strict=True)
+            if is_kept
+        ]
         start = start[kept]
-        again = _prior(free_parameters, start, moment_fit.values[kept])
+        again = _prior(free_parameters, start, again_from)
         moment_fit = match_moments(wanted, covariance, simulate, again, draws.number, f"{where}, once more")
         settled = True
     if _misses(moment_fit):
@@ -254,8 +273,8 @@ def _misses(moment_fit: MomentFit) -> bool:
 
 
 def _is_determined(moment_fit: MomentFit, index: int, parameter: Parameter) -> bool:
-    """Return whether a parameter stays in the fit: the room's always, smoothing and corner blur if significant."""
-    if parameter.key.startswith("room."):
+    """Return whether a parameter stays in the fit: held ones, the room's, and significant smoothing or corner blur."""
+    if parameter.held or parameter.key.startswith("room."):
         return True
     if parameter is SMOOTHING or parameter is CORNER_BLUR:
         return bool(moment_fit.values[index] > _SURE * np.sqrt(moment_fit.covariance[index, index]))
@@ -266,7 +285,7 @@ def _prior(parameters: Sequence[Parameter], middle: Floats, first: Floats | None
     spread, step, low, high = (
         np.array([getattr(parameter, name) for parameter in parameters]) for name in ("spread", "step", "low", "high")
     )
-    return Prior(middle, spread, step, low, high, first)
+    return Prior(middle, spread, step, low, high, first, np.array([parameter.held for parameter in parameters]))
 
 
 def _with_other_dots(sensor: Sensor, number: int) -> Sensor:

@@ -8,6 +8,9 @@ random numbers at every theta -> damped Gauss-Newton on
 -> theta and its covariance (J^T W J + P^-1)^-1. The mean of n simulations with independent random numbers keeps their
 noise small, and W includes it (McFadden, Econometrica 57 (1989) 995). P is wide: a factor of about e around the sensor
 file's values. If the uncertainty of a parameter is not well below that of P, the recording does not determine it.
+
+A parameter may be held at its start, with P as its uncertainty. The covariance of the others then includes it, and the
+square of the change that the recording suggests instead of the held value.
 """
 
 from __future__ import annotations
@@ -55,7 +58,10 @@ class MomentFit:
 
 @dataclass(frozen=True)
 class Prior:
-    """Prior of parameters (k,): mean, standard deviation, derivative steps, bounds; the fit starts at ``first``."""
+    """Prior of parameters (k,): mean, standard deviation, derivative steps, bounds; the fit starts at ``first``.
+
+    Parameters ``held`` stay at their mean.
+    """
 
     start: Floats
     spread: Floats
@@ -63,6 +69,7 @@ class Prior:
     low: Floats
     high: Floats
     first: Floats | None = None
+    held: NDArray[np.bool_] | None = None
 
 
 def match_moments(
@@ -89,6 +96,7 @@ def match_moments(
         return np.mean([m for m, _ in simulations], axis=0), np.mean([s for _, s in simulations], axis=0)
 
     inverse_prior = np.diag(prior.spread**-2.0)
+    held = np.zeros(len(prior.start), bool) if prior.held is None else prior.held
     theta = np.clip(prior.start if prior.first is None else prior.first, prior.low, prior.high)
     seen, spread = figures(theta)
     weight = np.linalg.pinv(covariance + spread / draws)
@@ -126,16 +134,18 @@ def match_moments(
         if float(moved.max()) < _ENOUGH or before - cost(theta, seen) < _ENOUGH:
             break
     weight = np.linalg.pinv(covariance + spread / draws)
-    total = np.linalg.inv(jacobian.T @ weight @ jacobian + inverse_prior)
     off = real - seen
-    determined = np.sqrt(np.diag(total)) < DETERMINED_SHARE * prior.spread
+    total = np.linalg.inv(jacobian.T @ weight @ jacobian + inverse_prior)
+    missed = total @ np.where(held, jacobian.T @ weight @ off - inverse_prior @ (theta - prior.start), 0.0)
+    total = total + np.outer(missed, missed)
+    determined = (np.sqrt(np.diag(total)) < DETERMINED_SHARE * prior.spread) & ~held
     freedom = len(real) - int(determined.sum())
     return MomentFit(theta, np.asarray(total, float), determined, float(off @ weight @ off), freedom, off)
 
 
 def _bounded_step(normal: Floats, pull: Floats, theta: Floats, prior: Prior) -> Floats:
     """Return the Gauss-Newton step of parameters not held by a bound, limited to the prior's standard deviation."""
-    free = np.ones(len(theta), bool)
+    free = np.ones(len(theta), bool) if prior.held is None else ~prior.held
     step = np.zeros(len(theta))
     for _ in range(len(theta)):
         step = np.zeros(len(theta))

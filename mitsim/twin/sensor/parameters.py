@@ -38,6 +38,7 @@ class Parameter:
       varied quantity.
     - ``scale`` on which the number in the file is approximately normal.
     - ``determined_by``: the capture that would determine it.
+    - ``held``: stays at the sensor's value, with the uncertainty ``spread``.
     """
 
     key: str
@@ -51,7 +52,15 @@ class Parameter:
     high: float = np.inf
     scale: Scale = "linear"
     determined_by: str = ""
+    held: bool = False
 
+    def held_within(self, uncertainty: float) -> Parameter:
+        """Return the parameter, held with an uncertainty of the varied quantity."""
+        return replace(self, held=True, spread=max(uncertainty, _LEAST_HELD))
+
+
+#: least uncertainty of a held quantity, which keeps the normal matrix regular; chosen
+_LEAST_HELD = 1e-4
 
 #: full well whose varied quantity is 1 [e-]
 _WELL = 15_000.0
@@ -90,6 +99,16 @@ def _number(key: str, unit: str, transform: str, **about: Any) -> Parameter:
 
 def _with_room_level(room: RoomTable | None, ratio: float) -> RoomTable | None:
     return None if room is None else room.model_copy(update={"irradiance_w_mm2": room.irradiance_w_mm2 * ratio})
+
+
+def _room_share(sensor: Sensor) -> float:
+    return float(np.log(_read_room(0, sensor) / sensor.imager.full_well))
+
+
+def _with_room_share(sensor: Sensor, x: float) -> Sensor:
+    assert sensor.room is not None
+    level = float(np.exp(x)) * sensor.imager.full_well
+    return replace(sensor, room=sensor.room.model_copy(update={"irradiance_w_mm2": level}))
 
 
 def _with_full_well(sensor: Sensor, x: float) -> Sensor:
@@ -143,7 +162,7 @@ READ_NOISE = Parameter(
     spread=3.0,
     step=0.1,
     low=0.0,
-    determined_by="a capture in the dark",
+    determined_by="repeats of one pose",
 )
 
 FLUX = Parameter(
@@ -198,6 +217,20 @@ _OFF = "a capture with the projector off"
 
 BLACK_LEVEL = _number(
     "projector.black_level", "1", "share", spread=0.5, step=0.05, low=0.0, high=0.95, determined_by=_OFF
+)
+
+
+#: light of a room that another capture determines, in grey levels; its terms over the field stay
+ROOM_LEVEL = Parameter(
+    "room.irradiance_w_mm2",
+    "W/mm^2",
+    lambda sensor: _read_room(0, sensor),
+    _room_share,
+    _with_room_share,
+    spread=1.0,
+    step=0.05,
+    scale="inverse",
+    determined_by=_OFF,
 )
 
 

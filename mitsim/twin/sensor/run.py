@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from mitsim.sensor.sensor import Sensor
 from mitsim.twin.compare.rebuild import like
 from mitsim.twin.finish.find_specimen import find_specimen
 from mitsim.twin.finish.specimen import Specimen
-from mitsim.twin.sensor.dots import DotDraws, DotsFit, fit_dots
+from mitsim.twin.sensor.dots import NOISE_KEYS, DotDraws, DotsFit, fit_dots
 from mitsim.twin.sensor.estimate import FittedKey, Undetermined, pooled
 from mitsim.twin.sensor.input_captures import InputCapture, read_input_captures, repeats
 from mitsim.twin.sensor.noise import ImagerFit, fit_imager, unseparated, without_fixed_pattern
@@ -38,6 +39,7 @@ from mitsim.twin.sensor.parameters import (
     FULL_WELL,
     PROJECTOR_CORNER,
     READ_NOISE,
+    ROOM_LEVEL,
     SMOOTHING,
     Parameter,
     pattern_parameters,
@@ -46,9 +48,6 @@ from mitsim.twin.sensor.room import RoomFit, fit_room
 from mitsim.twin.sensor.rows import row_turns
 from mitsim.twin.sensor.stripes import fit_stripes, focused
 from mitsim.twin.sensor.verdict import DotAgreement, Verdict, verdict_of
-
-#: keys of the noise that a single image determines together with the fixed pattern
-_NOISE = {FULL_WELL.key, READ_NOISE.key}
 
 
 @dataclass(frozen=True)
@@ -134,9 +133,10 @@ def fit_sensor(
     estimates = list(imager.estimates)
     base = replace(base, imager=imager.imager)
     room = fit_room(off_captures, base, specimens) if off_captures and on_captures else None
-    estimates += room.estimates if room is not None else []
     dots = _dots(on_captures, base, specimens, imager, room, DotDraws(draws, seed))
     shared, undetermined = _combined_estimates(dots, base, imager, room)
+    by_dots = {estimate.key for estimate in shared}
+    estimates += [estimate for estimate in room.estimates if estimate.key not in by_dots] if room is not None else []
     estimates += shared
     if isinstance(base.pattern, LightCode):
         coded: list[FittedKey] = []
@@ -145,7 +145,7 @@ def fit_sensor(
             coded += fit_stripes(source, capture_sensor, specimens[source.name])
         keys = {estimate.key for estimate in estimates}  # repeats and the dark before a single image
         estimates += [estimate for estimate in pooled(focused(coded)) if estimate.key not in keys]
-    if not imager.repeated and any(estimate.key in _NOISE for estimate in estimates):
+    if not imager.repeated and any(estimate.key in NOISE_KEYS for estimate in estimates):
         undetermined += unseparated(chosen.imager)
     turned, assumed, method = list[FittedKey](), chosen.unknowns.calibration, "row errors over the field"
     for source in lit:
@@ -215,10 +215,12 @@ def _dots(
 ) -> dict[str, DotsFit]:
     if not isinstance(base.pattern, DotPattern):
         return {}
-    parameters = [] if imager.known else [FULL_WELL, READ_NOISE, SMOOTHING]
+    parameters = _held_noise(imager, base) if imager.known else [FULL_WELL, READ_NOISE, SMOOTHING]
     parameters += [FLUX, *pattern_parameters(base), PROJECTOR_CORNER, CORNER_BLUR]
     if room is not None:
         parameters.append(BLACK_LEVEL)
+        if room.terms[0] > 0:
+            parameters.append(ROOM_LEVEL.held_within(room.estimates[0].uncertainty / room.terms[0]))
     out = {}
     for source in input_captures:
         sensor = replace(like(source.capture, base, source.name), imager=base.imager, room=base.room)
@@ -227,9 +229,10 @@ def _dots(
         specimen, terms = specimens[source.name], None if room is None else room.terms
         sensor = _check_exposure(sensor, source)
         dots_fit = fit_dots(source.capture, sensor, specimen, parameters, source.name, room=terms, draws=draws)
-        if not imager.known and not {parameter.key for parameter in dots_fit.parameters} & _NOISE:
+        if not imager.known and {parameter.key for parameter in dots_fit.undetermined} >= NOISE_KEYS:
             # the noise stays that of the file, and so does the fixed pattern beside it
-            sensor, dot_parameters = replace(sensor, imager=base.imager), [p for p in parameters if p.key not in _NOISE]
+            sensor = replace(sensor, imager=base.imager)
+            dot_parameters = [replace(p, held=p.key in NOISE_KEYS or p.held) for p in parameters]
             dots_fit = fit_dots(source.capture, sensor, specimen, dot_parameters, source.name, room=terms, draws=draws)
             dots_fit = replace(dots_fit, undetermined=(FULL_WELL, READ_NOISE, *dots_fit.undetermined))
         out[source.name], fit = dots_fit, dots_fit.moment_fit
@@ -238,6 +241,18 @@ def _dots(
             f"unevenness beyond the model {100 * dots_fit.uneven:.1f} %"
         )
     return out
+
+
+def _held_noise(fit: ImagerFit, sensor: Sensor) -> list[Parameter]:
+    """Return full well and read noise, held within the uncertainties of their estimates."""
+    held = []
+    for parameter, name in ((FULL_WELL, "full_well"), (READ_NOISE, "read_noise")):
+        for estimate in (one for one in fit.estimates if one.key == parameter.key):
+            changed: dict[str, Any] = {name: estimate.value + estimate.uncertainty}
+            other = replace(fit.imager, **changed)
+            change = parameter.get(replace(sensor, imager=other)) - parameter.get(sensor)
+            held.append(parameter.held_within(abs(change)))
+    return held
 
 
 def _combined_estimates(
@@ -252,11 +267,14 @@ def _combined_estimates(
         determined = fit.moment_fit.determined.tolist()
         rows = zip(fit.parameters, values.tolist(), spreads.tolist(), determined, strict=True)
         for parameter, value, spread, known in rows:
+            if parameter.held and parameter.key != ROOM_LEVEL.key:
+                continue
             how = ((name,), "figures of the dots over the field", parameter.scale)
             # the room stays in the fit; others are left out where they are not determined, or are significant
-            known = known or not parameter.key.startswith("room.")
+            known = known or parameter.held or not parameter.key.startswith("room.")
             estimates.append(FittedKey(parameter.key, value, spread, parameter.unit, *how, known))
-        parameters |= {parameter.key: parameter for parameter in (*fit.parameters, *fit.undetermined)}
+        free = [parameter for parameter in fit.parameters if not parameter.held]
+        parameters |= {parameter.key: parameter for parameter in (*free, *fit.undetermined)}
     keys = {estimate.key for estimate in estimates}
     undetermined += [
         Undetermined(p.key, p.read(base), p.determined_by) for p in parameters.values() if p.key not in keys

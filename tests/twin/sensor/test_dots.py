@@ -11,7 +11,14 @@ from characterisation.files.errors import InputError
 from mitsim.twin.finish.specimen import known_specimen
 from mitsim.twin.sensor import specimen_simulator
 from mitsim.twin.sensor.dots import DotDraws, field_misfits
-from mitsim.twin.sensor.parameters import BLACK_LEVEL, FLUX, PROJECTOR_CORNER, pattern_parameters
+from mitsim.twin.sensor.parameters import (
+    BLACK_LEVEL,
+    FLUX,
+    FULL_WELL,
+    PROJECTOR_CORNER,
+    ROOM_LEVEL,
+    pattern_parameters,
+)
 from tests.twin.sensor.small_unit import capture_of, small_fit, small_sensor, specimen, standard_errors, unit
 
 
@@ -42,6 +49,20 @@ def test_a_known_room_stays_while_the_power_is_fitted():
     power, black = (found.parameters.index(parameter) for parameter in (FLUX, BLACK_LEVEL))
     assert abs(1 / values[power] - 1 / truth.projector.flux) < 3 * spreads[power] < 0.2
     assert abs(values[black] - truth.projector.black_level) < 3 * spreads[black] < 0.05
+
+
+def test_the_power_is_as_uncertain_as_the_full_well_of_the_file():
+    """15,000 e- in the file for 17,800. Before, with the full well fixed, 0.601 +- 0.004 W for 0.716 W."""
+    truth, sensor = unit(0), small_sensor()
+    sensor = replace(sensor, imager=replace(sensor.imager, read_noise=truth.imager.read_noise * 15 / 17.8))
+    terms = [truth.room.irradiance_w_mm2 * 15 / 17.8 * s for s in (1.0, *truth.room.gradient, *truth.room.curvature)]
+    varied = [replace(FULL_WELL, held=True, spread=0.2), FLUX, *pattern_parameters(sensor), PROJECTOR_CORNER]
+    varied += [BLACK_LEVEL, ROOM_LEVEL.held_within(0.01)]
+    found = small_fit(capture_of(truth, 0), sensor, specimen(), varied, DotDraws(2, 7), terms)
+    values, spreads = found.in_file_units()
+    for parameter, true in ((FLUX, truth.projector.flux), (ROOM_LEVEL, truth.room.irradiance_w_mm2)):
+        index = [one.key for one in found.parameters].index(parameter.key)
+        assert abs(1 / values[index] - 1 / true) < 2 * spreads[index] < 0.8 / true
 
 
 def test_the_misfit_of_a_feature_is_its_root_mean_square_over_the_patches():
