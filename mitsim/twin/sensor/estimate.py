@@ -7,6 +7,9 @@ The estimates may differ by more than their own uncertainties, as sheets and the
 estimated by the moments of Q = sum w_i (x_i - x)^2 and added to every variance (DerSimonian & Laird, Controlled
 Clinical Trials 7 (1986) 177). Few captures determine tau^2 poorly, so the uncertainty is that of a normal distribution
 with the 95 % interval of Student's, whose degrees of freedom follow from the share of tau^2 (GUM, G.4).
+
+Captures of one projector show the same random dots: over units, features of two such captures correlate by 0.91 to 1.00
+(24 simulated units before a sheet at 450 and 480 mm). Their errors are common, and more captures do not reduce them.
 """
 
 from __future__ import annotations
@@ -87,8 +90,11 @@ class Undetermined:
     contained: bool = False
 
 
-def combined(values: Sequence[float], uncertainties: Sequence[float]) -> tuple[float, float]:
-    """Return the weighted mean of values and its standard uncertainty, including their excess scatter."""
+def combined(values: Sequence[float], uncertainties: Sequence[float], *, common: bool = False) -> tuple[float, float]:
+    """Return the weighted mean of values and its standard uncertainty, including their excess scatter.
+
+    ``common``: the errors of the values are the same error, not independent ones.
+    """
     x, variance = np.asarray(values, float), np.asarray(uncertainties, float) ** 2
     if len(x) == 1:
         return float(x[0]), float(np.sqrt(variance[0]))
@@ -100,11 +106,15 @@ def combined(values: Sequence[float], uncertainties: Sequence[float]) -> tuple[f
     share = scatter / (scatter + len(x) / float(weight.sum()))
     weight = 1 / (variance + scatter)
     factor = student.ppf(_SIDE, (len(x) - 1) / max(share, _LEAST_SHARE) ** 2) / norm.ppf(_SIDE)
-    return float((weight * x).sum() / weight.sum()), float(factor * weight.sum() ** -0.5)
+    total = float(factor**2 / weight.sum())
+    if common:
+        precision = 1 / variance
+        total += float((precision * np.sqrt(variance)).sum() / precision.sum()) ** 2 - 1 / float(precision.sum())
+    return float((weight * x).sum() / weight.sum()), math.sqrt(total)
 
 
-def pooled(estimates: Sequence[FittedKey]) -> list[FittedKey]:
-    """Combine estimates of the same key, in the order in which the keys first occur."""
+def pooled(estimates: Sequence[FittedKey], *, common: bool = False) -> list[FittedKey]:
+    """Combine estimates of the same key, in the order in which the keys first occur; ``common`` as for each key."""
     out = []
     for key in dict.fromkeys(estimate.key for estimate in estimates):
         group = [estimate for estimate in estimates if estimate.key == key]
@@ -115,6 +125,7 @@ def pooled(estimates: Sequence[FittedKey]) -> list[FittedKey]:
             middle, spread = combined(
                 [scaled(fitted_key.value, first.scale) for fitted_key in group],
                 [fitted_key.uncertainty for fitted_key in group],
+                common=common,
             )
             names = tuple(name for fitted_key in group for name in fitted_key.captures)
             first = replace(first, value=unscaled(middle, first.scale), uncertainty=spread, captures=names)

@@ -281,4 +281,4 @@ def _combined_estimates(
     ]
     if room is None and dots:
         undetermined.append(Undetermined(BLACK_LEVEL.key, BLACK_LEVEL.read(base), BLACK_LEVEL.determined_by))
-    return pooled(estimates), undetermined
+    return pooled(estimates, common=True), undetermined

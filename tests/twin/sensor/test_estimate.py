@@ -33,3 +33,13 @@ def test_intervals_of_captures_that_differ_hold_the_truth(count, least):
     assert least < np.mean([abs(value) < 1.96 * spread for value, spread in drawn]) < 0.96
     alike = [combined(rng.normal(0.0, own), own) for own in u]
     assert 0.94 < np.mean([abs(value) < 1.96 * spread for value, spread in alike]) < 0.98
+
+
+@pytest.mark.parametrize("poses", [0.0, 10.0])
+def test_captures_of_the_same_dots_share_their_error(poses):
+    """Before, intervals of 95 % of three captures with one common error held the truth in 74 %."""
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(0.7, 1.4, (3000, 1)), 3, axis=1)
+    errors = u * rng.normal(size=(3000, 1)) + rng.normal(0.0, poses, u.shape)
+    drawn = [combined(x, own, common=True) for x, own in zip(errors, u, strict=True)]
+    assert 0.9 < np.mean([abs(value) < 1.96 * spread for value, spread in drawn]) < 0.96
