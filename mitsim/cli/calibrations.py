@@ -201,7 +201,12 @@ def _recorded(path: Path, output: Path, board: str | None) -> None:
     from mitsim.study.calibration.board import parse_board
     from mitsim.study.calibration.corner_files import read_corners
     from mitsim.study.calibration.halves import calibrate_checked
-    from mitsim.study.calibration.written import calibration_table, sensor_lines, write_calibration
+    from mitsim.study.calibration.written import (
+        calibration_table,
+        other_size_hints,
+        sensor_lines,
+        write_calibration,
+    )
 
     if board is None:
         raise InputError("--board", "", "none", "the board of the recording: COLUMNSxROWSxSQUARE_MM:GRADE")
@@ -217,6 +222,8 @@ def _recorded(path: Path, output: Path, board: str | None) -> None:
     source = f"recorded corners: {path.name}, {chequerboard}"[:400]
     checked = calibrate_checked(corners, source, str(path))
     print(calibration_table(checked), end="")
+    for hint in other_size_hints(checked.calibration.rig):
+        say(f"warning: {hint}")
     rig_file = write_calibration(checked, output)
     say(f"calibration: {output}, {rig_file}; in a sensor file:")
     say(sensor_lines(checked.calibration.rig, rig_file, output))

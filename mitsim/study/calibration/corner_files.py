@@ -225,7 +225,10 @@ def _of_table(path: Path, board: Board) -> tuple[Seen, Sizes]:
     sizes: Sizes = {}
     for line in text.splitlines():
         if match := re.match(r"#\s*size\s+(\S+)\s+(\d{1,5})\s+(\d{1,5})\s*$", line):
-            sizes[match[1]] = (int(match[2]), int(match[3]))
+            size = int(match[2]), int(match[3])
+            if sizes.setdefault(match[1], size) != size:
+                other = "{} x {} px".format(*sizes[match[1]])
+                raise InputError(path, match[1], f"a size of {size[0]} x {size[1]} px after {other}", "one size")
     written = "\n".join(line for line in text.splitlines() if not line.startswith("#"))
     lines = csv.reader(io.StringIO(written), skipinitialspace=True)
     try:
@@ -250,7 +253,11 @@ def _of_table(path: Path, board: Board) -> tuple[Seen, Sizes]:
         if camera not in sizes:
             raise InputError(path, camera, "no size", f"a line # size {camera} WIDTH HEIGHT")
         by_eye = seen.setdefault(pose, {}).setdefault(camera, {})
-        by_eye[line_of_board * (board.columns - 1) + column] = pixel
+        corner = line_of_board * (board.columns - 1) + column
+        if corner in by_eye:
+            found, hint = f"corner {column}, {line_of_board} of {camera} a second time", "give every pose its own name"
+            raise InputError(path, f"row {number}, pose {pose}", found, "each corner of a pose once", hint)
+        by_eye[corner] = pixel
     return seen, sizes
 
 

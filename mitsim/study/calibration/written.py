@@ -16,6 +16,10 @@ from mitsim.sensor.rig_covariance import write_rig_covariance
 from mitsim.sensor.rig_parameters import parameter_values
 from mitsim.study.calibration.halves import CheckedCalibration, in_words
 
+#: distance of a principal point from the middle, as a share of the size, that is unusual: four standard deviations of
+#: the prior of cameras
+_FAR_OFF = 0.2
+
 
 def write_calibration(checked: CheckedCalibration, output: Path) -> Path:
     """Write the covariance to ``output`` and the rig beside it, as OpenCV's ``.yml``; return the path of the latter."""
@@ -47,6 +51,19 @@ def opencv_text(rig: Rig, fitted_to: Sequence[FittedCapture] = ()) -> str:
     if rig.projector is not None or other_cameras:
         lines.append('unit: "mm"')
     return "\n".join(lines) + "\n"
+
+
+def other_size_hints(rig: Rig) -> list[str]:
+    """Return a warning for each camera whose principal point is so far off the middle that the size may be wrong."""
+    out = []
+    for name, camera in rig.cameras.items():
+        point, size = camera.matrix[:2, 2], np.array([camera.width, camera.height])
+        if (np.abs(point - (size - 1) / 2) > _FAR_OFF * size).any():
+            out.append(
+                f"the principal point of {name}, {point[0]:.0f}, {point[1]:.0f} px, is far from the middle of "
+                f"{size[0]} x {size[1]} px: were the corners found in images of another size, or in a part of them?"
+            )
+    return out
 
 
 def calibration_table(checked: CheckedCalibration) -> str:

@@ -238,6 +238,28 @@ def test_files_without_corners_are_refused(tmp_path, name, text):
         read_corners(tmp_path / name, BOARD)
 
 
+def test_two_sessions_with_the_same_names_of_poses_are_refused(tmp_path):
+    """Before, the second session replaced the first one without a word, also at another resolution."""
+    write_table(tmp_path / "c.csv", pixels_of(4))
+    text = (tmp_path / "c.csv").read_text()
+    (tmp_path / "twice.csv").write_text(text + "".join(text.splitlines(keepends=True)[3:]))
+    with pytest.raises(InputError, match="pose 0: found corner 0, 0 of left a second time"):
+        read_corners(tmp_path / "twice.csv", BOARD)
+    (tmp_path / "sizes.csv").write_text("# size left 640 480\n" + text)
+    with pytest.raises(InputError, match="a size of 1280 x 960 px after 640 x 480 px"):
+        read_corners(tmp_path / "sizes.csv", BOARD)
+
+
+def test_corners_of_images_half_as_large_as_stated_are_named(tmp_path):
+    """Before, a principal point at 640, 470 px of 2560 x 1920 px without a word."""
+    write_table(tmp_path / "c.csv", {"camera": pixels_of(4)["left"]})
+    text = (tmp_path / "c.csv").read_text()
+    (tmp_path / "large.csv").write_text(text.replace("1280 960", "2560 1920"))
+    for name, warned in (("c.csv", False), ("large.csv", True)):
+        done = mitsim_here("calibrate", tmp_path / name, "--board", "9x7x20:glass", "-o", tmp_path / "unit.toml")
+        assert ("far from the middle of 2560 x 1920 px" in done.stderr) == warned
+
+
 def test_the_reference_is_a_camera_whatever_the_order_of_the_sizes(tmp_path):
     """Before, a projector named first was the reference, and the pose of the camera was lost: T was nearly 0."""
     pixels = pixels_of(4)
