@@ -218,18 +218,14 @@ def _plane_name(face: Face, surface: Plane, low: Floats, high: Floats) -> str:
             return name
         return f"{name}_at_{'xyz'[along]}{size(at)}mm"
     narrow = _extents(face).min() < _CHAMFER_SHARE * float(np.linalg.norm(high - low))
-    return f"chamfer_{degrees(_off_axis(surface))}deg" if narrow else _oblique(surface)
-
-
-def _off_axis(surface: Plane) -> float:
-    """Return the angle [deg] of a plane's normal to the nearest axis."""
-    return float(np.rad2deg(np.arccos(np.abs(surface.normal).max())))
+    off = float(np.rad2deg(np.arccos(np.abs(surface.normal).max())))
+    return f"chamfer_{degrees(off)}deg" if narrow else _oblique(surface)
 
 
 def _oblique(surface: Plane) -> str:
     upright = abs(surface.normal[2]) < np.sqrt(1 - _ALONG**2)  # like the sides of a hexagonal nut
     if upright:
-        return f"side_{degrees(_off_axis(surface))}deg"
+        return f"side_{degrees(np.rad2deg(np.arccos(np.abs(surface.normal).max())))}deg"
     return f"slope_{degrees(np.rad2deg(np.arccos(abs(surface.normal[2]))))}deg"  # against the horizontal
 
 
