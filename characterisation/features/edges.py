@@ -11,7 +11,9 @@ limit of the plane along its ray is used, with or without a label. Points with l
 The following biases are not corrected:
 
 - Points at an edge are mixed. Decoders interpolate between the two surfaces. Blocks extend a near face beyond its edge
-  (a hole shrinks) or lose part of it (a hole grows), by up to half the block. This affects sizes more than places.
+  (a hole shrinks) or lose part of it (a hole grows), by up to half the block. This property of the sensor is the same
+  all round the edge, so it affects sizes much more than places. A decoder that smooths displaces more points than its
+  noise tells: rims of 12 mm grow by 1.6 mm (Zivid, smoothed by 1.5 px), not by 0.3.
 - Where the wall of a hole is visible, its points within the limit count as points of the face. The edge there moves
   inward by up to m, the limit (along the ray) times the sine of the incidence angle. This moves the centre by m/2 away
   from the wall, and reduces the radius by m/pi. An edge whose other face is visible moves outward likewise.
@@ -47,10 +49,6 @@ NEAR_STD = 2.0
 
 #: the same in mm, if that is more; *assumed*
 NEAR_MM = 0.02
-
-#: the same in pixels, if that is more; chosen: a decoder that smooths displaces points beside edges by more than it
-#: leaves noise. Without it, rims of 12 mm grew by 1.6 mm (Zivid, smoothed by 1.5 px); now by 0.8, unsmoothed by 0.2
-NEAR_PX = 0.5
 
 #: least number of crossings for a figure; *assumed*
 LEAST_CROSSINGS = 12
@@ -95,8 +93,9 @@ def fit_circle(cloud: PointCloud, plane: PlaneFit, nominal: Circle, near: float 
         Nominal circle of the hole, sensor frame. The edge may lie half a radius from it. The face must have no other
         edge within a radius beyond it, because F is counted there.
     near
-        Distance [mm] behind the plane, along the ray, within which a point belongs to it; in front, twice that. By
-        default the most of :data:`NEAR_STD`, :data:`NEAR_MM` and :data:`NEAR_PX`.
+        Distance [mm] behind the plane, along the ray, within which a point belongs to it; in front, twice this
+        distance. By default :data:`NEAR_STD` times the standard deviation of the plane's points, at least
+        :data:`NEAR_MM`.
 
     See Also
     --------
@@ -212,8 +211,7 @@ def _crossings(
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = (plane.point - cloud.grid.origin) @ plane.normal / (rays @ plane.normal)
     points = cloud.grid.origin + distance[..., None] * rays
-    pixel = float(np.median(np.linalg.norm(np.diff(rays, axis=1), axis=-1)) * np.nanmedian(distance))
-    limit = max(NEAR_STD * plane.residual_std, NEAR_MM, NEAR_PX * pixel) if near is None else near
+    limit = max(NEAR_STD * plane.residual_std, NEAR_MM) if near is None else near
     with np.errstate(invalid="ignore"):
         behind = np.sum((cloud.points[rows, columns] - points) * rays, axis=-1)
         on_face = (behind <= limit) & (behind >= -2 * limit)
