@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from characterisation.features.starts import LEAST_STEP_MM
 from characterisation.files.arrays import MEDIAN_TO_STD, Floats
 from characterisation.files.errors import InputError
 from characterisation.files.threads import thread_count
@@ -53,9 +54,6 @@ _ASIDE = 1.5
 
 #: stiffness of the terms of second order, which two rows of points leave undetermined; chosen: takes 0.3 % of a bow
 _STIFF = (0.0, 1e-12, 1e-12, 1e-3, 1e-3, 1e-3)
-
-#: least step of rounded depths [mm] that matters; float32 rounds those 10 m away to 1e-3 mm
-_LEAST_STEP_MM = 1e-3
 
 #: about the number of points by which a reference is known to be noisy: if a twentieth of them is there; chosen
 _SOME = 2000
@@ -166,7 +164,7 @@ def distribution(difference: Floats, points_given: int) -> Difference:
     off = np.abs(finite - median)
     robust = MEDIAN_TO_STD * float(np.median(off))
     step = float(off.min(where=off > 0, initial=np.inf))
-    if robust == 0 and _LEAST_STEP_MM < step < np.inf:  # of rounded depths, of which most are the same
+    if robust == 0 and LEAST_STEP_MM < step < np.inf:  # of rounded depths, of which most are the same
         near = finite[off <= 2 * step]
         median, robust = float(near.mean()), float(near.std(ddof=1))
     return Difference(

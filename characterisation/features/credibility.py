@@ -31,7 +31,7 @@ from characterisation.features.figures import Circle, EdgePoint
 from characterisation.features.fits import COVERAGE, GATE, LEAST_GATE_MM, check_radius
 from characterisation.features.fitted import CircleFit, ConeFit, CylinderFit, EdgePointFit, Fit, PlaneFit, SphereFit
 from characterisation.features.robust_fit import CLIP, FitError, UndeterminedError, rays_from
-from characterisation.features.surfaces import GRAZING_COSINE, Surface, distances
+from characterisation.features.surfaces import GRAZING_COSINE, Plane, Surface, distances
 from characterisation.features.vectors import tangents
 
 Array = NDArray[np.float64]
@@ -66,7 +66,8 @@ def places_seen(nominal: Surface, rays: ArrayLike, viewpoint: ArrayLike, points:
     directions = np.asarray(rays, float).reshape(-1, 3)
     directions = directions[:: max(-(-len(directions) // PLACES), 1)]
     starts = np.broadcast_to(eye, directions.shape)
-    if len(array) and np.median(nominal.meet(array, rays_from(eye, array)).cosine) > 0:
+    several = len(array) and not isinstance(nominal, Plane)  # places on a ray
+    if several and np.median(nominal.meet(array, rays_from(eye, array)).cosine) > 0:
         # a ray enters a bore in the air, and meets its wall where it leaves: the nearer place from beyond
         starts = eye + 2 * np.linalg.norm(array - eye, axis=1).max() * directions
     at = nominal.meet(starts, directions)

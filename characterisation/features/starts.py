@@ -248,7 +248,7 @@ def rounding_step(points: Array, normal: Array) -> float:
     values = np.unique(points[:: 1 + len(points) // _MOST_ROUNDED, np.argmax(np.abs(normal))])
     step = float(np.diff(values).min(initial=np.inf))
     steps = (values - values[0]) / step if len(values) else values
-    rounded = _LEAST_STEP_MM < step < np.inf and np.abs(steps - np.rint(steps)).max() < _OFF_STEP
+    rounded = LEAST_STEP_MM < step < np.inf and np.abs(steps - np.rint(steps)).max() < _OFF_STEP
     return step if rounded else 0.0
 
 
@@ -293,7 +293,7 @@ _MOST_ROUNDED = 4000
 _TIED = 0.4
 
 #: least step of rounded coordinates [mm] that matters; float32 rounds those 10 m away to 1e-3 mm
-_LEAST_STEP_MM = 1e-3
+LEAST_STEP_MM = 1e-3
 
 #: largest distance of a rounded coordinate from a multiple of the step, in steps, from float32; chosen
 _OFF_STEP = 0.05

@@ -100,6 +100,10 @@ def leave_out_copies(points: NDArray[np.floating]) -> str:
     flat = points.reshape(-1, 3)
     seen = np.flatnonzero(np.isfinite(flat).all(axis=-1))
     values = flat[seen]
+    # equal points have equal sums: most clouds have no such, and their rows are not sorted
+    sums = np.sort(values[:, 0] + np.e * values[:, 1] + np.pi * values[:, 2])
+    if (sums[1:] != sums[:-1]).all():
+        return ""
     order = np.lexsort(values.T)  # stable: equal points keep their order
     values = values[order]
     first = np.flatnonzero(np.r_[True, (values[1:] != values[:-1]).any(axis=1)])

@@ -89,17 +89,7 @@ def with_names(faces: Sequence[Face]) -> list[Face]:
     parts = _part_names(faces)
     groups = defaultdict(list)
     for number, face in enumerate(faces):
-        given, described = _given(face), described_name(face, low, high)
-        if (
-            not given
-            and described.startswith("chamfer_")
-            and isinstance(face.surface, Plane)
-            and _is_floor(face, faces)
-        ):
-            described = _oblique(face.surface)
-        if not given and described.startswith("countersink_") and any(_ends(face, other) for other in faces):
-            described = described.replace("countersink", "cone")
-        groups[parts[number] + (given or described)].append(number)
+        groups[parts[number] + (_given(face) or described_name(face, faces, low, high))].append(number)
     names: dict[int, str] = {}
     for base, members in groups.items():
         for number, suffix in zip(members, _distinguished([faces[n] for n in members], high - low), strict=True):
@@ -178,11 +168,23 @@ def _part_names(faces: Sequence[Face]) -> list[str]:
     return [f"{names[face.body]}_" for face in faces]
 
 
-def described_name(face: Face, low: Floats, high: Floats) -> str:
-    """Return the kind of a face with its size, for a part that spans ``low`` to ``high`` (3,) [mm]."""
+def described_name(face: Face, faces: Sequence[Face], low: Floats, high: Floats) -> str:
+    """Return the kind of a face with its size, among the ``faces`` of a part.
+
+    Parameters
+    ----------
+    face, faces
+        The face, and all of the part.
+    low, high
+        (3,) [mm] Corners of the part.
+
+    See Also
+    --------
+    cylinder_kind : the kind of a cylinder
+    """
     surface, part = face.surface, float(np.linalg.norm(high - low))
     if isinstance(surface, Plane):
-        return _plane_name(face, surface, low, high)
+        return _plane_name(face, surface, faces, low, high)
     if isinstance(surface, Cylinder):
         kind = cylinder_kind(face, surface)
         whole = kind in ("boss", "bore")
@@ -190,7 +192,8 @@ def described_name(face: Face, low: Floats, high: Floats) -> str:
     if isinstance(surface, Cone):
         angle = np.rad2deg(2 * surface.half_angle)
         if not face.convex:
-            return f"countersink_{degrees(angle)}deg"
+            kind = "cone" if any(_ends(face, other) for other in faces) else "countersink"
+            return f"{kind}_{degrees(angle)}deg"
         narrow = np.ptp((face.vertices - surface.point) @ surface.axis) < _CHAMFER_SHARE * part
         return f"chamfer_{degrees(angle / 2)}deg" if narrow else f"cone_{degrees(angle)}deg"
     if isinstance(surface, Sphere):
@@ -208,7 +211,7 @@ def cylinder_kind(face: Face, surface: Cylinder) -> str:
     return "round" if face.convex else "slot_end" if angle > _HALF else "fillet"
 
 
-def _plane_name(face: Face, surface: Plane, low: Floats, high: Floats) -> str:
+def _plane_name(face: Face, surface: Plane, faces: Sequence[Face], low: Floats, high: Floats) -> str:
     along = int(np.argmax(np.abs(surface.normal)))
     if abs(surface.normal[along]) >= _ALONG:
         up = bool(surface.normal[along] > 0)
@@ -219,21 +222,18 @@ def _plane_name(face: Face, surface: Plane, low: Floats, high: Floats) -> str:
         return f"{name}_at_{'xyz'[along]}{size(at)}mm"
     narrow = _extents(face).min() < _CHAMFER_SHARE * float(np.linalg.norm(high - low))
     off = float(np.rad2deg(np.arccos(np.abs(surface.normal).max())))
-    return f"chamfer_{degrees(off)}deg" if narrow else _oblique(surface)
-
-
-def _oblique(surface: Plane) -> str:
+    if narrow and not _is_floor(face, surface, faces):
+        return f"chamfer_{degrees(off)}deg"
     upright = abs(surface.normal[2]) < np.sqrt(1 - _ALONG**2)  # like the sides of a hexagonal nut
     if upright:
-        return f"side_{degrees(np.rad2deg(np.arccos(np.abs(surface.normal).max())))}deg"
+        return f"side_{degrees(off)}deg"
     return f"slope_{degrees(np.rad2deg(np.arccos(abs(surface.normal[2]))))}deg"  # against the horizontal
 
 
-def _is_floor(face: Face, faces: Sequence[Face]) -> bool:
+def _is_floor(face: Face, surface: Plane, faces: Sequence[Face]) -> bool:
     """Return whether a plane's neighbours rise from it, as from the floor of a bore, along most of its outline."""
-    surface, tree, rise = face.surface, cKDTree(face.vertices), 0.0
+    tree, rise = cKDTree(face.vertices), 0.0
     low, high = face.vertices.min(axis=0) - _TOUCHING_MM, face.vertices.max(axis=0) + _TOUCHING_MM
-    assert isinstance(surface, Plane)
     for other in faces:
         near = ((other.vertices >= low) & (other.vertices <= high)).all(axis=1)
         if other is face or other.body != face.body or not near.any():

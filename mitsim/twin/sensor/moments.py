@@ -71,6 +71,11 @@ class Prior:
     first: Floats | None = None
     held: NDArray[np.bool_] | None = None
 
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """Return which parameters (k,) are not held."""
+        return np.ones(len(self.start), bool) if self.held is None else ~self.held
+
 
 def match_moments(
     real: Floats, covariance: Floats, simulate: Simulate, prior: Prior, draws: int = 2, label: str = ""
@@ -96,7 +101,6 @@ def match_moments(
         return np.mean([m for m, _ in simulations], axis=0), np.mean([s for _, s in simulations], axis=0)
 
     inverse_prior = np.diag(prior.spread**-2.0)
-    held = np.zeros(len(prior.start), bool) if prior.held is None else prior.held
     theta = np.clip(prior.start if prior.first is None else prior.first, prior.low, prior.high)
     seen, spread = figures(theta)
     weight = np.linalg.pinv(covariance + spread / draws)
@@ -136,16 +140,16 @@ def match_moments(
     weight = np.linalg.pinv(covariance + spread / draws)
     off = real - seen
     total = np.linalg.inv(jacobian.T @ weight @ jacobian + inverse_prior)
-    missed = total @ np.where(held, jacobian.T @ weight @ off - inverse_prior @ (theta - prior.start), 0.0)
+    missed = total @ np.where(prior.free, 0.0, jacobian.T @ weight @ off - inverse_prior @ (theta - prior.start))
     total = total + np.outer(missed, missed)
-    determined = (np.sqrt(np.diag(total)) < DETERMINED_SHARE * prior.spread) & ~held
+    determined = (np.sqrt(np.diag(total)) < DETERMINED_SHARE * prior.spread) & prior.free
     freedom = len(real) - int(determined.sum())
     return MomentFit(theta, np.asarray(total, float), determined, float(off @ weight @ off), freedom, off)
 
 
 def _bounded_step(normal: Floats, pull: Floats, theta: Floats, prior: Prior) -> Floats:
     """Return the Gauss-Newton step of parameters not held by a bound, limited to the prior's standard deviation."""
-    free = np.ones(len(theta), bool) if prior.held is None else ~prior.held
+    free = prior.free
     step = np.zeros(len(theta))
     for _ in range(len(theta)):
         step = np.zeros(len(theta))
