@@ -8,6 +8,7 @@ same numbers again and again.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -101,7 +102,7 @@ def leave_out_copies(points: NDArray[np.floating]) -> str:
     seen = np.flatnonzero(np.isfinite(flat).all(axis=-1))
     values = flat[seen]
     # equal points have equal sums: most clouds have no such, and their rows are not sorted
-    sums = np.sort(values[:, 0] + np.e * values[:, 1] + np.pi * values[:, 2])
+    sums = np.sort(values[:, 0] + math.e * values[:, 1] + math.pi * values[:, 2])
     if (sums[1:] != sums[:-1]).all():
         return ""
     order = np.lexsort(values.T)  # stable: equal points keep their order
