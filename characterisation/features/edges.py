@@ -13,7 +13,7 @@ The following biases are not corrected:
 - Points at an edge are mixed. Decoders interpolate between the two surfaces. Blocks extend a near face beyond its edge
   (a hole shrinks) or lose part of it (a hole grows), by up to half the block. This property of the sensor is the same
   all round the edge, so it affects sizes much more than places. A decoder that smooths displaces more points than its
-  noise tells: rims of 12 mm grow by 1.6 mm (Zivid, smoothed by 1.5 px), not by 0.3.
+  noise tells: rims of 12 mm grow by 1.1 mm (Zivid, smoothed by 1.5 px), not by 0.3.
 - Where the wall of a hole is visible, its points within the limit count as points of the face. The edge there moves
   inward by up to m, the limit (along the ray) times the sine of the incidence angle. This moves the centre by m/2 away
   from the wall, and reduces the radius by m/pi. An edge whose other face is visible moves outward likewise.
