@@ -17,7 +17,8 @@ from numpy.typing import ArrayLike
 
 from characterisation.files.arrays import Floats
 
-#: demand by screening, relative to the limit of the decision rule, above which a sensor is not measured
+#: demand by screening, relative to the limit of the decision rule, above which a sensor is not measured; relative to
+#: the best sensor's worst demand if that is above the limit as well
 LARGEST_DEMAND = 3.0
 
 #: reason why a sensor is not measured: no view can make any measurement
@@ -88,10 +89,11 @@ def unpromising(keys: Sequence[RankKey], tolerances: bool) -> list[str]:
     keys
         Keys of the sensors by screening.
     tolerances
-        Whether the demands are relative to a limit; otherwise they are relative to those of the best sensor.
+        Whether the demands are relative to a limit; otherwise they are relative to those of the best sensor. A limit
+        that the best sensor exceeds excludes no sensor that is about as good.
     """
     first = min(keys)
-    least = 1.0 if tolerances else max(first[1], default=math.inf)
+    least = max((1.0, *first[1]) if tolerances else first[1], default=math.inf)
 
     def reason(key: RankKey) -> str:
         if not key[1]:

@@ -14,7 +14,7 @@ later one keeps the sensors whose demand may still be the least, and gives each 
 Screening includes noise and calibration, but not finish, interreflections at edges and false points. It is therefore
 more often too small than too large, and a sensor is excluded if even the screened demand of its best view exceeds
 :data:`mitsim.study.choose.ranking.LARGEST_DEMAND`. A measurement that screening excludes for every sensor excludes none
-of them.
+of them, nor does a tolerance that no sensor comes near.
 
 Finished work is on the disk, so an interrupted command continues. In a round the sensors are measured one after the
 other, and the memory of each is released before the next.

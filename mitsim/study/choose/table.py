@@ -181,7 +181,7 @@ def as_text(choice: ChoiceDocument) -> str:
     lines = [*aligned(rows), "", legend, *choice.fit_more]
     lines += [f"{sensor.name}: {sensor.roughness_in_words}" for sensor in choice.sensors if sensor.roughness_in_words]
     if any(sensor.status == "screened" for sensor in choice.sensors):
-        least = "" if choice.toleranced else " times the best"
+        least = ", and so many times the best" if choice.toleranced else " times the best"
         reasons = f"fewer measurements are possible there, its demand there is above {LARGEST_DEMAND:g}{least}"
         lines.append(f"* by screening alone, (n of m) expected to fit: {reasons}, or time was over")
     lines += [

@@ -115,6 +115,8 @@ def test_a_measurement_that_no_sensor_can_make_excludes_none():
     assert unpromising([(1, (5.0,)), (1, (2.0,))], False) == ["", ""]
     assert unpromising([(1, (0.5,)), (0, (2.0, 1.0))], True) == ["fewer measurements possible", ""]
     assert unpromising([(1, (5.0,))], True) == [""]  # the best sensor is measured, however poor it is
+    # a tolerance that no sensor comes near: before, all but the best were left out
+    assert unpromising([(0, (8.2, 0.5)), (0, (7.5, 2.0)), (0, (23.0, 0.1))], True) == ["", "", "out by far"]
     assert unpromising([(2, ()), (2, ())], True) == ["no measurement possible"] * 2
 
 
