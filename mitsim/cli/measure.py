@@ -192,6 +192,7 @@ def clouds(
             from mitsim.report.style import write_png
 
             file = picture if len(paths) == 1 else picture.with_stem(f"{picture.stem}_{number + 1}")
+            options.check_file(file)
             write_png(drawn(), file, dpi=100)
             say(f"picture: {file}")
         whose.append((path, input_cloud.cloud.sensor, input_cloud.cloud.source))

@@ -14,6 +14,7 @@ from typer.core import TyperGroup
 from characterisation.files.atomic_io import pointed_to
 from characterisation.files.errors import InputError
 from mitsim.cli.folder_lock import lock_folder, remove_partial_beside
+from mitsim.cli.kept_files import refuse_kept
 
 if TYPE_CHECKING:
     from characterisation.point_cloud import PointCloud
@@ -251,12 +252,13 @@ def definitions(items: list[str] | None, option: str = "-D", allowed: str = "nam
 
 
 def check_file(file: Path) -> None:
-    """Check that a file can be written, and create its folder."""
+    """Check that a file can be written and holds nothing that the command reads, and create its folder."""
     check_folder(file.parent, locked=False)
     if file.is_dir():
         raise InputError("--output", "", f"the folder {file}", "a file")
     if file.exists() and not file.is_file():  # an atomic write would replace a device: /dev/null
         raise InputError("--output", "", f"{file}, a device or a pipe", "a file")
+    refuse_kept(file)
     remove_partial_beside(file)
 
 

@@ -42,11 +42,17 @@ from mitsim.cli import (
     studies,
     talk,
 )
+from mitsim.cli.kept_files import note_arguments
 from mitsim.cli.options import Group, command_group, release_folders
 
 
 class Commands(Group):
     """The commands; each releases its folders when it ends."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Note the arguments, so that no command writes over what it reads."""
+        note_arguments(args)
+        return list(super().parse_args(ctx, args))
 
     def invoke(self, ctx: Any) -> Any:
         """Run the requested command."""
