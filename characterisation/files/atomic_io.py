@@ -197,9 +197,9 @@ def write_netcdf(data: xr.Dataset, path: str | Path, encoding: Mapping[Any, Mapp
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write text as UTF-8, atomically."""
+    r"""Write text as UTF-8, atomically; bytes of file names that are not UTF-8 become escapes such as ``\udce9``."""
     with atomic_write(path) as file:
-        file.write_text(text, encoding="utf-8")
+        file.write_text(text, encoding="utf-8", errors="backslashreplace")  # in JSON the same text again
 
 
 def write_json(path: str | Path, data: Any) -> None:

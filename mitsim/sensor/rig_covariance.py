@@ -213,4 +213,5 @@ def _number(value: float, digits: str) -> str:
 
 
 def _text(value: str) -> str:
-    return json.dumps(value, ensure_ascii=False)  # a TOML basic string has JSON's escapes
+    """Return a TOML basic string, which has JSON's escapes; TOML has no bytes of file names that are not UTF-8."""
+    return json.dumps(value.encode(errors="replace").decode(), ensure_ascii=False)

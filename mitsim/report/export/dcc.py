@@ -23,6 +23,7 @@ from characterisation.tasks.task_file import effective_deviations
 from characterisation.words.version import __version__
 from mitsim.report.declaration import Declaration
 from mitsim.report.export.results import ExpectedResult, RunResults
+from mitsim.report.export.xml_text import xml_text
 
 #: XML namespace of digital calibration certificates
 DCC = "https://ptb.de/dcc"
@@ -250,7 +251,7 @@ def _text(to: Element, tag: str, text: str) -> None:
 
 def _add(to: Element, tag: str, text: str = "", **attributes: str) -> Element:
     out = SubElement(to, f"{{{DCC}}}{tag}", attributes)
-    out.text = " ".join(text.split()) or None
+    out.text = xml_text(" ".join(text.split())) or None
     return out
 
 

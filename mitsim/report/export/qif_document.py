@@ -11,6 +11,7 @@ from characterisation.features.figures import Circle, EdgePoint, Point
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
 from characterisation.tasks.definitions import DEFINITIONS, MeasurementKind
 from characterisation.tasks.task_file import Measurement, Nominal, Task
+from mitsim.report.export.xml_text import xml_text
 from mitsim.sensor.transforms import Transform
 
 #: QIF's characteristics by kind of measurement; sizes of a sphere have other names
@@ -93,7 +94,7 @@ def element(tag: str, content: Content = "", /, **attributes: str) -> Element:
 
     A bool has XML's form, a float all its digits.
     """
-    out = Element(tag, attributes)
+    out = Element(tag, {name: xml_text(value) for name, value in attributes.items()})
     match content:
         case Mapping():
             out.extend(element(name, child) for name, child in content.items() if child is not None)
@@ -105,7 +106,7 @@ def element(tag: str, content: Content = "", /, **attributes: str) -> Element:
         case float():
             out.text = decimal(content)
         case _ if content != "":
-            out.text = str(content)
+            out.text = xml_text(str(content))
     return out
 
 

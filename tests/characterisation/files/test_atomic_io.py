@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import errno
+import json
+import os
 import sys
 
 import pytest
 
-from characterisation.files.atomic_io import atomic_folder, atomic_write, atomic_write_named, write_folder
+from characterisation.files.atomic_io import atomic_folder, atomic_write, atomic_write_named, write_folder, write_json
 
 both = pytest.mark.parametrize("written", [atomic_write, atomic_write_named])
 
@@ -89,3 +91,10 @@ def test_a_link_to_a_folder_stays_and_its_folder_is_written(tmp_path):
     assert (tmp_path / "one").is_symlink() and (tmp_path / "two").is_symlink()
     names = sorted(p.relative_to(tmp_path / "disk").as_posix() for p in (tmp_path / "disk").rglob("*"))
     assert names == ["one", "one/second", "two", "two/third"]
+
+
+def test_json_keeps_a_file_name_that_is_not_utf8(tmp_path):
+    name = os.fsdecode(b"caf\xe9 \xc3\xa9.toml")  # e acute in Latin-1, then in UTF-8
+    write_json(tmp_path / "run.json", {"study": name})
+    text = (tmp_path / "run.json").read_bytes().decode("utf-8")
+    assert os.fsencode(json.loads(text)["study"]) == b"caf\xe9 \xc3\xa9.toml"

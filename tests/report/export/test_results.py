@@ -154,6 +154,14 @@ def test_qif_is_valid_against_the_schema(document):
     assert not schema.validate(spoilt)
 
 
+def test_qif_of_a_study_with_any_file_name_is_xml(every_kind, tmp_path):
+    etree = pytest.importorskip("lxml.etree")
+    name = os.fsdecode(b"a\x01\xe9&<>\xc3\xa9\xef\xbf\xbe.toml")  # control, Latin-1, UTF-8, no character
+    write_qif(replace(every_kind, study=name), tmp_path / "all.qif")
+    found = etree.parse(tmp_path / "all.qif").find(".//{*}*[@name='mitsim.study']").get("value")
+    assert found == r"a\x01\udce9&<>é\ufffe.toml"
+
+
 def test_qif_counts_and_references_hold(document):
     numbers = [int(one.get("id")) for one in document.iter() if one.get("id")]
     assert len(numbers) == len(set(numbers)) and max(numbers) == int(document.getroot().get("idMax"))
