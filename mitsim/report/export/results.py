@@ -101,12 +101,24 @@ def read_results(folder: str | Path, task_file: str | Path | None = None) -> Run
             f"{', '.join(run.about.measurements)}: the task of the run",
             "give the run's own: --task FILE",
         )
+    if task_file is not None and run.has(TASK):
+        _check_same(task_file, task, run.task())
     view = run.statement.view
     stated = run.statement.measurements
     results = tuple(expected_result(name, asked, stated[name], view) for name, asked in task.measurements.items())
     numbers = run.about.view_sets[0].views if run.about.view_sets else [view]
     plan = tuple((number, view_pose(run, number), tuple(task.measurements)) for number in numbers)
     return RunResults(results, task, run.about.sensor, run.about.study, run.statement.measured_by, plan)
+
+
+def _check_same(task_file: str | Path, given: Task, own: Task) -> None:
+    """Check that a task is the run's own: its nominal values and tolerances are those of the errors and verdicts."""
+    for kind in ("features", "measurements"):
+        entries, kept = getattr(given, kind), getattr(own, kind)
+        for name in [*kept, *entries]:
+            if entries.get(name) != kept.get(name):
+                hint = "leave --task out, or run the study again with this task"
+                raise InputError(task_file, f"{kind}.{name}", "another definition", "that of the run's task", hint)
 
 
 def write_results_csv(run_results: RunResults, path: str | Path) -> None:

@@ -375,6 +375,22 @@ def test_readings_are_those_of_the_part_whose_errors_are_stated(kind, nominal, t
         assert (one.expected, one.low, one.high) == (value - 0.01, value - 0.11, value + 0.09)
 
 
+def test_a_task_with_another_nominal_or_tolerance_than_that_of_the_run_is_refused(tmp_path):
+    """Its nominal value would move the expected reading, beside a verdict on another tolerance."""
+    folder = with_names_of_tasks(write_expecting_run(tmp_path / "run"))
+    task = tmp_path / "task.toml"
+    task.write_text(TASK)
+    own = read_task(task).model_dump(mode="json", exclude_unset=True, exclude_none=True)
+    (folder / "task.json").write_text(json.dumps(own), encoding="utf-8")
+    assert read_results(folder, task).results == read_results(folder).results
+    for key in ("nominal", "tolerance"):
+        changed = TASK.replace(f"{key} = ", f"{key} = 1", 1)
+        assert changed != TASK
+        task.write_text(changed)
+        with pytest.raises(InputError, match=r"task\.toml: measurements\..*the run's task"):
+            read_results(folder, task)
+
+
 def test_results_have_the_accepted_readings_of_the_statement(tmp_path):
     """Those of the sheet to sign: of a length, of a zone, and of one that accepts none."""
     folder = with_names_of_tasks(write_expecting_run(tmp_path / "run"))
