@@ -23,6 +23,7 @@ from mitsim.report.export.cloud_points import COVARIANCE, CloudPoints
 from mitsim.report.export.cloud_writers import about
 from mitsim.report.export.needed import needed
 from mitsim.report.export.run_scene import quaternion
+from mitsim.report.export.xml_text import xml_text
 from mitsim.sensor.transforms import Transform
 
 #: prefix of the fields that E57 does not define
@@ -35,10 +36,16 @@ NAMESPACE = "https://mitsim.invalid/e57/1.0"
 def write_e57(scans: Sequence[tuple[str, CloudPoints, Transform | None]], path: str | Path) -> None:
     """Write scans: for each a name, its points, and the pose of their frame in the part frame, None if unknown."""
     pye57 = needed("pye57", "pye57", f"{path}: E57")
-    with atomic_write_named(path) as file, pye57.E57(str(file), mode="w") as image:
-        image.image_file.extensionsAdd(PREFIX, NAMESPACE)
-        for name, points, pose in scans:
-            _write_scan(image, pye57.libe57, name, points.in_metres(), pose)
+    with atomic_write_named(path) as file:
+        image = pye57.E57(str(file), mode="w")
+        try:
+            image.image_file.extensionsAdd(PREFIX, NAMESPACE)
+            for name, points, pose in scans:
+                _write_scan(image, pye57.libe57, xml_text(name), points.in_metres(), pose)
+            image.close()
+        except Exception:
+            del image.image_file  # else pye57 closes it again, and prints the traceback of a full disk
+            raise
 
 
 def _write_scan(image: Any, libe57: Any, name: str, points: CloudPoints, pose: Transform | None) -> None:
