@@ -41,30 +41,24 @@ def decoded(capture: Capture, sensor: Sensor, geometry: Geometry, decoder: Decod
 
 
 def plain_sgbm(capture: Capture, sensor: Sensor, geometry: StereoGeometry, block: int) -> PointCloud:
-    """Return the cloud of a stereo pair by OpenCV's own rectification, matcher and triangulation."""
-    settings, grid = sensor.matcher, geometry.grid
+    """Return the cloud of a stereo pair, rectified as its calibration says, by OpenCV's matcher.
+
+    Its pixels are those of the labels: a maker's rectification need not be the one that ``cv2.stereoRectify`` finds.
+    """
+    settings, grid, rectified = sensor.matcher, geometry.grid, geometry.rectification
     assert settings is not None
-    left, right = list(capture.rig.cameras.values())[:2]
-    pose = right.sensor_from_camera.inverse() @ left.sensor_from_camera
-    size = (left.width, left.height)
-    turn_left, turn_right, p_left, p_right, q, *_ = cv2.stereoRectify(
-        left.matrix,
-        left.distortion,
-        right.matrix,
-        right.distortion,
-        size,
-        pose.rotation,
-        pose.translation.reshape(3, 1),
-        flags=0,
-        alpha=-1,
-    )
+    cameras = list(capture.rig.cameras.items())[:2]
+    matrices = rectified.matrix_left, rectified.matrix_right
+    turns = rectified.rotation_left, rectified.rotation_right
     pair = []
-    for camera, turn, p in ((left, turn_left, p_left), (right, turn_right, p_right)):
-        maps = cv2.initUndistortRectifyMap(camera.matrix, camera.distortion, turn, p, size, cv2.CV_32FC1)
-        name = next(name for name, one in capture.rig.cameras.items() if one is camera)
+    for (name, camera), turn, matrix in zip(cameras, turns, matrices, strict=True):
+        size = (rectified.width, rectified.height)
+        maps = cv2.initUndistortRectifyMap(camera.matrix, camera.distortion, turn, matrix, size, cv2.CV_32FC1)
         frame = np.round(capture.images[name][0] * (255 / (2**capture.bits - 1))).astype(np.uint8)
         pair.append(cv2.remap(frame, *maps, cv2.INTER_LINEAR))
-    focal, baseline, offset = p_left[0, 0], np.linalg.norm(pose.translation), p_right[0, 2] - p_left[0, 2]
+    left = cameras[0][1]
+    focal, baseline = matrices[0][0, 0], float(np.linalg.norm(cameras[1][1].centre - left.centre))
+    offset = matrices[1][0, 2] - matrices[0][0, 2]
     nearest, farthest = (focal * baseline / depth - offset for depth in (settings.near_mm, settings.far_mm))
     first = int(np.floor(farthest)) - 1
     count = 16 * int(np.ceil((nearest - first + 2) / 16))
@@ -83,9 +77,13 @@ def plain_sgbm(capture: Capture, sensor: Sensor, geometry: StereoGeometry, block
         speckleRange=2,
     )
     disparity = matcher.compute(*wide)[:, border:].astype(np.float32) / 16
-    points = cv2.reprojectImageTo3D(disparity, q)
-    valid = (disparity >= first) & (points[..., 2] >= settings.near_mm) & (points[..., 2] <= settings.far_mm)
-    in_sensor = points.astype(float) @ turn_left @ left.sensor_from_camera.rotation.T + left.centre
+    with np.errstate(divide="ignore"):
+        depth = focal * baseline / (disparity + offset)
+    valid = (disparity >= first) & (depth >= settings.near_mm) & (depth <= settings.far_mm)
+    columns, rows = np.meshgrid(np.arange(rectified.width), np.arange(rectified.height))
+    right_down = (np.stack([columns, rows], axis=-1) - matrices[0][:2, 2]) / np.diag(matrices[0])[:2]
+    points = np.concatenate([right_down, np.ones_like(depth)[..., None]], axis=-1) * depth[..., None]
+    in_sensor = points @ turns[0] @ left.sensor_from_camera.rotation.T + left.centre
     status = np.where(valid, Status.VALID, Status.AMBIGUOUS).astype(np.uint8)
     cloud = np.where(valid[..., None], in_sensor, np.nan).astype(np.float32)
     return PointCloud(cloud, status, grid, sensor.name, "simulated", geometry.baseline)
