@@ -25,7 +25,7 @@ from characterisation.files.errors import InputError
 from mitsim.sensor.calibration_names import USUAL_NAMES
 from mitsim.sensor.calibration_numbers import Composed, by_rows, dotted, vector
 from mitsim.sensor.calibration_poses import pose_in, second_from_first
-from mitsim.sensor.lens_models import is_fisheye
+from mitsim.sensor.lens_models import check_fourth, is_fisheye
 
 #: number of maps around the deepest one that is searched; chosen
 _DEEPEST = 8
@@ -253,14 +253,12 @@ def lens_in(maps: Sequence[_Named], fisheye: bool) -> Composed | None:
             bent = vector(table[low[spelling]])
             if bent is not None:
                 return Composed(bent, (dotted(name, low[spelling]),), table)
-        names = [
-            coefficient
-            for coefficient in (_FISHEYE if fisheye else _BENT)
-            if vector(table.get(low.get(coefficient, "")), 1) is not None
-        ]
+        plain = {key.replace("_", ""): written for key, written in low.items()}  # tau_x
+        known = _FISHEYE if fisheye else _BENT
+        names = [each for each in known if vector(table.get(plain.get(each, "")), 1) is not None]
         if names:
-            numbers = _ordered({coefficient: _number(table[low[coefficient]]) for coefficient in names}, fisheye)
-            return Composed(numbers, tuple(dotted(name, low[coefficient]) for coefficient in names), table)
+            numbers = _ordered({coefficient: _number(table[plain[coefficient]]) for coefficient in names}, fisheye)
+            return Composed(numbers, tuple(dotted(name, plain[coefficient]) for coefficient in names), table)
         radial, tangential = (next((key for key in keys if key in table), "") for keys in _RADIAL_TANGENTIAL)
         k, p = vector(table.get(radial)), vector(table.get(tangential, [0.0, 0.0]), 2)
         if k is not None and p is not None and 1 <= len(k) <= 3:
@@ -306,6 +304,7 @@ def in_opencvs_order(value: Any, table: Mapping[str, Any], fisheye: bool, where:
         if sorted(set(names) & set(known)) != sorted(names) or len(names) != numbers.size:
             allowed = f"the name of each of the {numbers.size} coefficients, of {', '.join(known)}"
             raise InputError(where, key, ", ".join(words), allowed)
+        check_fourth(names, numbers.tolist(), fisheye, where)
         return _ordered(dict(zip(names, numbers.tolist(), strict=True)), fisheye)
     return value
 

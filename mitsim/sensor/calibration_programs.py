@@ -62,10 +62,13 @@ def with_usual_names(tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def _with_lenses(tree: dict[str, Any]) -> dict[str, Any]:
-    """Return the tree; coefficients in a map under a usual name, such as ``distortion``, are a list."""
+    """Return the tree; coefficients in a map under a usual name, such as ``distortion``, are a list.
+
+    Eight with k4 may be those of a fisheye lens, which only their names tell: such a map stays.
+    """
     fisheye = is_fisheye(tree)
     lenses = {name: lens_in([("", tree[name])], fisheye) for name in _DISTORTIONS if isinstance(tree.get(name), dict)}
-    return tree | {name: lens.value for name, lens in lenses.items() if lens is not None}
+    return tree | {name: lens.value for name, lens in lenses.items() if lens is not None and len(lens.value) != 8}
 
 
 def _lens_beside_matrix(tree: dict[str, Any]) -> Composed | None:

@@ -9,7 +9,7 @@ own.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,9 @@ _MARKS = ("fisheyemodel", "isfisheye", "usefisheye", "fisheye")
 
 #: names of the mirror parameter of the unified model, of one camera or of each of two
 _MIRROR = re.compile(r"xi_?(?:\d|left|right)?", re.IGNORECASE)
+
+#: coefficients of a lens of eight, in OpenCV's order
+_RATIONAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 #: OpenCV's lens models by the names that programs give them, as :func:`_word` returns them
 _MODELS = {
@@ -105,6 +108,70 @@ def lens_model(
             where, "model", repr(model), f"{stated_model}, which the calibration states", "leave out model"
         )
     return stated_model
+
+
+def of_single_numbers(value: Any, sources: str, fisheye: bool, where: str | Path) -> Any:
+    """Return coefficients that stand as single numbers; k1 to k4 alone are those of a fisheye lens.
+
+    Parameters
+    ----------
+    value
+        The coefficients in the order of a perspective lens, or four of a fisheye lens.
+    sources
+        Their names in the file, with commas between them.
+    fisheye
+        Whether the lens is a fisheye.
+    where
+        The file, for messages.
+
+    Raises
+    ------
+    InputError
+        If k4 has no model.
+
+    See Also
+    --------
+    check_fourth : coefficients under names in any order
+    """
+    names = [source.rpartition(".")[2].lower().replace("_", "") for source in sources.split(", ")]
+    if len(value) != 8 or set(names) - set(_RATIONAL):  # two lists, or a model that is whole
+        return value
+    if fisheye and set(names) <= {"k1", "k2", "k3", "k4"}:
+        return value[[0, 1, 4, 5]]
+    check_fourth(names, [value[_RATIONAL.index(name)] for name in names], fisheye, where)
+    return value
+
+
+def check_fourth(names: Sequence[str], values: Sequence[float], fisheye: bool, where: str | Path) -> None:
+    """Check that k4 is that of a fisheye lens, or that of OpenCV's rational lens, which has k5 and k6 too.
+
+    Parameters
+    ----------
+    names, values
+        The coefficients of a lens by name.
+    fisheye
+        Whether the lens is a fisheye.
+    where
+        The file, for messages.
+
+    Raises
+    ------
+    InputError
+        If it is neither: the same number means another camera in other programs.
+
+    See Also
+    --------
+    lens_model : the model that words state
+    """
+    named = dict(zip(names, values, strict=True))
+    if fisheye or not named.get("k4") or {"k5", "k6"} & set(named):
+        return
+    hint = (
+        'of a fisheye lens, say so in a sensor file: [calibration] with model = "fisheye"; a k4 of r^8 (Metashape) is '
+        "in no lens of OpenCV"
+    )
+    allowed = "k1 to k6 of OpenCV's rational lens, or k1 to k4 of a stated fisheye lens"
+    raise InputError(where, ", ".join(names), f"k4 of {named['k4']:g} without k5 and k6", allowed, hint)
 
 
 def _stated(table: dict[str, Any], straight: bool) -> Iterator[tuple[str, Any, str]]:

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from characterisation.files.documents import Document, validate
 from characterisation.files.errors import InputError, nearest
 from mitsim.sensor.calibration_doubts import board_unit_note, check_unit, facing_note, lens_note, matrix_notes
-from mitsim.sensor.calibration_eyes import in_opencvs_order, size_of
+from mitsim.sensor.calibration_eyes import in_opencvs_order, lens_in, size_of
 from mitsim.sensor.calibration_formats import beside
 from mitsim.sensor.calibration_names import USUAL_NAMES, Names
 from mitsim.sensor.calibration_numbers import by_rows, checked_matrix, numbers_of, rotation_matrix
@@ -31,7 +31,7 @@ from mitsim.sensor.calibration_qualifiers import OF_FORMAT, of_images, read_out_
 from mitsim.sensor.calibration_quaternions import ORDERED
 from mitsim.sensor.calibration_table import CalibrationTable, EyeKeys
 from mitsim.sensor.calibration_tree import CalibrationTree, Found, read_tree
-from mitsim.sensor.lens_models import is_fisheye, lens_model
+from mitsim.sensor.lens_models import is_fisheye, lens_model, of_single_numbers
 
 
 def with_calibration(
@@ -194,16 +194,26 @@ class _Values:
             names = tuple(key for key in names if key not in USUAL_NAMES[quantity][1])
         for key in names:
             match = self.tree.find(key)
+            if match is not None and quantity == "distortion" and isinstance(match.value, dict):
+                lens = lens_in([(match.name, match.value)], self._is_fisheye(match.table))
+                match = None if lens is None else replace(match, value=lens.value, name=", ".join(lens.sources))
             if match is not None and (key == stated_name or quantity == "size" or not isinstance(match.value, dict)):
                 value = size_of(match.value) if quantity == "size" and isinstance(match.value, dict) else match.value
-                if quantity == "distortion" and "," not in match.name:  # single numbers have their order
-                    around = self.tables[-1] if self.tables else {}
-                    fisheye = self.calibration_table.model == "fisheye" or is_fisheye(around | match.table)
-                    value = in_opencvs_order(value, match.table, fisheye, match.file)
+                if quantity == "distortion":
+                    fisheye = self._is_fisheye(match.table)
+                    if "," in match.name:
+                        value = of_single_numbers(value, match.name, fisheye, match.file)
+                    else:
+                        value = in_opencvs_order(value, match.table, fisheye, match.file)
                 return replace(match, value=numbers_of(value, match.file, match.name, shapes))
         if needed or stated_name:
             self.missing.append((name, quantity, names))
         return None
+
+    def _is_fisheye(self, table: dict[str, Any]) -> bool:
+        """Return whether the sensor file, or the table of a lens or that of its matrix, states a fisheye lens."""
+        around = self.tables[-1] if self.tables else {}
+        return self.calibration_table.model == "fisheye" or is_fisheye(around | table)
 
     def all_missing(self) -> InputError:
         """Return one error that names all missing values."""

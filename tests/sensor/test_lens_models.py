@@ -98,3 +98,45 @@ def test_the_unified_model_of_two_cameras_is_refused(tmp_path):
 def test_the_name_of_a_device_is_no_model(tmp_path, device):
     read = read_calibration(single(tmp_path / "a.json", model=device, distortion=[0.0] * 5), SIZE)
     assert read.rig.reference.model == "perspective"
+
+
+BENT_BY_NAME = {name: float(number) for name, number in zip(("k1", "k2", "k3", "k4"), BENT, strict=True)}
+WHOLE = {"camera_matrix": K.tolist(), "image_size": list(SIZE)}
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        {"fx": 600.0, "fy": 602.0, "cx": 322.0, "cy": 238.0, **BENT_BY_NAME},
+        {"fx": 600.0, "fy": 602.0, "cx": 322.0, "cy": 238.0, "distortion": BENT_BY_NAME},
+        WHOLE | BENT_BY_NAME,
+        WHOLE | {"distortion": BENT_BY_NAME},
+        {"camera": WHOLE | {"distortion": BENT_BY_NAME}},
+    ],
+)
+def test_k1_to_k4_alone_are_a_fisheye_lens_or_refused(tmp_path, table):
+    """They were k1, k2, k3 and k4 of a rational lens, without a word: up to 55 px off in an image of 1280 px."""
+    (tmp_path / "a.json").write_text(json.dumps(table))
+    with pytest.raises(InputError, match=r"k4 of -0\.001 without k5 and k6.*model = \"fisheye\""):
+        read_calibration(tmp_path / "a.json", SIZE)
+    sensor = '[calibration]\nfile = "a.json"\nprojector = false\nmodel = "fisheye"\n'
+    (tmp_path / "a.toml").write_text(sensor)
+    is_fisheye(tmp_path / "a.toml")
+
+
+def test_k4_of_a_polynomial_is_refused_in_a_list_with_names_too(tmp_path):
+    """Metashape's K4 belongs to r^8, which is in no lens of OpenCV."""
+    names = ["k1", "k2", "k3", "k4", "p1", "p2"]
+    path = single(tmp_path / "a.json", distortion=[-0.1, 0.05, 0.01, 0.02, 1e-3, -1e-3], distortion_names=names)
+    with pytest.raises(InputError, match=r"k4 of 0\.02 without k5 and k6"):
+        read_calibration(path, SIZE)
+
+
+def test_coefficients_are_read_with_underscores_in_their_names(tmp_path):
+    """The tilt of the imager, tau_x and tau_y, and lenses of k_1 to k_3 were left out without a word."""
+    names = ("k_1", "k_2", "p_1", "p_2", "k_3", "k_4", "k_5", "k_6", "s_1", "s_2", "s_3", "s_4", "tau_x", "tau_y")
+    bent = [-0.1, 0.05, 1e-3, -5e-4, 0.01, 0.02, -0.01, 3e-3, 2e-3, -1e-3, 1.5e-3, 4e-4, 0.01, -0.008]
+    for count in (5, 8, 12, 14):
+        camera = read_calibration(single(tmp_path / "a.json", **dict(zip(names[:count], bent, strict=False))), SIZE)
+        seen, _ = cv2.projectPoints(POINTS, np.zeros(3), np.zeros(3), K, np.array(bent[:count]))
+        np.testing.assert_allclose(camera.rig.reference.project(POINTS), seen[:, 0], atol=1e-6)
