@@ -83,7 +83,7 @@ def _toolbox(tree: dict[str, Any], out: dict[str, Any]) -> dict[str, Any]:
     """Return the values of the Computer Vision Toolbox: of the pair, or else of the camera, that a file has.
 
     Those of several cameras are found by the name of their structure alone. ``out`` loses a K whose pixels count from
-    1, which is none of OpenCV's.
+    1, and a size of rows and columns, which are none of OpenCV's.
     """
     pairs: list[dict[str, Any]] = []
     cameras: dict[str, dict[str, Any]] = {}
@@ -97,7 +97,8 @@ def _toolbox(tree: dict[str, Any], out: dict[str, Any]) -> dict[str, Any]:
         if name.count(".") < _DEEPEST:
             maps += [(dotted(name, key), value) for key, value in holder.items() if isinstance(value, dict)]
     if "" in cameras:
-        out.pop("K", None)
+        for name in ("K", "ImageSize"):
+            out.pop(name, None)
     quantities = {"+K1": "matrix", "+D1": "distortion", "+size": "size"}
     named = {
         f"+{quantities[key]} of {name}": value

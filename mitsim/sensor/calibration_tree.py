@@ -28,6 +28,9 @@ _DERIVED = re.compile(
     re.IGNORECASE,
 )
 
+#: names of the first single coefficient of a lens: k1, dist_k1, kc1, radial_1
+_FIRST = re.compile(r"(?:.*_)?(?:k[cr]?|kappa)_?1(?:_.*)?|(?:.*_)?(?:radial|dist|distortion)_?1")
+
 #: letters of a name from which its capital letters do not matter
 _SHORTEST = 5
 
@@ -147,7 +150,8 @@ def _ends(name: str) -> list[int]:
 
 def _is_optics(name: str, value: Any) -> bool:
     """Return whether a value looks like a camera matrix, distortion coefficients, or a rotation."""
-    if name.rpartition(".")[2].lower() == "k1" and not isinstance(value, (list, np.ndarray)):
+    own = name.rpartition(".")[2].lower()
+    if _FIRST.fullmatch(own) and not isinstance(value, (list, np.ndarray)):
         alone = vector(value, 1)
         return alone is not None and bool(alone.any())
     try:
@@ -160,7 +164,8 @@ def _is_optics(name: str, value: Any) -> bool:
         matrix = numbers[0, 0] > 0 and np.abs(numbers[2] - [0, 0, 1]).max() < 1e-9 and numbers[0, 2] > 0
         return bool(matrix or np.abs(numbers @ numbers.T - np.eye(3)).max() < 1e-4)
     is_vector = numbers.ndim and numbers.size == max(numbers.shape)
-    return bool(is_vector and numbers.size in (4, 5, 8, 12, 14) and np.abs(numbers).max() < 100 and numbers.any())
+    lens = numbers.size in (4, 5, 8, 12, 14) or (numbers.size > 1 and ("radial" in own or "distortion" in own))
+    return bool(is_vector and lens and np.abs(numbers).max() < 100 and numbers.any())
 
 
 def _stepped(tree: dict[str, Any], name: str) -> tuple[str, Any, dict[str, Any]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import json
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from scipy.io import savemat
 
 from characterisation.files.errors import InputError
+from mitsim.capture.recordings.calibration_file import read_calibration
 from mitsim.sensor.calibration_tree import read_tree
 from mitsim.sensor.preset import load_sensor
 from tests.sensor.opencv_files import opencv_file
@@ -148,6 +150,25 @@ def test_a_structure_of_the_vision_toolbox(tmp_path):
     found = loaded(tmp_path, PAIR, '"stereo.mat"', size=None)
     is_the_rig(found.rig, found.rig.cameras["right"])
     assert (found.rig.reference.width, found.rig.reference.height) == (640, 480)
+
+
+@pytest.mark.parametrize("suffix", [".json", ".mat"])
+def test_fields_of_a_structure_of_the_vision_toolbox_alone(tmp_path, suffix):
+    """jsonencode(toStruct(cameraParams)): its size was (columns, rows), so images of 640 x 480 px were refused."""
+    camera = {
+        "IntrinsicMatrix": (K1 + np.eye(3)[[2, 2, 2]] * [[1], [1], [0]]).T.tolist(),
+        "RadialDistortion": D1[[0, 1, 4]].tolist(),
+        "TangentialDistortion": D1[2:4].tolist(),
+        "ImageSize": [480, 640],
+    }
+    path = tmp_path / f"camera{suffix}"
+    if suffix == ".mat":
+        savemat(path, camera)
+    else:
+        path.write_text(json.dumps(camera))
+    read = read_calibration(path).rig.reference
+    np.testing.assert_allclose(read.matrix, K1)
+    assert (read.width, read.height) == (640, 480)
 
 
 def test_names_that_go_together_are_found_together(tmp_path):

@@ -102,3 +102,28 @@ def test_a_calibration_of_depthai_without_cameras(tmp_path):
     (tmp_path / "empty.json").write_text(json.dumps(table))
     with pytest.raises(InputError, match=r'height: found \{"px": true\}; allowed: a whole number'):
         read_calibration(tmp_path / "empty.json")
+
+
+@pytest.mark.parametrize(
+    "unread",
+    [
+        {"dist_k1": -0.1, "dist_k2": 0.05},
+        {"distortion_k1": -0.1},
+        {"kc1": -0.1, "kc2": 0.05},
+        {"k1_left": -0.1},
+        {"radial_distortion": [-0.1, 0.05, 0.01, 0.02, -0.01, 0.003]},
+    ],
+)
+def test_coefficients_under_unusual_names_are_told(tmp_path, unread):
+    """They were left out without a word: 60 px at the corner of an image of 1280 px with k1 = -0.1."""
+    camera = {"fx": 60.0, "fy": 60.0, "cx": 31.5, "cy": 23.5, "width": 64, "height": 48}
+    (tmp_path / "a.json").write_text(json.dumps(camera | unread))
+    (note,) = read_calibration(tmp_path / "a.json").notes
+    assert f"values not read: {next(iter(unread))}" in note and "camera without distortion" in note
+
+
+@pytest.mark.parametrize("other", [{"task_1": 5.0}, {"k1": 0.0}, {"dist_m": 0.7}, {"max_distortion_px": 0.4}])
+def test_other_numbers_are_no_coefficients(tmp_path, other):
+    camera = {"fx": 60.0, "fy": 60.0, "cx": 31.5, "cy": 23.5, "width": 64, "height": 48}
+    (tmp_path / "a.json").write_text(json.dumps(camera | other))
+    assert read_calibration(tmp_path / "a.json").notes == ()
