@@ -110,6 +110,8 @@ TEXTS = {
     "names after other columns": text(",", "# scan\n# r,g,b,x,y,z\n", "1{s}2{s}3{s}{x}{s}{y}{s}{z}"),
     "empty fields": text(",", missing=""),
     "points and commas": text(", "),
+    "quotes, semicolons and decimal commas": text(";", columns='"{x}"{s}"{y}"{s}"{z}"', mark=","),
+    "a tab at the end of rows": text(",", end="\t\n"),
     "a number of points": text(" ", "2700\n"),
     "carriage returns": text(",", end="\r\n"),
 }
@@ -123,6 +125,33 @@ def test_texts_of_many_programs(tmp_path, name, encoding):
     cloud, about = read_plain_cloud(tmp_path / "a.csv")
     np.testing.assert_allclose(cloud.points[cloud.valid], plane(2.0)[np.isfinite(plane()[..., 0])], atol=1e-3)
     assert "in mm, " in about
+
+
+def thousands(separator, quote="", of_thousands=",", mark="."):
+    """A text of the plane, 1500 mm farther away, with marks of thousands and no names."""
+    points = plane(1502.0).reshape(-1, 3)
+    points = points[np.isfinite(points).all(axis=1)]
+    marks = str.maketrans(",.", of_thousands + mark)
+    rows = [[f"{quote}{value:,.4f}{quote}".translate(marks) for value in row] for row in points.tolist()]
+    return "\n".join(separator.join(row) for row in rows) + "\n"
+
+
+MARKED = {
+    "semicolons": thousands(";"),
+    "tabs": thousands("\t"),
+    "spaces": thousands(" "),
+    "points of thousands, decimal commas": thousands(";", of_thousands=".", mark=","),
+    "quotes": thousands(",", '"'),
+    "decimal commas in quotes": text(",", columns='"{x}"{s}"{y}"{s}"{z}"', mark=",", missing="0,0"),
+}
+
+
+@pytest.mark.parametrize("name", MARKED)
+def test_commas_of_thousands_are_refused(tmp_path, name):
+    """A row -12.5;7.1;2,102.5 was the point -12.5, 7.1, 2, and "-12,5","7,1","602,5" was -12, 5, 7."""
+    (tmp_path / "a.csv").write_text(MARKED[name])
+    with pytest.raises(InputError, match="a comma that is no separator, as of thousands"):
+        read_plain_cloud(tmp_path / "a.csv")
 
 
 def sized(factor, head="", separator=","):

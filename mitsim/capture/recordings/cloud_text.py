@@ -42,6 +42,12 @@ _OF_AXIS = re.compile(r"(?<![a-z])[xyz](?:\s*[\[(]\s*(\w+)\s*[\])]|_(\w+))")
 #: words before the names in a comment
 _BEFORE_NAMES = re.compile(r"^(?:[\w ]*:|columns?|fields?|format)\s+")
 
+#: a comma inside a number of a row whose numbers have other separators: a mark of thousands, say
+_OTHER_MARK = re.compile(rb"\S,\S.*[;\t]\s*\S|\S\s*[;\t].*\S,\S|[^\s,] +[^\s,]+,\S|\S,[^\s,]+ +[^\s,]")
+
+#: a comma inside a number in quotes, beside one that separates numbers
+_QUOTED_COMMA = re.compile(rb'"[-+]?\d[\d.]*,\d[\d.,]*"\s*,|,\s*"[-+]?\d[\d.]*,\d[\d.,]*"')
+
 #: lines from which separators and decimal mark are found
 _SAMPLE = 200
 
@@ -60,6 +66,7 @@ def points_of_text(data: bytes, path: Path) -> tuple[NDArray[np.float64], str | 
     encoding = next((name for mark, name in _MARKS.items() if data.startswith(mark)), None)
     if encoding is not None:
         data = data.decode(encoding, "replace").encode()
+    quoted = _QUOTED_COMMA.search(data)
     lines = [line.strip(b" \r\n") for line in data.replace(b'"', b"").splitlines()]
     rows = [line for line in lines if line.strip() and not _is_comment(line)]
     heads = [line.decode("utf-8", "replace") for line in lines[:100] if _is_comment(line)]
@@ -67,6 +74,11 @@ def points_of_text(data: bytes, path: Path) -> tuple[NDArray[np.float64], str | 
         if rows and len(number_words(rows[0].translate(_SPACES))) == 1:  # the number of points
             rows = rows[1:]
         rows = _with_points(rows)
+        mixed = next((row for row in rows[:_SAMPLE] if _OTHER_MARK.search(row)), quoted and quoted[0])
+        if mixed:
+            raise ValueError(
+                f"{mixed[:60].decode('ascii', 'replace')!r}: a comma that is no separator, as of thousands"
+            )
         columns = len(number_words(rows[0].translate(_SPACES))) if rows else 0
         words = number_words(b"\n".join(rows).translate(_SPACES))
         if columns < 3 or len(words) != columns * len(rows):
