@@ -203,6 +203,7 @@ def _recorded(path: Path, output: Path, board: str | None) -> None:
     from mitsim.study.calibration.halves import calibrate_checked
     from mitsim.study.calibration.written import (
         calibration_table,
+        noisy_pose_hints,
         other_size_hints,
         sensor_lines,
         write_calibration,
@@ -222,7 +223,7 @@ def _recorded(path: Path, output: Path, board: str | None) -> None:
     source = f"recorded corners: {path.name}, {chequerboard}"[:400]
     checked = calibrate_checked(corners, source, str(path))
     print(calibration_table(checked), end="")
-    for hint in other_size_hints(checked.calibration.rig):
+    for hint in [*other_size_hints(checked.calibration.rig), *noisy_pose_hints(checked, corners)]:
         say(f"warning: {hint}")
     rig_file = write_calibration(checked, output)
     say(f"calibration: {output}, {rig_file}; in a sensor file:")

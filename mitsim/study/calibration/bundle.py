@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from characterisation.files.arrays import Floats
+from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.rig_parameters import MATRIX_NAMES, POSE_NAMES, distortion_names, moved, parameter_names
 from mitsim.sensor.transforms import Transform
@@ -35,6 +36,10 @@ from mitsim.study.calibration.board import Board
 
 #: columns of OpenCV's Jacobian after rotation, translation and fx fy cx cy: the coefficients
 _ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")
+
+#: angle [deg] between a second eye's places at one pose and at the others, above which corners have another order.
+#: Chosen: half of a quarter turn; 1 px of noise gives 4 deg
+_TURNED_DEG = 45.0
 
 
 @dataclass(frozen=True)
@@ -125,6 +130,38 @@ def second_eye(first: Sequence[Transform], second: Sequence[Transform]) -> Trans
     apart = [transform @ other.inverse() for transform, other in zip(first, second, strict=True)]
     turn = Rotation.from_matrix([motion.rotation for motion in apart]).mean().as_matrix()
     return Transform(turn, np.median([motion.translation for motion in apart], axis=0))
+
+
+def check_order(first: Sequence[Transform], second: Sequence[Transform], eye: str, names: Sequence[str]) -> None:
+    """Check that the second eye stands alike to the first at all poses: corners in another order turn it.
+
+    Parameters
+    ----------
+    first, second
+        Poses ``eye_from_board`` of the board in both eyes.
+    eye
+        Name of the second eye, for messages.
+    names
+        Those of the poses; an empty one is replaced by the number of its pose.
+
+    Raises
+    ------
+    InputError
+        If one pose of the board turns it by about a quarter or half of a turn, as another order of its corners does.
+
+    See Also
+    --------
+    second_eye : the place of the second eye
+    """
+    turns = np.array([(pose @ other.inverse()).rotation for pose, other in zip(second, first, strict=True)])
+    cosine = (np.einsum("iab,jab->ij", turns, turns) - 1) / 2
+    apart = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    from_most = apart[np.argmin(np.median(apart, axis=1))]
+    odd = int(np.argmax(from_most))
+    if from_most[odd] > _TURNED_DEG:
+        found = f"corners that turn {eye} by {from_most[odd]:.0f} deg against the other poses"
+        hint = "are they in the order of --board, COLUMNSxROWS, as at other poses? Reverse them, or leave out the pose"
+        raise InputError("boards", f"{eye}, pose {names[odd] or odd}", found, "one order in both eyes", hint)
 
 
 def stepped(rig: Rig, poses: Sequence[Transform], names: tuple[str, ...], step: Floats) -> tuple[Rig, list[Transform]]:

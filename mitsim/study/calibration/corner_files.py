@@ -108,7 +108,7 @@ def _together(
             left_out.append(f"{pose}: the same as {twin}")
             continue
         used[pose] = pixels
-        boards.append(RecordedBoard(np.array(common, np.intp), pixels, images.get(pose)))
+        boards.append(RecordedBoard(np.array(common, np.intp), pixels, images.get(pose), pose))
     if not boards:
         reasons = "; ".join(left_out[:3]) or "no pose"
         raise InputError(path, "", reasons, f"poses with {_LEAST_CORNERS} corners or more", "check --board")

@@ -57,7 +57,7 @@ _SMALL_GAIN = 1e-9
 _STUCK = 1e9
 #: residuals of corners [px], median of the poses, above which the model of the lens is wrong; *assumed*: corners of
 #: real boards scatter by 0.05 to 1 px
-_MOST_NOISE_PX = 3.0
+MOST_NOISE_PX = 3.0
 #: the usual cause of corners that no rig sees
 _ORDER = "are the corners of all cameras in the order of --board, COLUMNSxROWS, and of the same pose?"
 #: least angle [deg] between board normals for which a missing tilt is not named as the cause of a failure; *assumed*
@@ -70,12 +70,13 @@ LEAST_POSES = 3
 class RecordedBoard:
     """A board at one pose: ``corners`` (n,) of :attr:`Board.corners`, and their pixels (n, 2) by eye.
 
-    ``images`` of the pose, if it was read from images.
+    ``images`` of the pose, if it was read from images; its ``name``, for messages.
     """
 
     corners: NDArray[np.intp]
     pixels: Mapping[str, Floats]
     images: FittedCapture | None = None
+    name: str = ""
 
 
 @dataclass(frozen=True)
@@ -130,7 +131,7 @@ def calibrate_recorded(corners: RecordedCorners, source: str, *, own_units: bool
         rig, poses, normal = observed.adjusted(rig, poses, noise, rig_prior(rig, sizes))
         noise = observed.noise(rig, poses, normal)
     typical = float(np.median(noise[:, 0]))
-    if not typical <= _MOST_NOISE_PX:  # NaN of a lens that folds
+    if not typical <= MOST_NOISE_PX:  # NaN of a lens that folds
         hint = (
             f"{_ORDER} A lens of more than about 90 deg needs another model; leave out corners far from the middle of "
             "the image"
@@ -139,7 +140,7 @@ def calibrate_recorded(corners: RecordedCorners, source: str, *, own_units: bool
             "corners that the fitted lens cannot see" if math.isnan(typical) else f"residuals of {typical:.1f} px"
         )
         raise InputError(
-            "boards", "", residuals, f"{_MOST_NOISE_PX:g} px or less, of a lens with k1, k2, p1, p2, k3", hint
+            "boards", "", residuals, f"{MOST_NOISE_PX:g} px or less, of a lens with k1, k2, p1, p2, k3", hint
         )
     matrix, effect = observed.covariance(rig, poses, noise, normal, own_units)
     details: dict[str, str | float] = {
@@ -206,6 +207,7 @@ def _start(
             pixels, options = [view.pixels[eye] for view in boards], {"distCoeffs": np.zeros(5), "flags": flags | free}
             tries.append(bundle.eye_start(points, pixels, (width, height), guess, **options))
         _, matrix, _, poses[eye] = min(tries, key=lambda fit: fit[0])
+        bundle.check_order(poses[reference], poses[eye], eye, [view.name for view in boards])
         pose = Transform.identity() if eye == reference else bundle.second_eye(poses[reference], poses[eye])
         cameras[eye] = Camera(matrix, np.zeros(5), width, height, pose)
     projector = cameras.pop("projector", None)

@@ -15,6 +15,7 @@ from mitsim.sensor.fitted_to import FittedCapture
 from mitsim.sensor.rig_covariance import write_rig_covariance
 from mitsim.sensor.rig_parameters import parameter_values
 from mitsim.study.calibration.halves import CheckedCalibration, in_words
+from mitsim.study.calibration.recorded import MOST_NOISE_PX, RecordedCorners
 
 #: distance of a principal point from the middle, as a share of the size, that is unusual: four standard deviations of
 #: the prior of cameras
@@ -64,6 +65,16 @@ def other_size_hints(rig: Rig) -> list[str]:
                 f"{size[0]} x {size[1]} px: were the corners found in images of another size, or in a part of them?"
             )
     return out
+
+
+def noisy_pose_hints(checked: CheckedCalibration, corners: RecordedCorners) -> list[str]:
+    """Return a warning for each pose whose corners the calibration does not explain; it has next to no weight."""
+    return [
+        f"pose {board.name or number}: residuals of {noise:.1f} px, so it has next to no weight: are its corners those "
+        "of the board, and its images taken at one time?"
+        for number, (board, noise) in enumerate(zip(corners.boards, checked.calibration.camera_px, strict=True))
+        if noise > MOST_NOISE_PX
+    ]
 
 
 def calibration_table(checked: CheckedCalibration) -> str:

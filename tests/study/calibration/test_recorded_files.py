@@ -23,7 +23,7 @@ from mitsim.study.calibration.board import Board
 from mitsim.study.calibration.corner_files import read_corners
 from mitsim.study.calibration.halves import calibrate_checked, in_words
 from mitsim.study.calibration.recorded import RecordedBoard, RecordedCorners
-from mitsim.study.calibration.written import opencv_text, write_calibration
+from mitsim.study.calibration.written import noisy_pose_hints, opencv_text, write_calibration
 from tests.shell import mitsim_here
 
 BOARD = Board(9, 7, 20.0, "glass")
@@ -113,6 +113,34 @@ def test_corners_of_a_board_with_twice_as_many_are_refused(tmp_path):
     assert len(read_corners(tmp_path / "c.npz", BOARD).boards) == 10
     with pytest.raises(InputError, match=r"\(10, 48, 2\); allowed: \(poses, 24, 2\)"):
         read_corners(tmp_path / "c.npz", Board(9, 4, 20.0, "glass"))
+
+
+ORDERS = {
+    "reversed": lambda corners: corners[::-1],
+    "rows mirrored": lambda corners: corners.reshape(6, 8, 2)[:, ::-1].reshape(-1, 2),
+    "columns mirrored": lambda corners: corners.reshape(6, 8, 2)[::-1].reshape(-1, 2),
+}
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("count", [10, 24])
+def test_one_pose_in_another_order_is_refused_by_name(tmp_path, order, count):
+    """Of 10 poses the calibration took it, at residuals of 133 px; of 24 it did not converge and named no pose."""
+    pixels = pixels_of(1, count)
+    pixels["right"][3] = ORDERS[order](pixels["right"][3])
+    write_table(tmp_path / "c.csv", pixels)
+    with pytest.raises(InputError, match=r"right, pose 3: found corners that turn right by 1[78]\d deg"):
+        calibrate_checked(read_corners(tmp_path / "c.csv", BOARD), "test")
+
+
+def test_a_pose_that_the_calibration_does_not_explain_is_told(tmp_path):
+    """The right image of another moment: its residuals were in the printed range, of no pose."""
+    pixels = pixels_of(1)
+    pixels["right"][3] += [0.0, 15.0]
+    write_table(tmp_path / "c.csv", pixels)
+    corners = read_corners(tmp_path / "c.csv", BOARD)
+    (hint,) = noisy_pose_hints(calibrate_checked(corners, "test"), corners)
+    assert hint.startswith("pose 3: residuals of ")
 
 
 def test_corners_in_the_order_of_another_board_are_said(tmp_path):
