@@ -69,12 +69,16 @@ def result_tables(
 
 
 def summary(clouds: Sequence[Sequence[Result]]) -> str:
-    """Return one line: the number of measurements with a value, and the first without, with its reason."""
+    """Return one line: how many measurements have a value, the first without, with its reason, and those of u 0."""
     every = [result for results in clouds for result in results]
     count = sum(result.possible for result in every)
     text = f"{count} of {len(every)} measurements" + (f" in {len(clouds)} clouds" if len(clouds) > 1 else "")
     first_failed = next((result for result in every if not result.possible), None)
-    return text + (f"; {first_failed.name}: {first_failed.reason}" if first_failed else "")
+    text += f"; {first_failed.name}: {first_failed.reason}" if first_failed else ""
+    exact = list(dict.fromkeys(result.name for result in every if result.origin == "fit" and result.uncertainty == 0))
+    shown = ", ".join(exact[:3]) + ", ..." * (len(exact) > 3)
+    why = "its points have no scatter, as depths of one whole mm have, which hide noise and up to half a step"
+    return text + (f"; u is 0 of {shown}: {why}" if exact else "")
 
 
 def measured_document(

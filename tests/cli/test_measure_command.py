@@ -71,6 +71,20 @@ def test_a_copy_among_repeats_is_told(asked, clouds):
     assert told.count("not a repeat") == 1
 
 
+@pytest.mark.parametrize("tilt", [0.0, 0.2])
+def test_depths_of_one_whole_mm_say_why_u_is_0(tmp_path, rng, tilt):
+    """A wall at 700.2 mm was at 700.000 mm with u = 0 and noise 0, without a word."""
+    rows, columns = np.mgrid[:48, :64]
+    rays = np.stack([(columns - 31.5) / 60, (rows - 23.5) / 60, np.ones((48, 64))], axis=-1)
+    depth = 700.2 / (1 + tilt * rays[..., 0]) + 0.05 * rng.standard_normal((48, 64))
+    np.save(tmp_path / "wall.npy", np.rint(depth)[..., None] * rays)
+    done = run(tmp_path / "wall.npy", "--plane", "wall")
+    told = (
+        "u is 0 of wall flatness, wall noise, wall distance, ...: its points have no scatter, as depths of one whole mm"
+    )
+    assert (told in done.stderr) == (tilt == 0.0)
+
+
 def test_a_difference_with_its_picture(clouds):
     done = run(
         clouds / "0.ply",
