@@ -55,6 +55,11 @@ _SINGLES = ("image_points", "imgpoints", "Image_points")
 #: suffixes of files of arrays
 _OF_ARRAYS = (".npz", ".yml", ".yaml", ".xml", ".json")
 
+#: the camera within the name of an image: a word of its own, or a capital letter at the end or before a number there
+_WITHIN = re.compile(
+    r"(?<![a-zA-Z0-9])(?i:left|right|l|r|(?:camera|cam|ir|infra)[-_ ]?\d{1,2})(?![a-zA-Z0-9])|[LR](?=\d*$)"
+)
+
 _COLUMNS = ("pose", "camera", "column", "row", "x_px", "y_px")
 
 
@@ -195,7 +200,7 @@ def _named(files: Sequence[Path], path: Path) -> dict[Path, tuple[str, str]]:
 
     A folder is a camera, unless the names of its images state several.
     """
-    by_name = {file: _by_name(file) for file in files}
+    by_name = {file: _by_name(file) for file in files} | _pairs_within(files)
     stated: dict[Path, set[str]] = {}
     for file, (camera, pose) in by_name.items():
         stated.setdefault(file.parent, set()).update({camera} if pose != file.stem else ())
@@ -218,6 +223,26 @@ def _by_name(file: Path) -> tuple[str, str]:
     if match:
         return {"l": "left", "r": "right"}.get(match[2].lower(), match[2].lower()), match[1]
     return "camera", file.stem
+
+
+def _pairs_within(files: Sequence[Path]) -> dict[Path, tuple[str, str]]:
+    """Return the camera and the pose of images named as ``img_left_1`` and ``img_right_1``, if most are such pairs.
+
+    Any image without such a name, as of a board at the left, at the right and in the middle, belongs to one camera.
+    """
+    out: dict[Path, tuple[str, str]] = {}
+    poses: dict[str, set[str]] = {}
+    for file in files:
+        match = _WITHIN.search(file.stem)
+        if match is None:
+            return {}
+        camera, pose = match[0].lower(), f"{file.stem[: match.start()]}{file.stem[match.end() :]}"
+        out[file] = {"l": "left", "r": "right"}.get(camera, camera), re.sub(r"[-_ ]{2,}", "_", pose).strip("-_ ")
+        poses.setdefault(out[file][0], set()).add(out[file][1])
+    if len(poses) != 2 or len(out) != sum(map(len, poses.values())):
+        return {}
+    first, second = poses.values()
+    return out if len(first & second) > len(first | second) / 2 else {}
 
 
 def _of_table(path: Path, board: Board) -> tuple[Seen, Sizes]:

@@ -313,6 +313,9 @@ def test_eyes_that_no_calibration_file_holds_are_refused(tmp_path, names):
         ("poses/{camera}-{pose:04d}.png", ["left", "right"]),
         ("poses/{pose:04d}_{camera}.png", ["left", "right"]),
         ("unit-{camera}/room{pose}.png", ["unit-left", "unit-right"]),
+        ("img_{camera}_{pose:03d}.png", ["left", "right"]),
+        ("poses/board-{pose}-{camera}-image.png", ["left", "right"]),
+        ("{camera}/img_{camera}_{pose}.png", ["left", "right"]),
     ],
 )
 def test_a_folder_whose_images_name_two_cameras_is_no_camera(tmp_path, name, cameras):
@@ -322,6 +325,29 @@ def test_a_folder_whose_images_name_two_cameras_is_no_camera(tmp_path, name, cam
     assert list(found.sizes) == cameras and len(found.boards) == 2
     for board in found.boards:
         np.testing.assert_allclose(board.pixels[cameras[1]] - board.pixels[cameras[0]], 30.0, atol=0.05)
+
+
+@pytest.mark.parametrize(
+    "names, cameras",
+    [
+        (["001_cam0", "001_cam1", "002_cam0", "002_cam1"], ["cam0", "cam1"]),
+        (["ir1_0", "ir2_0"], ["ir1", "ir2"]),
+        (["cam_0_12", "cam_1_12", "cam_0_13", "cam_1_13"], ["cam_0", "cam_1"]),
+        (["imageL1", "imageR1", "imageL2", "imageR2", "imageL3"], ["left", "right"]),
+        (["board_left_1", "board_right_1", "board_middle_1"], ["camera"]),
+        (["board_left_1", "board_right_2", "board_left_3"], ["camera"]),
+        (["cam_01", "cam_02", "cam_03"], ["cam"]),
+    ],
+)
+def test_the_camera_stands_anywhere_in_the_names_of_most_pairs(tmp_path, names, cameras):
+    """Images of two cameras, such as img_left_1 and img_right_1, were calibrated as those of one."""
+    write_images(tmp_path, "{camera}-{pose}.png")
+    shown = (tmp_path / "left-0.png").read_bytes()
+    for file in tmp_path.iterdir():
+        file.unlink()
+    for name in names:
+        (tmp_path / f"{name}.png").write_bytes(shown)
+    assert list(read_corners(tmp_path, BOARD).sizes) == cameras
 
 
 def test_images_of_one_pose_in_two_folders_are_refused(tmp_path):
