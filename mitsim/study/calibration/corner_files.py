@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from characterisation.files.arrays import Floats
 from characterisation.files.checked_files import read_text_bounded
 from characterisation.files.errors import InputError
-from mitsim.capture.grey_image import SUFFIXES, read_grey
+from mitsim.capture.grey_image import CHANNELS, SUFFIXES, read_grey
 from mitsim.sensor.calibration_formats import read_documents
 from mitsim.sensor.fitted_to import FittedCapture, joined_digest, stack_digest
 from mitsim.study.calibration.board import Board
@@ -146,7 +146,7 @@ def _of_images(path: Path, board: Board) -> tuple[Seen, Sizes, dict[str, FittedC
     for file, (camera, pose) in _named(files, path).items():
         if camera in digests.get(pose, {}):
             raise InputError(file, "", f"a second image of {camera}, pose {pose}", "one of each pose by each camera")
-        image = read_grey(file)
+        image = read_grey(file, channel=CHANNELS["green"])  # as captures of the same camera are imported
         size = (image.shape[1], image.shape[0])
         if sizes.setdefault(camera, size) != size:
             allowed = "{} x {} px, as the others".format(*sizes[camera])

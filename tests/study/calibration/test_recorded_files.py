@@ -151,8 +151,11 @@ def test_corners_in_the_order_of_another_board_are_said(tmp_path):
         calibrate_checked(RecordedCorners(BOARD, boards_of(mixed), SIZES), "x")
 
 
-def write_images(folder, name="{camera}-{pose:04d}.png"):
-    """Images of the board by two cameras at two poses; the right one is shifted by 30 px along both axes."""
+def write_images(folder, name="{camera}-{pose:04d}.png", colour=(1.0,)):
+    """Images of the board by two cameras at two poses; the right one is shifted by 30 px along both axes.
+
+    ``colour``: levels of the channels, relative.
+    """
     squares = np.kron(np.indices((7, 9)).sum(axis=0) % 2, np.ones((40, 40)))
     for pose, angle in enumerate((0.0, 8.0)):
         for camera, shift in (("left", 60), ("right", 90)):
@@ -161,7 +164,16 @@ def write_images(folder, name="{camera}-{pose:04d}.png"):
             image = cv2.warpAffine(255 * squares.astype(np.uint8), motion, (640, 480), borderValue=200)
             file = folder / name.format(camera=camera, pose=pose)
             file.parent.mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(file), image)
+            cv2.imwrite(str(file), (image[..., None] * np.array(colour)).astype(np.uint8))
+
+
+def test_colour_images_of_a_board_are_read(tmp_path):
+    """ROS's calibrator saves them of a colour camera; they were refused, though mitsim import reads such captures."""
+    write_images(tmp_path / "colour", colour=(0.8, 0.9, 1.0))
+    write_images(tmp_path / "grey", colour=(0.9,))
+    found, grey = (read_corners(folder, BOARD) for folder in (tmp_path / "colour", tmp_path / "grey"))
+    assert len(found.boards) == 2
+    np.testing.assert_array_equal(found.boards[0].pixels["left"], grey.boards[0].pixels["left"])
 
 
 @pytest.mark.parametrize("name", ["{camera}-{pose:04d}.png", "{camera}/{camera}{pose:02d}.png", "{camera}/{pose}.png"])
