@@ -35,7 +35,8 @@ def read_toml_table(path: str | Path) -> dict[str, Any]:
         If the file is missing or is not TOML.
     """
     path = Path(path)
-    text = read_text_bounded(path, "a TOML file", _neighbours(path), LARGEST_TOML).replace("\r\n", "\n")
+    near = "" if path.exists() else _neighbours(path)
+    text = read_text_bounded(path, "a TOML file", near, LARGEST_TOML).replace("\r\n", "\n")
     _check_nesting(path, text)
     try:
         table = tomllib.loads(text)

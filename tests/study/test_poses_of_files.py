@@ -37,6 +37,15 @@ def test_a_rounded_pose_is_the_nearest_motion_wherever_it_is_read(tmp_path, deci
     )  # a text of six digits is taken as it is
 
 
+@pytest.mark.parametrize("name", ["pose.json", "pose.txt"])
+def test_a_pose_with_the_mark_of_an_editor_of_windows_is_read(tmp_path, name):
+    """A byte order mark made the first number "another text"."""
+    rows = POSE.matrix().tolist()
+    text = "\n".join(" ".join(map(repr, row)) for row in rows) if name.endswith("txt") else json.dumps(rows)
+    (tmp_path / name).write_text(text, encoding="utf-8-sig")
+    np.testing.assert_allclose(imported_pose(tmp_path / name).matrix(), POSE.matrix(), atol=1e-9)
+
+
 CALIBRATED = """
 [views.flange_from_sensor]
 position_mm = [1, 2, 3]

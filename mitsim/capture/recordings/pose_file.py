@@ -53,7 +53,7 @@ def read_pose(file: str | Path) -> Transform:
     """
     file = Path(file)
     data = read_bounded(file, "a pose")
-    text = data.decode("utf-8", errors="replace").strip()
+    text = data.decode("utf-8-sig", errors="replace").strip()
     lines = [line for whole in text.splitlines() if (line := whole.partition("#")[0]).strip()]
     if text.startswith(("{", "[")):
         table = parsed_json(data, file, _WANTED)
