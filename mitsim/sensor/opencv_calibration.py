@@ -249,6 +249,8 @@ def _eye(values: _Values, name: str, index: int, sensor_keys: dict[str, Any]) ->
     if index < 2 and model is None and (note := lens_note(name, distortion)):
         values.notes.append(f"calibration {file}: {note}")
     model = model or "perspective"
+    if model == "fisheye" and not distortion[4:].any():
+        distortion = distortion[:4]  # librealsense has five numbers of any lens
     if model == "fisheye" and len(distortion) not in (0, 4):
         raise InputError(file, f"distortion of {name}", f"{len(distortion)} numbers", "4, as of a fisheye lens")
     size = _size(values, name, index, table)

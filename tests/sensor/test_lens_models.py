@@ -52,6 +52,17 @@ def test_opencvs_fisheye_model_by_many_names(tmp_path, name, key):
     is_fisheye(single(tmp_path / "b.json", **{key: name}, distortion=BENT.tolist()))
 
 
+def test_the_five_numbers_of_a_fisheye_of_librealsense_are_four(tmp_path):
+    """A T265 has Kannala and Brandt's four and a 0, which was refused."""
+    camera = {"width": 640, "height": 480, "ppx": 322.0, "ppy": 238.0, "fx": 600.0, "fy": 602.0}
+    for model in (5, "distortion.kannala_brandt4"):
+        (tmp_path / "a.json").write_text(json.dumps(camera | {"model": model, "coeffs": [*BENT.tolist(), 0.0]}))
+        is_fisheye(tmp_path / "a.json")
+    (tmp_path / "a.json").write_text(json.dumps(camera | {"model": 5, "coeffs": [*BENT.tolist(), 0.1]}))
+    with pytest.raises(InputError, match="5 numbers; allowed: 4"):
+        read_calibration(tmp_path / "a.json", SIZE)
+
+
 def test_a_pinhole_with_equidistant_coefficients_is_a_fisheye_in_any_order(tmp_path):
     is_fisheye(single(tmp_path / "a.json", type="pinhole", distortion_model="equidistant", distortion=BENT.tolist()))
 
