@@ -60,6 +60,9 @@ PUBLISHED_TRIMMED_SHARE = 0.05
 #: side of the patches whose noise is the local planarity precision [px]; *assumed*
 PATCH_PX = 9
 
+#: share of the pixels with equal points in all captures from which depths are rounded; chosen: others are never equal
+_ALL_EQUAL = 0.01
+
 
 @dataclass(frozen=True)
 class PlaneQuality:
@@ -213,14 +216,22 @@ def temporal_noise(clouds: Sequence[PointCloud]) -> Floats:
         return np.where(count > 1, np.sqrt(total.sum(0) / (count - 1)), np.nan)
 
 
-def median_unbiased_noise(clouds: Sequence[PointCloud]) -> Floats:
-    """Return :func:`temporal_noise` (H, W) [mm], scaled so that its median is the deviation of normal noise.
+def typical_temporal_noise(clouds: Sequence[PointCloud], region: NDArray[np.bool_]) -> float:
+    """Return the median of :func:`temporal_noise` [mm] over a region (H, W), unbiased for normal noise.
 
-    The median of few values is lower: by a third for two captures, a ninth for four, under a hundredth for 40.
+    The median of few values is lower: by a third for two captures, a ninth for four, under a hundredth for 40. If
+    rounding, as to whole mm, made the depths of many pixels equal in all captures, the median may be 0 whatever the
+    noise; then it is the root mean square. NaN if no pixel has two points.
     """
     noise = temporal_noise(clouds)
-    freedom = np.sum([cloud.valid for cloud in clouds], axis=0) - 1
-    return np.asarray(noise / np.sqrt(chi2.median(np.maximum(freedom, 1)) / np.maximum(freedom, 1)))
+    used = region & np.isfinite(noise)
+    if not used.any():
+        return float("nan")
+    points = np.stack([cloud.points for cloud in clouds])
+    if np.mean((points == points[0]).all(axis=(0, -1))[used]) > _ALL_EQUAL:
+        return float(np.sqrt(np.mean(noise[used] ** 2)))
+    freedom = np.sum([cloud.valid for cloud in clouds], axis=0)[used] - 1
+    return float(np.median(noise[used] / np.sqrt(chi2.median(freedom) / freedom)))
 
 
 def local_planarity_precision(cloud: PointCloud, region: NDArray[np.bool_] | None = None) -> float:

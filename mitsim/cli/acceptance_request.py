@@ -17,8 +17,8 @@ from characterisation.acceptance.depth_quality import (
     global_planarity_trueness,
     local_planarity_precision,
     mean_depth_error,
-    median_unbiased_noise,
     plane_quality,
+    typical_temporal_noise,
 )
 from characterisation.acceptance.range_uncertainty import flatness_uncertainty, form_error_uncertainty
 from characterisation.acceptance.vdi_2634 import flatness_error, probing_error, sphere_spacing_error
@@ -132,8 +132,8 @@ def cloud_figures(cloud: PointCloud, artefacts: Artefacts, baseline_mm: float | 
 def joint_figures(clouds: Sequence[PointCloud], artefacts: Artefacts) -> list[Result]:
     """Return the figures of every plane that need two or more captures of one pose.
 
-    Temporal noise [mm], the median over the window, unbiased for few captures; global planarity trueness [mm]; with a
-    distance mean depth error [%]. Definitions and sources: :mod:`characterisation.acceptance.depth_quality`.
+    Temporal noise [mm] over the window; global planarity trueness [mm]; with a distance mean depth error [%].
+    Definitions and sources: :mod:`characterisation.acceptance.depth_quality`.
 
     Raises
     ------
@@ -141,15 +141,11 @@ def joint_figures(clouds: Sequence[PointCloud], artefacts: Artefacts) -> list[Re
         If there are fewer than two clouds, their grids differ in size, or a window does not lie in the grid.
     """
     out: list[Result] = []
-    noise = median_unbiased_noise(clouds) if artefacts.planes else np.empty((0, 0))
     for name, (window, distance) in artefacts.planes.items():
-        inside = window_slices(window, clouds[0], name)
-        region, known_noise = _mask(clouds[0], inside), noise[inside][np.isfinite(noise[inside])]
-        reason = "no pixel has a point in two of the clouds"
+        region = _mask(clouds[0], window_slices(window, clouds[0], name))
+        noise, reason = typical_temporal_noise(clouds, region), "no pixel has a point in two of the clouds"
         out += [
-            _figure_or_reason(
-                f"{name} temporal noise", "mm", float(np.median(known_noise)) if len(known_noise) else np.nan, reason
-            ),
+            _figure_or_reason(f"{name} temporal noise", "mm", noise, reason),
             _figure_or_reason(
                 f"{name} global planarity trueness",
                 "mm",

@@ -11,6 +11,7 @@ from characterisation.acceptance.depth_quality import (
     mean_depth_error,
     plane_quality,
     temporal_noise,
+    typical_temporal_noise,
 )
 from characterisation.coupon.patches import Coupon
 from characterisation.files.errors import InputError
@@ -86,6 +87,22 @@ def test_temporal_noise_holds_no_warp_and_no_fixed_pattern(rng):
     # 30 000 pixels of 19 degrees of freedom: sqrt(2 / 570000) = 0.2 % of the variance
     assert np.isclose(np.mean(noise**2), 0.09, rtol=0.01)
     assert local_planarity_precision(clouds[0]) > 1.5  # which does hold the pattern
+
+
+@pytest.mark.parametrize("sigma", [0.05, 0.3, 0.6, 3.0])
+@pytest.mark.parametrize("count", [2, 4, 40])
+def test_temporal_noise_of_depths_in_whole_mm(rng, sigma, count):
+    """The median of four captures was 0 for 0.05 mm, and for 0.6 mm of two captures 1.05 mm."""
+    true = 700 + np.linspace(0, 40, 30_000).reshape(150, 200)  # over many steps
+    rays = GRID.rays() / GRID.rays()[..., 2:]
+    depths = np.rint(true + sigma * rng.standard_normal((count, 150, 200)))
+    status = np.full((150, 200), Status.VALID, np.uint8)
+    clouds = [PointCloud((depth[..., None] * rays).astype(np.float32), status, GRID, "t", "device") for depth in depths]
+    # two depths d apart, at any place between steps, are rounded to n or n + 1 steps apart, by the fraction of d
+    whole, part = np.divmod(np.abs(sigma * np.sqrt(2) * rng.standard_normal(1_000_000)), 1)
+    expected = np.sqrt(np.mean(whole**2 * (1 - part) + (whole + 1) ** 2 * part) / 2)
+    found = typical_temporal_noise(clouds, np.ones((150, 200), bool))
+    assert found == pytest.approx(expected * np.linalg.norm(rays, axis=-1).mean(), rel=0.03)
 
 
 def test_temporal_noise_of_pixels_seen_less_than_twice_is_missing(rng):
