@@ -152,7 +152,7 @@ def corners_of_board(capture: Capture, board: Board, cloud: PointCloud | None) -
     names = list(capture.rig.cameras)
     if len(names) > 1 and all(name in pixels for name in names[:2]):
         first, second = (capture.rig.cameras[name] for name in names[:2])
-        second_pixels = turned_alike(pixels[names[0]], pixels[names[1]])
+        (second_pixels,) = turned_alike([(pixels[names[0]], pixels[names[1]])])
         points, rows = triangulated(first, pixels[names[0]], second, second.rays(second_pixels))
     elif cloud is not None and names[0] in pixels:
         points, rows = _on_plane(capture, pixels[names[0]], cloud), np.empty(0)

@@ -20,7 +20,7 @@ from mitsim.sensor.rig_covariance import read_rig_covariance
 from mitsim.sensor.rig_parameters import parameter_differences
 from mitsim.sensor.transforms import Transform
 from mitsim.study.calibration.board import Board
-from mitsim.study.calibration.corner_files import read_corners
+from mitsim.study.calibration.corner_files import read_corners, turned_alike
 from mitsim.study.calibration.halves import calibrate_checked, in_words
 from mitsim.study.calibration.recorded import RecordedBoard, RecordedCorners
 from mitsim.study.calibration.written import noisy_pose_hints, opencv_text, write_calibration
@@ -360,6 +360,17 @@ def test_the_camera_stands_anywhere_in_the_names_of_most_pairs(tmp_path, names, 
     for name in names:
         (tmp_path / f"{name}.png").write_bytes(shown)
     assert list(read_corners(tmp_path, BOARD).sizes) == cameras
+
+
+@pytest.mark.parametrize("upside_down", [False, True])
+@pytest.mark.parametrize("count", [3, 10])
+def test_a_second_camera_may_stand_upside_down(upside_down, count):
+    """Its corners were always put in the reverse order, so that the calibration did not converge."""
+    pixels = pixels_of(2, count)
+    right = np.array(SIZE) - 1 - pixels["right"] if upside_down else pixels["right"]
+    detected = [corners if corners[0, 1] < corners[-1, 1] else corners[::-1] for corners in right]  # from the top
+    found = turned_alike(list(zip(pixels["left"], detected, strict=True)))
+    np.testing.assert_array_equal(found, right)
 
 
 def test_images_of_one_pose_in_two_folders_are_refused(tmp_path):
