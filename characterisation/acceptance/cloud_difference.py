@@ -84,10 +84,7 @@ class Difference:
 def difference_along_rays(cloud: PointCloud, reference: PointCloud, window: Window = _ALL) -> Floats:
     """Return the difference (h, w) [mm] of two clouds on one grid in a window, NaN where either has no point.
 
-    Raises
-    ------
-    InputError
-        If the grids are not the same.
+    Raises InputError if the grids are not the same.
     """
     if not cloud.grid.same_rays(reference.grid):
         allowed = f"the grid of the reference: {_described(reference.grid)}"
@@ -109,7 +106,8 @@ def difference_to_surface(
     """Return the difference (h, w) [mm] of a cloud's points in a window from the surface of a reference.
 
     The difference is NaN where the cloud has no point, or the reference has none within 1 % of the point's distance. It
-    is also NaN beyond the edge of the reference.
+    is also NaN beyond the edge of the reference. Raises InputError if the reference has fewer than :data:`NEIGHBOURS`
+    points.
 
     Parameters
     ----------
@@ -121,11 +119,6 @@ def difference_to_surface(
         Rows and columns (h, w) of the cloud's grid; by default all.
     progress
         Iterates over the starts of the blocks of points, and may report them.
-
-    Raises
-    ------
-    InputError
-        If the reference has fewer than :data:`NEIGHBOURS` points.
 
     See Also
     --------

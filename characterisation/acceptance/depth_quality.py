@@ -103,6 +103,8 @@ def plane_quality(
     same, since the cloud is rotated perpendicular to the axis before z is read; its spatial noise is the plane-fit
     RMS.)
 
+    Raises InputError if the region has another shape than the grid or is empty, or an argument is out of range.
+
     Parameters
     ----------
     cloud
@@ -115,11 +117,6 @@ def plane_quality(
         b of a stereo sensor.
     trimmed_share
         Share of the points excluded at either end of the depths.
-
-    Raises
-    ------
-    InputError
-        If the region has another shape than the grid or is empty, or an argument is out of range.
 
     See Also
     --------
@@ -165,7 +162,8 @@ def mean_depth_error(
 
     5 % of the depths are excluded at either end, and 10 captures are used (docs.luxonis.com, depth accuracy). Their
     board is perpendicular to the axis, and the error is that of its depth. Here each point is compared with the true
-    plane along its own ray, which is the same for such a board.
+    plane along its own ray, which is the same for such a board. Raises InputError if there is no cloud, or a region
+    does not match one.
 
     Parameters
     ----------
@@ -175,11 +173,6 @@ def mean_depth_error(
         True pose of the target.
     region
         (H, W) mask of the target; the whole grid if None.
-
-    Raises
-    ------
-    InputError
-        If there is no cloud, or a region does not match one.
     """
     where = "mean_depth_error"
     _check_clouds(where, clouds, 1, "Luxonis takes 10", alike=False)
@@ -199,12 +192,8 @@ def temporal_noise(clouds: Sequence[PointCloud]) -> Floats:
     It is NaN with fewer than two values. With k captures of a pixel, the divisor is k - 1; rs-depth-quality divides by
     k, with 40 captures. Its figure is the median over the region, ``np.nanmedian(temporal_noise(clouds)[region])``, of
     depth: multiply by the cosine of the angle to the axis. Zivid's point precision is assumed to be this figure
-    (*assumed*). Unlike sigma, it contains neither warp nor fixed pattern.
-
-    Raises
-    ------
-    InputError
-        If there are fewer than two clouds, or their grids differ in size.
+    (*assumed*). Unlike sigma, it contains neither warp nor fixed pattern. Raises InputError if there are fewer than two
+    clouds, or their grids differ in size.
     """
     _check_clouds("temporal_noise", clouds, 2, "rs-depth-quality takes 40")
     distance = np.stack([np.linalg.norm(cloud.points - cloud.grid.origin, axis=-1) for cloud in clouds])
@@ -239,12 +228,8 @@ def local_planarity_precision(cloud: PointCloud, region: NDArray[np.bool_] | Non
 
     Patches are squares of :data:`PATCH_PX` side that lie in the region and have all points. The noise of a patch is the
     standard deviation of orthogonal distances with n - 3 degrees of freedom. Size, statistic and median are *assumed*.
-    The result is NaN if no patch has all points.
-
-    Raises
-    ------
-    InputError
-        If the region has another shape than the grid or is empty.
+    The result is NaN if no patch has all points. Raises InputError if the region has another shape than the grid or is
+    empty.
     """
     region = _region("local_planarity_precision", cloud, region)
     rows, columns = (side // PATCH_PX for side in region.shape)
@@ -270,12 +255,8 @@ def global_planarity_trueness(clouds: Sequence[PointCloud], region: NDArray[np.b
     The clouds of several captures are averaged pixel by pixel, which reduces noise by the square root of their number.
     The result is the :data:`TRUENESS_PERCENTILE` of the absolute distance from the plane through all points. Statistic
     and percentile are *assumed*. The remaining noise is included, so use enough captures. A pixel without a point in
-    some capture is excluded. The result is NaN with fewer than 4 points.
-
-    Raises
-    ------
-    InputError
-        If there is no cloud, their grids differ in size, or the region does not match.
+    some capture is excluded. The result is NaN with fewer than 4 points. Raises InputError if there is no cloud, their
+    grids differ in size, or the region does not match.
     """
     where = "global_planarity_trueness"
     _check_clouds(where, clouds, 1, "several reduce the noise")

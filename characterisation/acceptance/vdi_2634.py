@@ -54,7 +54,8 @@ class ProbingError:
 def flatness_error(points: ArrayLike, rejected_share: float = REJECTED_SHARE) -> float:
     """Return the flatness measurement error of VDI/VDE 2634-2 [mm].
 
-    It is the range of the signed distances from the least-squares plane.
+    It is the range of the signed distances from the least-squares plane. Raises InputError if there are fewer than 4
+    points, or the share is out of range.
 
     Parameters
     ----------
@@ -66,11 +67,6 @@ def flatness_error(points: ArrayLike, rejected_share: float = REJECTED_SHARE) ->
     See Also
     --------
     characterisation.acceptance.range_uncertainty.flatness_uncertainty
-
-    Raises
-    ------
-    InputError
-        If there are fewer than 4 points, or the share is out of range.
     """
     points = _usable("flatness_error", points, 4, rejected_share)
     kept = _nearest(plane_distances(points), rejected_share)
@@ -81,6 +77,9 @@ def probing_error(
     points: ArrayLike, calibrated_diameter: float, rejected_share: float = REJECTED_SHARE
 ) -> ProbingError:
     """Return the probing errors of VDI/VDE 2634-2: form PF and size PS of a sphere of free radius.
+
+    Raises InputError if there are fewer than 5 points, they do not curve enough for a sphere, or an argument is out of
+    range.
 
     Parameters
     ----------
@@ -94,11 +93,6 @@ def probing_error(
     See Also
     --------
     characterisation.acceptance.range_uncertainty.form_error_uncertainty
-
-    Raises
-    ------
-    InputError
-        If there are fewer than 5 points, they do not curve enough for a sphere, or an argument is out of range.
     """
     if not calibrated_diameter > 0:
         raise InputError("probing_error", "calibrated_diameter", calibrated_diameter, "a positive length in mm")
@@ -115,6 +109,8 @@ def sphere_spacing_error(
 ) -> float:
     """Return the sphere-spacing error SD of VDI/VDE 2634-2 [mm]: measured minus calibrated distance of the centres.
 
+    Raises InputError as :func:`probing_error`, or if the calibrated distance is not positive.
+
     Parameters
     ----------
     first, second
@@ -123,11 +119,6 @@ def sphere_spacing_error(
         [mm].
     rejected_share
         As in :func:`probing_error`.
-
-    Raises
-    ------
-    InputError
-        As :func:`probing_error`, or if the calibrated distance is not positive.
 
     See Also
     --------

@@ -139,6 +139,9 @@ def measure_patches(
 ) -> xr.Dataset:
     """Divide the cloud of a coupon into discs, and measure each.
 
+    Raises InputError if both ``angular_pitch`` and ``reference`` are given, ``reference`` has another grid, the coupon
+    is no rectangle, or a size in pixels or the pitch is none.
+
     Parameters
     ----------
     cloud
@@ -177,12 +180,6 @@ def measure_patches(
         Place: ``row``, ``column`` [px], ``distance`` [mm], ``normal_x`` and ``normal_y`` (N in the view frame),
         ``incidence`` [rad], ``off_axis`` [rad], ``included_angle`` [rad], ``semi_major`` and ``semi_minor`` [mm] of the
         ellipse on the surface, ``independent_share``.
-
-    Raises
-    ------
-    InputError
-        If both ``angular_pitch`` and ``reference`` are given, ``reference`` has another grid, the coupon is no
-        rectangle, or a size in pixels or the pitch is none.
 
     See Also
     --------

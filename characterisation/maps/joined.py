@@ -26,12 +26,8 @@ def with_samples(performance_map: PerformanceMap, other_maps: Sequence[Performan
     """Return a map with the samples of other maps appended.
 
     ``other_maps`` are of the same sensor, at some of the distances of the first map. A sample that occurs in several of
-    them, each time at another distance, is joined to one. Attributes are those of the first map.
-
-    Raises
-    ------
-    InputError
-        If a distance is not one of the first map's.
+    them, each time at another distance, is joined to one. Attributes are those of the first map. Raises InputError if a
+    distance is not one of the first map's.
     """
     data = performance_map.data
     distances, axis = data["distance"].values.astype(float), data["a"].values.astype(float)

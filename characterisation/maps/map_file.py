@@ -77,10 +77,7 @@ def write_map(data: xr.Dataset, path: str | Path, compact: bool) -> None:
 def read_map(path: str | Path) -> xr.Dataset:
     """Read the data of a map.
 
-    Raises
-    ------
-    InputError
-        If the file is missing, damaged, not a performance map, or has another schema.
+    Raises InputError if the file is missing, damaged, not a performance map, or has another schema.
     """
     path = Path(path)
     data = read_dataset(path, _SCHEMA)

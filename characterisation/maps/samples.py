@@ -49,12 +49,7 @@ class Samples:
         With ``light``, a surface is represented by a sample with equal optical properties, whatever its name, and the
         Ra is NaN. Otherwise the surface must lie between two samples of its finish, all of them as made. Without
         ``light``, finish and Ra alone decide. They also decide for samples of unknown optical properties, if the
-        surface is as made.
-
-        Raises
-        ------
-        InputError
-            If the surface was not characterised.
+        surface is as made. Raises InputError if the surface was not characterised.
         """
         if light is None:
             members = self.members(finish)
@@ -76,10 +71,7 @@ class Samples:
     def members(self, finish: str) -> list[int]:
         """Return the numbers of the samples of a finish, by Ra; the first sample of each Ra.
 
-        Raises
-        ------
-        InputError
-            If the finish was not characterised.
+        Raises InputError if the finish was not characterised.
         """
         members: dict[str, int] = {}
         for i, name in enumerate(self.names):

@@ -21,10 +21,7 @@ def shipped_maps() -> dict[str, Path]:
 def map_path(name: str | Path, folder: str | Path = ".") -> Path:
     """Return the file of a map, given as a path relative to ``folder``, or as the name of a sensor with a shipped map.
 
-    Raises
-    ------
-    InputError
-        If there is neither.
+    Raises InputError if there is neither.
     """
     path = Path(folder) / name
     if is_file(path):

@@ -97,6 +97,8 @@ def axes_for(
 ) -> Iterator[NDArray[np.object_]]:
     """Yield (rows, columns) axes to draw into, within :func:`drawing`.
 
+    Raises InputError if ``ax`` has another number of axes.
+
     Parameters
     ----------
     ax
@@ -106,11 +108,6 @@ def axes_for(
         Rows and columns, and width and height of a new figure [in].
     subplots
         Further arguments of :func:`matplotlib.pyplot.subplots`.
-
-    Raises
-    ------
-    InputError
-        If ``ax`` has another number of axes.
     """
     with drawing():
         if ax is None:

@@ -52,6 +52,9 @@ def choose_set(
 ) -> ViewSet:
     """Return the fewest views that together bring the standard uncertainties of measurements below their limits.
 
+    Raises InputError if a measurement does not exist, or depends on a form (whose modes differ from view to view) or on
+    a quantity that no view sees. Also if it depends on a pose, and views are not joined exactly.
+
     Parameters
     ----------
     task
@@ -66,12 +69,6 @@ def choose_set(
         Time limit of the proof [s]; after it, the greedy set is returned, marked as not exact.
     joining
         Uncertainty of the poses of the views; exact by default.
-
-    Raises
-    ------
-    InputError
-        If a measurement does not exist, or depends on a form (whose modes differ from view to view) or on a quantity
-        that no view sees. Also if it depends on a pose, and views are not joined exactly.
     """
     joining = joining or SetJoining(np.zeros((6, 6)), np.zeros(3))
     for name in limits:

@@ -43,6 +43,8 @@ def view_statistics(
 ) -> xr.Dataset:
     """Return the inputs of the score, arrays (views, features), as a dataset; see :data:`INPUTS`.
 
+    Raises ValueError if shapes differ, a number of points is negative or NaN, or points come without a positive sigma.
+
     Parameters
     ----------
     features
@@ -51,11 +53,6 @@ def view_statistics(
         Expected numbers of points, arrays (views, features); they may be fractional.
     mean_sigma, mean_sigma_white
         (views, features) [mm]; NaN where a view has no point on a feature.
-
-    Raises
-    ------
-    ValueError
-        If shapes differ, a number of points is negative or NaN, or points come without a positive sigma.
 
     See Also
     --------
@@ -75,6 +72,8 @@ def view_statistics(
 def score_views(views: xr.Dataset, task: Task, minimum_points: float = 100) -> xr.Dataset:
     """Score and rank every view for every measurement of a task.
 
+    Raises ValueError if a feature or variable is absent, or numbers are invalid (see :func:`view_statistics`).
+
     Parameters
     ----------
     views
@@ -92,11 +91,6 @@ def score_views(views: xr.Dataset, task: Task, minimum_points: float = 100) -> x
         ``limited_by`` (measurement, view); and ``n``. Where a measurement is impossible, V_m is 0 regardless of S_m
         R_m. ``limited_by`` then names the feature with the fewest points; elsewhere it is "". Rank 1 is best.
         Impossible views rank after all possible ones; of equal views the lower index ranks first.
-
-    Raises
-    ------
-    ValueError
-        If a feature or variable is absent, or numbers are invalid (see :func:`view_statistics`).
     """
     _check(views)
     names = list(task.shapes)
@@ -157,12 +151,8 @@ def score_table(
     """Return the rows of ``scores.csv``: one per measurement and view, measurements in task order, best view first.
 
     ``extra`` maps further column names (a pose, a predicted uncertainty) to arrays (views,), or (measurements, views).
-    ``order`` is the variable whose rank orders the views.
-
-    Raises
-    ------
-    ValueError
-        If an extra column has another length, or the name of a column of this table.
+    ``order`` is the variable whose rank orders the views. Raises ValueError if an extra column has another length, or
+    the name of a column of this table.
     """
     columns = {name: np.asarray(values) for name, values in (extra or {}).items()}
     shape = scores["V_m"].shape

@@ -33,10 +33,7 @@ LEAST_TURN = float(np.radians(2.0))
 def axes_from_rotations(angles: Floats, rotations: Floats, translations: Floats) -> tuple[TurningAxes, Floats]:
     """Return the axes, and the pose (4, 4) at zero, from poses at angles (n, k) [rad].
 
-    Raises
-    ------
-    InputError
-        If no two captures differ in one axis alone.
+    Raises InputError if no two captures differ in one axis alone.
     """
     directions: list[Floats] = []
     left = rotations

@@ -122,12 +122,8 @@ class Decoding(Document):
 def read_settings(where: str | Path, table: dict[str, Any], technology: str) -> tuple[Decoding, dict[str, Any]]:
     """Split the table of a ``settings.json`` into what decoding reads and the records.
 
-    ``technology``, that of the capture, determines the type of ``decoder``. Messages name the file ``where``.
-
-    Raises
-    ------
-    InputError
-        If the technology is unknown, or a value that decoding reads is invalid.
+    ``technology``, that of the capture, determines the type of ``decoder``. Messages name the file ``where``. Raises
+    InputError if the technology is unknown, or a value that decoding reads is invalid.
     """
     if technology not in SETTINGS_OF:
         raise InputError("capture", "technology", repr(technology), ", ".join(SETTINGS_OF))
@@ -139,10 +135,7 @@ def read_settings(where: str | Path, table: dict[str, Any], technology: str) -> 
 def settings_table(decoding: Decoding, records: dict[str, Any]) -> dict[str, Any]:
     """Return the table of ``settings.json``: all that decoding reads and that is not a default, then the records.
 
-    Raises
-    ------
-    InputError
-        If a record has the name of a value that decoding reads.
+    Raises InputError if a record has the name of a value that decoding reads.
     """
     both = set(records) & set(Decoding.model_fields)
     if both:

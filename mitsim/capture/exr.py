@@ -21,10 +21,7 @@ _DEPTHS = ("Z", "depth.Z", "depth.V", "depth.Y", "Depth.Z", "Depth.V")
 def exr_depths(path: Path) -> NDArray[Any]:
     """Return the depths (H, W) of an image: of the channel of a depth, else the one that it has, or equal ones.
 
-    Raises
-    ------
-    InputError
-        If the image is damaged, or has several channels that differ and none of a depth.
+    Raises InputError if the image is damaged, or has several channels that differ and none of a depth.
     """
     try:
         with OpenEXR.File(str(path), separate_channels=True) as image:

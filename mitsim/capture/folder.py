@@ -99,12 +99,7 @@ def write_capture(
 def write_packed(files: Mapping[str, bytes], folder: str | Path, *, overwrite: bool = False) -> Path:
     """Write the files of :func:`~mitsim.capture.packed_files.packed` to a folder, completely or not at all.
 
-    Raises
-    ------
-    InputError
-        If the folder is not free or cannot be written.
-    OSError
-        If the disk is full.
+    Raises InputError if the folder is not free or cannot be written. Raises OSError if the disk is full.
     """
     folder = Path(folder).absolute()
     check_free(folder, overwrite)
@@ -122,11 +117,8 @@ def write_packed(files: Mapping[str, bytes], folder: str | Path, *, overwrite: b
 def is_written(capture: Capture, folder: str | Path, vendor: Mapping[str, bytes] | None = None) -> bool:
     """Return whether a folder contains exactly this capture. The versions of the software may differ.
 
-    Raises
-    ------
-    InputError
-        If the index of the folder cannot be read, or the capture could not be written. Also if the folder contains this
-        capture, but a file of it is missing, damaged or changed.
+    Raises InputError if the index of the folder cannot be read, or the capture could not be written. Also if the folder
+    contains this capture, but a file of it is missing, damaged or changed.
     """
     folder = Path(folder).absolute()
     if not (folder / "capture.json").is_file():
@@ -229,10 +221,7 @@ def read_capture(path: str | Path) -> Capture:
 def read_settings_and_pose(folder: str | Path) -> tuple[str, dict[str, Any], Transform | None]:
     """Return the sensor's name, settings and ``world_from_sensor`` of a capture folder, without reading its images.
 
-    Raises
-    ------
-    InputError
-        As :func:`read_capture`, for the files that are read.
+    Raises InputError as :func:`read_capture`, for the files that are read.
     """
     folder = Path(folder)
     document, where = _read_index(folder)
@@ -331,10 +320,7 @@ def _read_checked(folder: Path, entry: FileEntry, field: str, where: Path) -> by
 def check_free(folder: Path, overwrite: bool = False) -> None:
     """Check that a capture can be written to a folder: it is missing, empty, or has a capture to ``overwrite``.
 
-    Raises
-    ------
-    InputError
-        If it is not free.
+    Raises InputError if it is not free.
     """
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return

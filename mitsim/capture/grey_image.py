@@ -55,10 +55,7 @@ CHANNELS = {"blue": 0, "green": 1, "red": 2}
 def channel_of(name: str | None) -> int:
     """Return the number of a channel by its name; None is green, which has half of the pixels of a Bayer pattern.
 
-    Raises
-    ------
-    InputError
-        For an unknown name.
+    Raises InputError for an unknown name.
     """
     if name is not None and name not in CHANNELS:
         raise InputError("--channel", "", repr(name), " | ".join(CHANNELS))
@@ -83,12 +80,8 @@ def read_grey(path: Path, *, channel: int | None = None) -> Image:
     """Read a grey image (H, W), uint8 or uint16.
 
     A colour image is read only if its colour channels are equal, or if ``channel`` selects one by its number
-    (:data:`CHANNELS`).
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, is not an image, has several pages, or channels that differ.
+    (:data:`CHANNELS`). Raises InputError if the file cannot be read, is not an image, has several pages, or channels
+    that differ.
     """
     return decode_grey(_bytes_of(path), path, channel=channel)
 
@@ -109,10 +102,7 @@ def page_labels(path: str | Path, count: int) -> list[str]:
 def page_count(path: Path) -> int:
     """Return the number of images in a file.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or is a damaged TIFF.
+    Raises InputError if the file cannot be read, or is a damaged TIFF.
     """
     begin = read_bounded(path, first=4)
     return len(_tiff_pages(_bytes_of(path), path)) if begin in _TIFF_MARKS else 1

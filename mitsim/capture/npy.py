@@ -29,12 +29,8 @@ def encode_npy(values: NDArray[Any]) -> bytes:
 def numbers_of_npy(data: bytes, where: str | Path, *, tables: bool = False) -> NDArray[Any]:
     """Return the array in the bytes of an ``.npy`` file of any version, type and order, by rows.
 
-    ``tables``: whether its entries may have named fields.
-
-    Raises
-    ------
-    InputError
-        If the bytes are not a complete file of numbers.
+    ``tables``: whether its entries may have named fields. Raises InputError if the bytes are not a complete file of
+    numbers.
     """
     stream = io.BytesIO(data)
     try:
@@ -53,11 +49,8 @@ def numbers_of_npy(data: bytes, where: str | Path, *, tables: bool = False) -> N
 def decode_npy(data: bytes, where: str | Path) -> NDArray[Any]:
     """Return the map (H, W) or (H, W, channels) in the bytes of an ``.npy`` file; messages name ``where``.
 
-    Raises
-    ------
-    InputError
-        If the bytes are not a complete file, the values are not of :data:`DTYPES`, little-endian, or a side is longer
-        than :data:`~mitsim.sensor.png.LONGEST_SIDE_PX`.
+    Raises InputError if the bytes are not a complete file, the values are not of :data:`DTYPES`, little-endian, or a
+    side is longer than :data:`~mitsim.sensor.png.LONGEST_SIDE_PX`.
     """
     values = numbers_of_npy(data, where)
     if values.dtype.newbyteorder("=").name not in DTYPES or values.dtype.byteorder == ">":

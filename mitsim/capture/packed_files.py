@@ -44,17 +44,14 @@ def packed(
 ) -> dict[str, bytes]:
     """Return the bytes of every file of a capture's folder, by path in the folder, ``capture.json`` last.
 
+    Raises InputError if something in the capture cannot be written to a file, or the file could not be read back.
+
     Parameters
     ----------
     capture, folder, vendor
         Capture to write, folder that messages name, and the maker's files by name.
     truth
         True values by camera.
-
-    Raises
-    ------
-    InputError
-        If something in the capture cannot be written to a file, or the file could not be read back.
 
     See Also
     --------
@@ -139,17 +136,14 @@ def check_image(
 ) -> None:
     """Check that an image has the type of the earlier images, and no value above its bits.
 
+    Raises InputError if it does not; the error names the file ``where``.
+
     Parameters
     ----------
     image
         (H, W) [DN].
     frames, bits, where
         Earlier images of the camera, bits of a grey level, and file that messages name.
-
-    Raises
-    ------
-    InputError
-        If it does not; the error names the file ``where``.
     """
     if frames and frames[0].dtype != image.dtype:
         raise InputError(where, "dtype", image.dtype, f"{frames[0].dtype}, as in the first frame")

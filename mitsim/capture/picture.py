@@ -44,6 +44,8 @@ def draw_images(
 ) -> NDArray[np.object_]:
     """Draw one image of every camera, all of one scale; return their axes.
 
+    Raises InputError if there is no such image, or another number of axes.
+
     Parameters
     ----------
     stacks
@@ -56,11 +58,6 @@ def draw_images(
         Axes to draw into, one for each camera; None for those of a new figure.
     image
         Number of the image, from 0; negative numbers count from the last.
-
-    Raises
-    ------
-    InputError
-        If there is no such image, or another number of axes.
 
     See Also
     --------
@@ -100,6 +97,8 @@ def draw_maps(
 ) -> NDArray[np.object_]:
     """Draw maps in colours; return their axes.
 
+    Raises InputError if the number of axes is another.
+
     Parameters
     ----------
     maps, units
@@ -108,11 +107,6 @@ def draw_maps(
         Sensor and source, for the titles.
     ax
         Axes to draw into, one for each map; None for those of a new figure.
-
-    Raises
-    ------
-    InputError
-        If the number of axes is another.
 
     See Also
     --------

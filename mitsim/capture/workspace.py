@@ -28,10 +28,7 @@ _RIGID = TypeAdapter(RigidRows)
 def written_frame(capture: Capture, frame: str, where: str | Path) -> WrittenFrame | None:
     """Return the frame for a capture's cloud file; None for the sensor frame.
 
-    Raises
-    ------
-    InputError
-        If ``frame`` is unknown, or the capture at ``where`` has no rigid transform to its workspace.
+    Raises InputError if ``frame`` is unknown, or the capture at ``where`` has no rigid transform to its workspace.
     """
     if frame not in FRAMES:
         raise InputError("--points-in", "", repr(frame), " | ".join(FRAMES))

@@ -52,10 +52,7 @@ class Artefacts:
 def read_artefacts(planes: Sequence[str], spheres: Sequence[str], spacings: Sequence[str]) -> Artefacts:
     """Read the texts of ``--plane``, ``--sphere`` and ``--spacing``.
 
-    Raises
-    ------
-    InputError
-        If a text cannot be read. The error names the option and the allowed form.
+    Raises InputError if a text cannot be read. The error names the option and the allowed form.
     """
     targets: dict[str, tuple[Roi | None, float | None]] = {}
     for text in planes:
@@ -96,11 +93,7 @@ def cloud_figures(cloud: PointCloud, artefacts: Artefacts, baseline_mm: float | 
 
     Definitions and sources: :mod:`characterisation.acceptance.vdi_2634` and
     :mod:`characterisation.acceptance.depth_quality`. A figure that cannot be computed has no value, but a reason.
-
-    Raises
-    ------
-    InputError
-        If a window does not lie in the grid.
+    Raises InputError if a window does not lie in the grid.
     """
     out: list[Result] = []
     for name, (window, distance) in artefacts.planes.items():
@@ -132,13 +125,9 @@ def cloud_figures(cloud: PointCloud, artefacts: Artefacts, baseline_mm: float | 
 def joint_figures(clouds: Sequence[PointCloud], artefacts: Artefacts) -> list[Result]:
     """Return the figures of every plane that need two or more captures of one pose.
 
-    Temporal noise [mm] over the window; global planarity trueness [mm]; with a distance mean depth error [%].
-    Definitions and sources: :mod:`characterisation.acceptance.depth_quality`.
-
-    Raises
-    ------
-    InputError
-        If there are fewer than two clouds, their grids differ in size, or a window does not lie in the grid.
+    Temporal noise [mm] over the window; global planarity trueness [mm]; with a
+    distance mean depth error [%]. Definitions and sources: :mod:`characterisation.acceptance.depth_quality`. Raises
+    InputError if there are fewer than two clouds, their grids differ in size, or a window does not lie in the grid.
     """
     out: list[Result] = []
     for name, (window, distance) in artefacts.planes.items():

@@ -44,10 +44,7 @@ def capture(
 def mount(sample: str, distance: float) -> None:
     """Ask the user to mount a coupon, and to place the stage as calibrated for a distance [mm].
 
-    Raises
-    ------
-    InputError
-        If there is no terminal.
+    Raises InputError if there is no terminal.
     """
     if not sys.stdin.isatty():
         pending = f"{sample} at {distance:g} mm, which somebody must mount next"

@@ -40,6 +40,8 @@ def read_journey(
 ) -> Journey:
     """Return the steps after a fit; everything that can be checked before the fit is checked.
 
+    Raises InputError if a file cannot be read, or no campaign is given.
+
     Parameters
     ----------
     study
@@ -52,11 +54,6 @@ def read_journey(
         Time of the run of the study [min]; None: until it ends by its rules.
     ask
         See :class:`Journey`.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be read, or no campaign is given.
     """
     from mitsim.maps.campaign.campaign_file import CampaignFile
     from mitsim.study import StudyFile
@@ -75,10 +72,7 @@ def read_journey(
 def map_and_run(journey: Journey, sensor: Path) -> None:
     """Make the map of a fitted sensor, run the study with both, and print where the report is.
 
-    Raises
-    ------
-    InputError
-        If the campaign or the study cannot be done with this sensor.
+    Raises InputError if the campaign or the study cannot be done with this sensor.
     """
     from mitsim.report.figures import write_map_figures
     from mitsim.report.page import write_report

@@ -40,10 +40,7 @@ _WITHIN = ("", "captures", "clouds", "coupons")
 def lock_folder(folder: Path) -> Callable[[], None]:
     """Lock an existing folder and remove abandoned files; return the function that releases it.
 
-    Raises
-    ------
-    InputError
-        If another command has locked it; the message has its process, machine and start time.
+    Raises InputError if another command has locked it; the message has its process, machine and start time.
     """
     handle = _locked(folder)
     if handle is None:

@@ -26,10 +26,8 @@ class MeasuringFrame:
     def of(self, input_cloud: InputCloud, view: int | None = None) -> tuple[NDArray[np.float64], str]:
         """Return the transform (4, 4) [mm] from the sensor frame of a cloud, and a sentence about it, or none.
 
-        Raises
-        ------
-        InputError
-            If the cloud has no workspace, its images do not show the board, or the pose file cannot be read.
+        Raises InputError if the cloud has no workspace, its images do not show the board, or the pose file cannot be
+        read.
         """
         if self.board is not None:
             return self._of_board(input_cloud, *self.board)
@@ -74,10 +72,7 @@ class MeasuringFrame:
 def read_frame(text: str) -> MeasuringFrame:
     """Read the text of ``--points-in``.
 
-    Raises
-    ------
-    InputError
-        If it is none of the allowed.
+    Raises InputError if it is none of the allowed.
     """
     if text in ("sensor", "workspace"):
         return MeasuringFrame(text)

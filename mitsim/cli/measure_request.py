@@ -131,6 +131,8 @@ def read_request(
 ) -> Request:
     """Read the texts of options into a request.
 
+    Raises InputError if a text cannot be read. The error names the option and the allowed form.
+
     Parameters
     ----------
     features
@@ -147,11 +149,6 @@ def read_request(
         Direction of the difference, one of :data:`DIRECTIONS`.
     window
         Window of the difference [px], None for the whole grid.
-
-    Raises
-    ------
-    InputError
-        If a text cannot be read. The error names the option and the allowed form.
     """
     named: dict[str, tuple[Shape, Roi | None]] = {}
     for shape, texts in features.items():
@@ -205,6 +202,8 @@ def parse_window(
 ) -> tuple[str, Roi | None, float | None]:
     """Return name, window and length of a text such as ``name=200,150,300,200,600``.
 
+    Raises InputError if the text has another form, the name is in use, or the window is not one.
+
     Parameters
     ----------
     option, text
@@ -219,11 +218,6 @@ def parse_window(
     Returns
     -------
     The window is None for the whole grid, the length is None without one.
-
-    Raises
-    ------
-    InputError
-        If the text has another form, the name is in use, or the window is not one.
     """
     name, _, numbers_text = text.partition("=")
     try:

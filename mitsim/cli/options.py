@@ -181,12 +181,7 @@ def refuse_unused(context: typer.Context, found: str, allowed: str, *names: str)
     """Refuse options of the running command that the user gave although they have no effect.
 
     ``found`` and ``allowed`` say why the parameters ``names`` have no effect, such as ``no --task``, and what gives
-    them one.
-
-    Raises
-    ------
-    InputError
-        For the first of them that is on the command line, whatever its value.
+    them one. Raises InputError for the first of them that is on the command line, whatever its value.
     """
     for parameter in context.command.params:
         source = context.get_parameter_source(parameter.name or "")
@@ -198,14 +193,8 @@ def requested_workers(scheduler: str | None, processes: int) -> Executor | None:
     """Return the workers of a scheduler, or processes on this machine; None if this process works alone.
 
     ``processes`` of 0 means as many as cores and memory allow, or one on a CUDA device, which it uses completely. A
-    scheduler has workers of its own.
-
-    Raises
-    ------
-    InputError
-        If both are given, or the address of the scheduler is not valid.
-    MissingEnvironmentError
-        If no scheduler answers.
+    scheduler has workers of its own. Raises InputError if both are given, or the address of the scheduler is not valid.
+    Raises MissingEnvironmentError if no scheduler answers.
     """
     from mitsim.running import executor
     from mitsim.running.cluster import Cluster
@@ -290,12 +279,7 @@ def keep_finished(folder: Path, overwrite: bool, last: str) -> None:
 
     A run that ended for lack of time says so in the file, and goes on. The command that writes the new run removes the
     file (:func:`mitsim.study.run_files.claim_folder`), or moves it away with the other files of its run: an interrupted
-    run must not look finished.
-
-    Raises
-    ------
-    InputError
-        If the file exists and ``overwrite`` is false.
+    run must not look finished. Raises InputError if the file exists and ``overwrite`` is false.
     """
     if not overwrite and (folder / last).exists() and _is_finished(folder / last):
         hint = "to repeat the run, add --overwrite (it reuses finished trials); to rewrite its page, use mitsim report"

@@ -46,6 +46,8 @@ def beside_simulated(
 ) -> tuple[list[Result], list[Result]]:
     """Return the figures of every target in the recorded and in the simulated cloud, in the same order.
 
+    Raises InputError if the sensor is not known, or does not see a target.
+
     Parameters
     ----------
     input_cloud, targets, sensor
@@ -54,11 +56,6 @@ def beside_simulated(
         Function that states the figures of a target.
     seed
         Of the noise.
-
-    Raises
-    ------
-    InputError
-        If the sensor is not known, or does not see a target.
     """
     from mitsim.sensor.preset import load_sensor
     from mitsim.twin.compare.target_twin import seen_target, simulated_target

@@ -45,12 +45,8 @@ MOST_FACES = 2000
 def author_page(about: Authored, served: str = "") -> str:
     """Return the page as HTML.
 
-    ``served`` is the token of the command that accepts saved files; it is empty for a page that stands alone.
-
-    Raises
-    ------
-    InputError
-        If the scene was not read from a file, or has more than :data:`MOST_FACES` shapes.
+    ``served`` is the token of the command that accepts saved files; it is empty for a page that stands alone. Raises
+    InputError if the scene was not read from a file, or has more than :data:`MOST_FACES` shapes.
     """
     data = page_data(about, served)
     content = {

@@ -24,10 +24,7 @@ from mitsim.study.scene_geometry import read_scene_geometry
 def write_choice_page(folder: Path) -> Path:
     """Write ``choice.html`` atomically into a folder that holds ``choice.json``, and return its path.
 
-    Raises
-    ------
-    InputError
-        If a file is missing or damaged; the message names the file.
+    Raises InputError if a file is missing or damaged; the message names the file.
     """
     choice = read_choice(folder)
     if choice is None:

@@ -97,10 +97,7 @@ class Declaration:
 def read_declaration(folder: Path, geometry: SceneGeometry | None) -> Declaration:
     """Read the declaration of a finished run, or of a comparison of sensors.
 
-    Raises
-    ------
-    InputError
-        If a file is missing or damaged; the message names the file.
+    Raises InputError if a file is missing or damaged; the message names the file.
     """
     choice = read_choice(folder)
     return _of_run(read_run(folder), geometry) if choice is None else _of_choice(choice, geometry, folder)

@@ -130,10 +130,7 @@ def nearest_distance(performance_map: PerformanceMap, distance_mm: float | None)
 def check_distance(maps: Sequence[PerformanceMap], distance_mm: float) -> None:
     """Check that every map covers a distance |V| [mm].
 
-    Raises
-    ------
-    InputError
-        Naming the maps that do not cover it, and their ranges.
+    Raises InputError, naming the maps that do not cover it, and their ranges.
     """
     outside = []
     for performance_map in maps:

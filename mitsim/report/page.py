@@ -64,10 +64,7 @@ REMEDIES: dict[Status, str] = {
 def write_report(folder: str | Path) -> Path:
     """Write ``report.html`` atomically into the folder of a finished run, and return its path.
 
-    Raises
-    ------
-    InputError
-        If a file of the run is missing or damaged; the message names the file.
+    Raises InputError if a file of the run is missing or damaged; the message names the file.
     """
     run = read_run(folder)
     return write_page(run.folder / "report.html", "page.html.j2", page_content(run))

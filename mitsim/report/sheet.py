@@ -97,10 +97,7 @@ _LAYOUTS = (
 def write_sheet(folder: str | Path) -> Path:
     """Write ``sheet.pdf`` atomically into the folder of a finished run or comparison, and return its path.
 
-    Raises
-    ------
-    InputError
-        If a file is missing or damaged; the message names the file.
+    Raises InputError if a file is missing or damaged; the message names the file.
     """
     folder = Path(folder)
     geometry = read_scene_geometry(folder)

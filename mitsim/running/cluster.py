@@ -47,12 +47,8 @@ _ADDRESS = re.compile(r"(?:(tcp|tls)://)?(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):
 class Cluster:
     """The workers of a Dask scheduler, as an :class:`mitsim.running.executor.Executor`.
 
-    Raises
-    ------
-    InputError
-        If the address is not valid.
-    MissingEnvironmentError
-        If ``distributed`` is not installed, certificates are missing, or no scheduler answers.
+    Raises InputError if the address is not valid. Raises MissingEnvironmentError if ``distributed`` is not installed,
+    certificates are missing, or no scheduler answers.
     """
 
     def __init__(self, address: str) -> None:
@@ -70,17 +66,14 @@ class Cluster:
     ) -> Iterator[tuple[Item, Result]]:
         """Yield items with their results, as they are finished, until given up.
 
+        Raises MissingEnvironmentError also if there are no workers for :data:`NO_WORKER_S`, a worker has another build
+        of mitsim, or any other error occurs there.
+
         Parameters
         ----------
         items, order, work, prepared
             As of :meth:`~mitsim.running.executor.Executor.distribute`. The scheduler chooses
             the worker, whatever it has prepared.
-
-        Raises
-        ------
-        MissingEnvironmentError
-            Also if there are no workers for :data:`NO_WORKER_S`, a worker has another build of mitsim, or any other
-            error occurs there.
         """
         if not items:
             return
@@ -110,12 +103,8 @@ class Cluster:
 def connected(address: str) -> Any:
     """Return a client of the Dask scheduler at an address.
 
-    Raises
-    ------
-    InputError
-        If the address is not valid.
-    MissingEnvironmentError
-        If ``distributed`` is not installed, certificates are missing, or no scheduler answers.
+    Raises InputError if the address is not valid. Raises MissingEnvironmentError if ``distributed`` is not installed,
+    certificates are missing, or no scheduler answers.
     """
     match = _ADDRESS.fullmatch(address)
     if match is None or not 0 < int(match[2]) < 65536:

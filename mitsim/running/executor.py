@@ -73,6 +73,8 @@ class Executor(Protocol):
     ) -> Iterator[tuple[Item, Result]]:
         """Yield items with the results of ``work``, a module-level function, on their orders, as they are finished.
 
+        Raises InputError if a worker raises it. Raises MissingEnvironmentError if no worker is left.
+
         Parameters
         ----------
         items
@@ -82,13 +84,6 @@ class Executor(Protocol):
         prepared
             Names of what a worker prepares for an item: a whole, of which it keeps the last, and a part of it; by
             default nothing.
-
-        Raises
-        ------
-        InputError
-            If a worker raises it.
-        MissingEnvironmentError
-            If no worker is left.
         """
 
 
@@ -296,10 +291,7 @@ def _start_worker(threads: int, parent: int) -> None:
 def check_same_file(path: str | Path, digest: str, ordered: str) -> None:
     """Check that a worker reads the file that the command did, by their digests.
 
-    Raises
-    ------
-    InputError
-        If the file is another one, or has changed since.
+    Raises InputError if the file is another one, or has changed since.
     """
     if digest != ordered:
         found, allowed = "another content than when the command read it", "the same file on every machine, unchanged"

@@ -37,10 +37,8 @@ NEAR_SHARE = 0.05
 def measured_errors(talk: Talk, folder: Path) -> dict[str, xr.Dataset]:
     """Return the errors of the captures in a folder, by the key of their sample, as those of virtual measurements.
 
-    Raises
-    ------
-    InputError
-        If there is no capture, or one without a pose, of another sensor, of no sample of the talk, or of no view.
+    Raises InputError if there is no capture, or one without a pose, of another sensor, of no sample of the talk, or of
+    no view.
     """
     capture_folders = sorted(path.parent for path in folder.rglob("capture.json"))
     if not capture_folders:

@@ -34,10 +34,7 @@ class Results:
     def get(self, name: str) -> xr.Dataset | None:
         """Return the result of a piece, or None if it is missing or depends on something that has changed.
 
-        Raises
-        ------
-        InputError
-            If its file is damaged.
+        Raises InputError if its file is damaged.
         """
         if name not in self._known:
             result = self._read(name)

@@ -147,10 +147,8 @@ class Talk:
 def read_talk(path: str | Path) -> Talk:
     """Read a talk TOML file.
 
-    Raises
-    ------
-    InputError
-        If a key is wrong, two samples have one name, or a name or distance to show is none of the talk or its task.
+    Raises InputError if a key is wrong, two samples have one name, or a name or distance to show is none of the talk or
+    its task.
     """
     path = Path(path)
     file = read_toml(path, TalkFile)

@@ -117,7 +117,7 @@ def candidate_views(
     """Return all views of a table: directions from the zenith down, for each all rolls, for each roll all standoffs.
 
     If the body of the sensor is too near to the part, the sensor is moved out in steps of :data:`STEP_MM` until it is
-    free.
+    free. Raises InputError if no view is possible.
 
     Parameters
     ----------
@@ -138,11 +138,6 @@ def candidate_views(
         nor as far as the next standoff, which is a separate view.
     where
         File of the table, for error messages.
-
-    Raises
-    ------
-    InputError
-        If no view is possible.
 
     See Also
     --------

@@ -14,7 +14,8 @@ from mitsim.views.table import ViewsTable
 def chosen_standoffs(where: str | Path, table: ViewsTable, sensor: Sensor, radius_mm: float) -> list[float]:
     """Return |V| of the views [mm], nearest first.
 
-    They are those of the table, or else the nearest at which the sensor can measure a ball around the part.
+    They are those of the table, or else the nearest at which the sensor can measure a ball around the part. Raises
+    InputError for a standoff outside the sensor's working range.
 
     Parameters
     ----------
@@ -26,11 +27,6 @@ def chosen_standoffs(where: str | Path, table: ViewsTable, sensor: Sensor, radiu
         Sensor with its working range.
     radius_mm
         Radius of a ball around the part.
-
-    Raises
-    ------
-    InputError
-        For a standoff outside the sensor's working range.
 
     See Also
     --------
@@ -49,6 +45,8 @@ def characterised_range(
 ) -> tuple[float, float]:
     """Return the range of |V| [mm] that a view may have: the part of the sensor's working range that is characterised.
 
+    Raises InputError for a standoff outside the characterised ``distances`` [mm].
+
     Parameters
     ----------
     where
@@ -61,11 +59,6 @@ def characterised_range(
         [mm] of the views.
     distances
         Characterised distances [mm].
-
-    Raises
-    ------
-    InputError
-        For a standoff outside the characterised ``distances`` [mm].
 
     See Also
     --------

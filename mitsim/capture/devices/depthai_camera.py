@@ -56,12 +56,8 @@ class DepthaiShot:
 class DepthaiCamera(LiveCamera):
     """An open camera; a context manager that switches its light off and closes it.
 
-    ``identifier``: its id, address or USB port, if there are several; ``dai``: the package ``depthai``.
-
-    Raises
-    ------
-    DeviceError
-        If there is no such camera, or it rejects the settings.
+    ``identifier``: its id, address or USB port, if there are several; ``dai``: the package ``depthai``. Raises
+    DeviceError if there is no such camera, or it rejects the settings.
     """
 
     def __init__(self, settings: DepthaiSettings, identifier: str, dai: Any) -> None:
@@ -85,10 +81,7 @@ class DepthaiCamera(LiveCamera):
     def take(self) -> DepthaiShot:
         """Take one capture; its frames are exposed after the call.
 
-        Raises
-        ------
-        DeviceError
-            If the camera fails; its light is switched off before the error is raised.
+        Raises DeviceError if the camera fails; its light is switched off before the error is raised.
         """
         with self._closed_on_error("capture"):
             asked, deadline = self._dai.Clock.now(), time.monotonic() + self.settings.timeout_s
@@ -218,6 +211,8 @@ def aligned(
 ) -> dict[str, Any]:
     """Return the next frames of a common sequence number, one from each queue.
 
+    Raises DeviceError if they do not arrive in time.
+
     Parameters
     ----------
     queues, timeout_s
@@ -226,11 +221,6 @@ def aligned(
         Name of the camera in messages, and least sequence number.
     now
         Returns the time [s].
-
-    Raises
-    ------
-    DeviceError
-        If they do not arrive in time.
     """
     deadline = now() + timeout_s
     newest: dict[str, Any] = {}

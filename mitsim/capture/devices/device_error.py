@@ -36,6 +36,8 @@ class DeviceError(MissingEnvironmentError):
 def check_open(where: str, operation: str, closed: bool, fault: str, again: str = "Open it again") -> None:
     """Reject a device that was closed, or that failed.
 
+    Raises DeviceError, naming the rejected operation.
+
     Parameters
     ----------
     where, operation
@@ -46,11 +48,6 @@ def check_open(where: str, operation: str, closed: bool, fault: str, again: str 
         Operation at which the device failed, "" for no failure.
     again
         What to do.
-
-    Raises
-    ------
-    DeviceError
-        Naming the rejected operation.
     """
     if closed or fault:
         found = f"a device that has failed, at {fault}" if fault else "a device that was closed"

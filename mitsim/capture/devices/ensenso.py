@@ -124,10 +124,7 @@ class EnsensoCamera(LiveCamera):
     def take(self) -> EnsensoShot:
         """Take one capture, with all its FlexView frames.
 
-        Raises
-        ------
-        DeviceError
-            If the camera fails; its previous state is restored before the error is raised.
+        Raises DeviceError if the camera fails; its previous state is restored before the error is raised.
         """
         with self._closed_on_error("capture"):
             camera, seconds = self._camera, self.settings.capture_timeout_s
@@ -247,14 +244,9 @@ class EnsensoCamera(LiveCamera):
 def open_ensenso(serial: str, settings: EnsensoSettings) -> EnsensoCamera:
     """Open a camera by its serial number, and configure it.
 
-    NxLib's shared library is that of the SDK, or of ``NXLIB_LIBRARY_PATH``.
-
-    Raises
-    ------
-    MissingEnvironmentError
-        Without the package ``ensenso-nxlib``.
-    DeviceError
-        Without the manufacturer's SDK, or if the camera cannot be opened or rejects the settings.
+    NxLib's shared library is that of the SDK, or of ``NXLIB_LIBRARY_PATH``. Raises MissingEnvironmentError without the
+    package ``ensenso-nxlib``. Raises DeviceError without the manufacturer's SDK, or if the camera cannot be opened or
+    rejects the settings.
     """
     try:
         nxlib = import_module("nxlib")

@@ -66,12 +66,8 @@ _REFUSED = "Correct the setting with a terminal; the board stores it"
 class Grbl:
     """GRBL on a serial line; a :class:`~mitsim.capture.devices.stage.Controller`.
 
-    Raises
-    ------
-    DeviceError
-        If the device does not answer as GRBL 1.1, or is not the one of the connection.
-    InputError
-        If its settings do not allow the connection's values.
+    Raises DeviceError if the device does not answer as GRBL 1.1, or is not the one of the connection. Raises InputError
+    if its settings do not allow the connection's values.
     """
 
     def __init__(self, connection: StageConnection, line: SerialLine) -> None:

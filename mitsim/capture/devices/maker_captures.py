@@ -65,10 +65,7 @@ DeviceTable = Annotated[EnsensoTable | DepthaiTable, Field(discriminator="kind")
 def device_table(device: str, settings: Path | None) -> EnsensoTable | DepthaiTable:
     """Return the ``[device]`` table of a camera that is named in one word, with the settings of a TOML file.
 
-    Raises
-    ------
-    InputError
-        For an unknown kind of camera, or settings that the camera does not have.
+    Raises InputError for an unknown kind of camera, or settings that the camera does not have.
     """
     kind, _, name = device.partition(":")
     if kind == "ensenso" and name:
@@ -91,12 +88,8 @@ class DeviceCapture:
 def open_device(table: EnsensoTable | DepthaiTable) -> OpenDevice:
     """Open the camera of a ``[device]`` table and apply its settings.
 
-    Raises
-    ------
-    MissingEnvironmentError
-        Without the package of the maker.
-    DeviceError
-        If the camera is not connected, or rejects its settings.
+    Raises MissingEnvironmentError without the package of the maker. Raises DeviceError if the camera is not connected,
+    or rejects its settings.
     """
     if isinstance(table, EnsensoTable):
         return open_ensenso(table.serial, table.settings)
@@ -106,10 +99,7 @@ def open_device(table: EnsensoTable | DepthaiTable) -> OpenDevice:
 def device_capture(shot: EnsensoShot | DepthaiShot) -> DeviceCapture:
     """Return the capture of a camera's shot.
 
-    Raises
-    ------
-    DeviceError
-        If its calibration cannot be read.
+    Raises DeviceError if its calibration cannot be read.
     """
     return ensenso_capture(shot) if isinstance(shot, EnsensoShot) else depthai_capture(shot)
 
@@ -199,10 +189,7 @@ def _read_node(node: dict[str, Any], images: dict[str, NDArray[np.unsignedintege
 def depthai_rig(calibration: dict[str, Any], size: tuple[int, int]) -> Rig:
     """Return cameras ``left`` and ``right`` for images of ``size`` (columns, rows) from the calibration of a device.
 
-    Raises
-    ------
-    DeviceError
-        If it is not the calibration of a stereo pair.
+    Raises DeviceError if it is not the calibration of a stereo pair.
     """
     with TemporaryDirectory() as folder, _read_from("camera depthai"):
         file = Path(folder) / "calibration.json"

@@ -47,12 +47,8 @@ _NUMBER = re.compile(r"[-+]?\d{1,9}(\.\d{0,9})?")
 class PanTiltUnit:
     """A PTU on a serial line; a :class:`~mitsim.capture.devices.stage.Controller`.
 
-    Raises
-    ------
-    DeviceError
-        If the device does not answer as a PTU, or is not the one of the connection.
-    InputError
-        If its speeds do not include the connection's.
+    Raises DeviceError if the device does not answer as a PTU, or is not the one of the connection. Raises InputError if
+    its speeds do not include the connection's.
     """
 
     def __init__(self, connection: StageConnection, line: SerialLine) -> None:

@@ -81,10 +81,7 @@ class SerialLine:
     def send(self, data: bytes) -> None:
         """Send bytes.
 
-        Raises
-        ------
-        DeviceError
-            If the port failed, or accepts no data.
+        Raises DeviceError if the port failed, or accepts no data.
         """
         with self._port_there("send"):
             self._port.write(data)
@@ -92,11 +89,8 @@ class SerialLine:
     def receive(self, deadline: float, operation: str, expected: str) -> str:
         """Return the next line with text, without its line end.
 
-        Raises
-        ------
-        DeviceError
-            If no line or only a part of one arrives by the deadline, or the port failed. It states the request
-            ``operation`` and the ``expected`` reply.
+        Raises DeviceError if no line or only a part of one arrives by the deadline, or the port failed. It states the
+        request ``operation`` and the ``expected`` reply.
         """
         began = self.clock.now()
         waited = f"within {max(deadline - began, 0):.2g} s"
@@ -179,16 +173,9 @@ def open_line(port: str, baud: int, where: str) -> SerialLine:
     """Open a port exclusively, 8 data bits, no parity, 1 stop bit.
 
     ``port`` is a device (``/dev/ttyUSB0``, ``COM3``) or a URL of pyserial (``socket://host:4000``,
-    ``rfc2217://host:port``), for which ``baud`` may have no effect. Messages name ``where``.
-
-    Raises
-    ------
-    MissingEnvironmentError
-        Without pyserial.
-    DeviceError
-        If there is no such port, another program uses it, or the user lacks permission.
-    InputError
-        If the name of the port is invalid.
+    ``rfc2217://host:port``), for which ``baud`` may have no effect. Messages name ``where``. Raises
+    MissingEnvironmentError without pyserial. Raises DeviceError if there is no such port, another program uses it, or
+    the user lacks permission. Raises InputError if the name of the port is invalid.
     """
     serial = pyserial()
     try:

@@ -94,10 +94,7 @@ class LiveStage:
     def position(self) -> Angles:
         """Read the current angles (axes,) [deg] of the stage from the device.
 
-        Raises
-        ------
-        DeviceError
-            If the device does not answer, or has not been homed.
+        Raises DeviceError if the device does not answer, or has not been homed.
         """
         self._check_homed("position")
         with self._stopped_on_error("position"):
@@ -106,12 +103,8 @@ class LiveStage:
     def home(self) -> Angles:
         """Let the device find its zero, and return its angles (axes,) [deg] there.
 
-        With ``homing = "none"`` the axes move to the zero that the device assumes.
-
-        Raises
-        ------
-        DeviceError
-            If it does not find its zero.
+        With ``homing = "none"`` the axes move to the zero that the device assumes. Raises DeviceError if it does not
+        find its zero.
         """
         if self.connection.homing == "none":
             return self.move(np.zeros(len(self.axes)))
@@ -123,12 +116,8 @@ class LiveStage:
     def move(self, angles_deg: ArrayLike) -> Angles:
         """Move to angles (axes,) [deg], and return the angles read back once all axes stand.
 
-        Raises
-        ------
-        InputError
-            If an angle exceeds the limits; then nothing moves.
-        DeviceError
-            If the stage has not been homed, does not arrive, or stands elsewhere; it is stopped first.
+        Raises InputError if an angle exceeds the limits; then nothing moves. Raises DeviceError if the stage has not
+        been homed, does not arrive, or stands elsewhere; it is stopped first.
         """
         requested = self._within_limits(angles_deg)
         self._check_homed("move")
@@ -145,10 +134,7 @@ class LiveStage:
     def stop(self) -> None:
         """Stop the axes at their current position.
 
-        Raises
-        ------
-        DeviceError
-            If the device does not confirm the stop.
+        Raises DeviceError if the device does not confirm the stop.
         """
         with self._stopped_on_error("stop"):
             if not self._halt():
@@ -281,14 +267,8 @@ class LiveStage:
 def open_stage(connection: StageConnection) -> LiveStage:
     """Open a stage. Nothing moves; axes left moving by an earlier program are stopped.
 
-    Raises
-    ------
-    MissingEnvironmentError
-        Without pyserial.
-    DeviceError
-        If the port cannot be opened, or the device there is not the one of the connection.
-    InputError
-        If the connection exceeds what the device allows.
+    Raises MissingEnvironmentError without pyserial. Raises DeviceError if the port cannot be opened, or the device
+    there is not the one of the connection. Raises InputError if the connection exceeds what the device allows.
     """
     line = open_line(connection.port, connection.bits_per_second, connection.where)
     return start_stage(connection, line)

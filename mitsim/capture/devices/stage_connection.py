@@ -118,10 +118,7 @@ class StageConnection(Document):
 def check_model(connection: StageConnection, identity: str) -> None:
     """Reject a device that is not the ``model`` of the connection.
 
-    Raises
-    ------
-    DeviceError
-        With the device's self-description.
+    Raises DeviceError with the device's self-description.
     """
     if connection.model.lower() not in identity.lower():
         raise DeviceError(
@@ -136,10 +133,7 @@ def check_model(connection: StageConnection, identity: str) -> None:
 def check_steps(connection: StageConnection, index: int, steps_per_deg: float) -> None:
     """Reject a device whose steps differ from the connection's: the angles would be wrong by the ratio.
 
-    Raises
-    ------
-    DeviceError
-        With both numbers.
+    Raises DeviceError with both numbers.
     """
     axis = connection.axes[index]
     wanted = axis.steps_per_deg

@@ -203,10 +203,7 @@ KINDS: dict[str, Kind] = {
 def read_recording(path: str | Path, options: ReadOptions, kind: str | None = None) -> Imported:
     """Read a recording of any kind.
 
-    Raises
-    ------
-    InputError
-        If its kind is unknown, an option does not apply to its kind, or it cannot be read.
+    Raises InputError if its kind is unknown, an option does not apply to its kind, or it cannot be read.
     """
     path = Path(path)
     if path.is_file() and not path.stat().st_size:

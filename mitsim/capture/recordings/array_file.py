@@ -41,10 +41,7 @@ _LARGEST_ARCHIVE = 4 * 1024**3
 def arrays_of_npz(data: bytes, where: str | Path) -> dict[str, NDArray[Any]]:
     """Return the arrays of numbers in the bytes of an ``.npz`` archive, by name; arrays of objects are left out.
 
-    Raises
-    ------
-    InputError
-        If the bytes are not a complete archive, or too large.
+    Raises InputError if the bytes are not a complete archive, or too large.
     """
     allowed = "an .npz file of NumPy"
     try:
@@ -68,10 +65,7 @@ def arrays_of_npz(data: bytes, where: str | Path) -> dict[str, NDArray[Any]]:
 def arrays_in(data: bytes, where: Path) -> dict[str, NDArray[Any]]:
     """Return the arrays of an ``.npy`` or ``.npz`` file by name; that of the first has none.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
+    Raises InputError if the file cannot be read.
     """
     return {"": numbers_of_npy(data, where, tables=True)} if data.startswith(NPY_MAGIC) else arrays_of_npz(data, where)
 
@@ -84,12 +78,8 @@ def map_in(data: bytes, where: Path, frame: int | None = None) -> NDArray[Any]:
 def map_among(arrays: dict[str, NDArray[Any]], where: Path, frame: int | None = None) -> NDArray[Any]:
     """Return the points (rows, columns, 3), or else the depths (rows, columns), among arrays.
 
-    ``frame`` is the number, from 0, of one of several images of depths, (frames, rows, columns).
-
-    Raises
-    ------
-    InputError
-        If the file has neither, several arrays of depths of which none is named so, or no such frame.
+    ``frame`` is the number, from 0, of one of several images of depths, (frames, rows, columns). Raises InputError if
+    the file has neither, several arrays of depths of which none is named so, or no such frame.
     """
     arrays = _large(arrays)
     points = points_among(arrays, where)
@@ -134,12 +124,8 @@ def disparities(where: str | Path) -> InputError:
 def points_among(arrays: dict[str, NDArray[Any]], where: str | Path) -> NDArray[Any] | None:
     """Return the array of points (n, 3) or (rows, columns, 3) among arrays; None without one.
 
-    Of several, one that is named so comes first, then the largest; colours and normals are none.
-
-    Raises
-    ------
-    InputError
-        If numbers of rows or colours precede x, y and z in the array; the error names the file ``where``.
+    Of several, one that is named so comes first, then the largest; colours and normals are none. Raises InputError if
+    numbers of rows or colours precede x, y and z in the array; the error names the file ``where``.
     """
     arrays = _large(arrays)
     fields = {

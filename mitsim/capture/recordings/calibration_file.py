@@ -75,6 +75,9 @@ class RigFile(Document):
 def read_calibration(source: str | Path, size: tuple[int, int] | None = None) -> Calibrated:
     """Read the cameras of a preset by name, or of a file.
 
+    Raises InputError if there is no such file, it has none of the formats above, or its numbers cannot belong to its
+    images.
+
     Parameters
     ----------
     source
@@ -82,11 +85,6 @@ def read_calibration(source: str | Path, size: tuple[int, int] | None = None) ->
     size
         (width, height) [px] of the images: the size of an OpenCV file without one, and the size to which the cameras
         of a preset or of a DepthAI calibration are scaled.
-
-    Raises
-    ------
-    InputError
-        If there is no such file, it has none of the formats above, or its numbers cannot belong to its images.
     """
     read = _read(source, size)
     if read.nominal and size is not None:
@@ -128,6 +126,8 @@ def _is_of_capture(cameras: Any) -> bool:
 def calibrated_by(tables: dict[str, dict[str, Any]], where: Path, size: tuple[int, int] | None) -> Calibrated:
     """Return the cameras of ROS's ``camera_info`` messages, by topic: one camera, or the left and the right of a pair.
 
+    Raises InputError if values are missing, or cannot belong to the images.
+
     Parameters
     ----------
     tables
@@ -136,11 +136,6 @@ def calibrated_by(tables: dict[str, dict[str, Any]], where: Path, size: tuple[in
         The recording, for messages.
     size
         (width, height) [px] of the images.
-
-    Raises
-    ------
-    InputError
-        If values are missing, or cannot belong to the images.
 
     See Also
     --------
@@ -158,6 +153,8 @@ def calibrated_by(tables: dict[str, dict[str, Any]], where: Path, size: tuple[in
 def camera_of(calibrated: Calibrated, name: str | None, size: tuple[int, int], where: str | Path) -> tuple[str, Camera]:
     """Return the camera of a name, or the first; of unrelated ones, the only one of the size. With its name.
 
+    Raises InputError if no camera has that name, or its size differs.
+
     Parameters
     ----------
     calibrated
@@ -168,11 +165,6 @@ def camera_of(calibrated: Calibrated, name: str | None, size: tuple[int, int], w
         (width, height) [px] of the images; that of the camera must be the same.
     where
         File of the images, for messages.
-
-    Raises
-    ------
-    InputError
-        If no camera has that name, or its size differs.
 
     See Also
     --------

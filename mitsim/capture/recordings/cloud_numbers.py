@@ -163,6 +163,9 @@ def _without_place(points: NDArray[np.floating]) -> NDArray[np.bool_]:
 def scale_to_mm(points: NDArray[np.floating], path: Path, unit: str | None = None, hint: str = "") -> tuple[str, float]:
     """Scale points (..., 3) of a file to mm, in place; missing ones are NaN or (0, 0, 0), and become NaN.
 
+    Raises InputError if there is no point, one is beyond :data:`FARTHEST_MM`, or the unit is neither given nor
+    plausible.
+
     Parameters
     ----------
     points
@@ -179,11 +182,6 @@ def scale_to_mm(points: NDArray[np.floating], path: Path, unit: str | None = Non
     -------
     tuple of str and float
         The unit, and the median distance of the points from the origin in it.
-
-    Raises
-    ------
-    InputError
-        If there is no point, one is beyond :data:`FARTHEST_MM`, or the unit is neither given nor plausible.
     """
     points[_without_place(points)] = np.nan
     seen = points[np.isfinite(points[..., 0])]
@@ -214,10 +212,7 @@ _INFINITE = re.compile(rb"(?i)([-+]?)1\.#inf[0-9]*")
 def number_words(text: bytes) -> list[str]:
     """Return the words of a text of numbers, which ``float`` reads.
 
-    Raises
-    ------
-    UnicodeDecodeError
-        If the text is not ASCII; it is a ``ValueError``.
+    Raises UnicodeDecodeError if the text is not ASCII; it is a ``ValueError``.
     """
     if b"#" in text or b"(" in text:
         text = _INFINITE.sub(rb"\1inf", _NAN.sub(b"nan", text))

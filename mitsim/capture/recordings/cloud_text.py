@@ -55,11 +55,8 @@ _SAMPLE = 200
 def points_of_text(data: bytes, path: Path) -> tuple[NDArray[np.float64], str | None]:
     """Return the points (n, 3) of a text, and their unit of length if the text states one.
 
-    Raises
-    ------
-    InputError
-        If the lines are not equally many numbers, three or more, their names lack x, y or z, or columns without names
-        seem to count rows.
+    Raises InputError if the lines are not equally many numbers, three or more, their names lack x, y or z, or columns
+    without names seem to count rows.
     """
     if len(data) > _LARGEST:
         raise InputError(path, "", f"{len(data):,} bytes of text", f"at most {_LARGEST:,}", "save it as PLY")
@@ -132,10 +129,7 @@ def _words(text: str) -> list[str]:
 def _unit(heads: list[str], path: Path) -> str | None:
     """Return the unit of length that the lines before the numbers state; None without one.
 
-    Raises
-    ------
-    InputError
-        If x, y and z have several.
+    Raises InputError if x, y and z have several.
     """
     for line in heads:
         below = [word.strip("[]()") for word in _words(line.lower())]

@@ -51,6 +51,9 @@ def read_depth_image(
 ) -> Capture:
     """Read one depth image.
 
+    Raises InputError if the image or the calibration cannot be read, the image has 8 bits, its size differs from the
+    camera's, or it has disparities or an unknown unit.
+
     Parameters
     ----------
     path
@@ -68,12 +71,6 @@ def read_depth_image(
         Name of the sensor; by default that of the calibration, or ``depth-camera``.
     frame
         Number of one of several images in a file of NumPy, from 0.
-
-    Raises
-    ------
-    InputError
-        If the image or the calibration cannot be read, the image has 8 bits, its size differs from the camera's, or it
-        has disparities or an unknown unit.
 
     See Also
     --------
@@ -182,6 +179,9 @@ def depth_capture(
 ) -> Capture:
     """Return the capture of a map of depths.
 
+    Raises InputError if no pixel has a depth, a depth is no measurement, or the size of the map differs from the
+    camera's.
+
     Parameters
     ----------
     depth
@@ -196,11 +196,6 @@ def depth_capture(
         Name of the camera; by default the first.
     sensor
         Name of the sensor; by default that of the calibration, or ``depth-camera``.
-
-    Raises
-    ------
-    InputError
-        If no pixel has a depth, a depth is no measurement, or the size of the map differs from the camera's.
 
     See Also
     --------

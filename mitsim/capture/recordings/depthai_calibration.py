@@ -81,10 +81,7 @@ def is_depthai_calibration(table: Any) -> bool:
 def read_depthai_calibration(path: str | Path) -> DepthaiCalibration:
     """Read a calibration file.
 
-    Raises
-    ------
-    InputError
-        If it is no such file, or a value is missing or invalid; the error names the field.
+    Raises InputError if it is no such file, or a value is missing or invalid; the error names the field.
     """
     path = Path(path)
     table = parsed_json(read_bounded(path, "a calibration.json of DepthAI"), path, "a calibration of DepthAI")

@@ -62,10 +62,8 @@ class RecordedFrame:
 def read_frames(files: dict[str, Path], frame: int | None) -> dict[str, RecordedFrame]:
     """Read the frame of one number from each stream, by the names of ``files``.
 
-    Raises
-    ------
-    InputError
-        If a file is damaged, has no uncompressed frames, or lacks the frame; or if it has several and none was chosen.
+    Raises InputError if a file is damaged, has no uncompressed frames, or lacks the frame; or if it has several and
+    none was chosen.
     """
     sequences = {name: _sequences(file) for name, file in files.items()}
     positions, count = _chosen(sequences, frame, next(iter(files.values())))

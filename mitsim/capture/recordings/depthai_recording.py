@@ -52,10 +52,7 @@ _LOOSE = 0.25
 def recorded_streams(path: str | Path) -> dict[str, Path]:
     """Return the files of the streams ``left``, ``right``, ``disparity`` and ``depth``, recognised by their names.
 
-    Raises
-    ------
-    InputError
-        If there is none, there are two of one stream, or there are videos instead.
+    Raises InputError if there is none, there are two of one stream, or there are videos instead.
     """
     path = Path(path)
     if path.is_file():
@@ -98,6 +95,9 @@ def read_depthai_recording(
 ) -> Capture:
     """Read one frame of a recording.
 
+    Raises InputError if a file is missing, damaged or lossily compressed, or not of the calibration and its camera.
+    Raises MissingEnvironmentError without the packages of the extra ``recordings``.
+
     Parameters
     ----------
     path
@@ -110,13 +110,6 @@ def read_depthai_recording(
         n of a disparity in units of 1/2^n px.
     sensor
         Name of the sensor; by default that of the calibration.
-
-    Raises
-    ------
-    InputError
-        If a file is missing, damaged or lossily compressed, or not of the calibration and its camera.
-    MissingEnvironmentError
-        Without the packages of the extra ``recordings``.
 
     See Also
     --------
@@ -179,10 +172,7 @@ def _read_frames(streams: dict[str, Path], frame: int | None) -> dict[str, Recor
 def calibration_beside(path: Path) -> Path:
     """Return the calibration in the folder of a recording.
 
-    Raises
-    ------
-    InputError
-        If there is none, or more than one.
+    Raises InputError if there is none, or more than one.
     """
     folder = path if path.is_dir() else path.parent
     if (folder / "calibration.json").is_file():

@@ -51,6 +51,8 @@ class _ImageSet:
 def read_ensenso(path: str | Path, *, dynamic: bool = True, frame: int | None = None) -> Capture:
     """Read one image set of a recording.
 
+    Raises InputError if a file is missing or damaged, or the calibration lacks a field; the error names it.
+
     Parameters
     ----------
     path
@@ -66,11 +68,6 @@ def read_ensenso(path: str | Path, *, dynamic: bool = True, frame: int | None = 
     Capture
         ``source`` is ``device``, or ``simulated`` for the vendor's virtual cameras. The images of a FlexView series
         are in the order of the pattern's shifts, for each side.
-
-    Raises
-    ------
-    InputError
-        If a file is missing or damaged, or the calibration lacks a field; the error names it.
     """
     path = Path(path)
     chosen = _image_set(path, frame)
@@ -104,10 +101,7 @@ def read_ensenso(path: str | Path, *, dynamic: bool = True, frame: int | None = 
 def ensenso_originals(path: str | Path, frame: int | None = None) -> dict[str, bytes]:
     """Read the files of an image set unchanged, by name, for ``vendor/`` in a capture folder.
 
-    Raises
-    ------
-    InputError
-        If ``path`` is neither zip nor folder, or a file is missing, damaged, encrypted or too large.
+    Raises InputError if ``path`` is neither zip nor folder, or a file is missing, damaged, encrypted or too large.
     """
     data = recorded_files(Path(path), _image_set(Path(path), frame).names)
     return {plain_name(name): content for name, content in data.items()}

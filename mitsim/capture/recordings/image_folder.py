@@ -48,13 +48,8 @@ def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNEL
 
     Without ``[images]`` in the sensor file, a rig of one camera uses all images in the folder. A rig of two cameras
     uses those in the subfolders named after the cameras, or those whose names begin with the cameras' names. Of colour
-    images one ``channel`` is used.
-
-    Raises
-    ------
-    InputError
-        If the sensor is not a structured-light one, images are missing or too many, or an image cannot be read or
-        differs in size or depth from the sensor file.
+    images one ``channel`` is used. Raises InputError if the sensor is not a structured-light one, images are missing or
+    too many, or an image cannot be read or differs in size or depth from the sensor file.
     """
     folder, rig = Path(folder), sensor.rig
     code, decoder = sensor.pattern, sensor.settings
@@ -133,12 +128,8 @@ def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNEL
 def at_size_of_images(folder: Path, read: Callable[[tuple[int, int] | None], Read]) -> Read:
     """Return what ``read`` makes of the size (width, height) [px] of a folder's images; of None without images.
 
-    The first size that it accepts counts, since a thumbnail or a picture of the rig may be among the images.
-
-    Raises
-    ------
-    InputError
-        If it accepts none: its error for the largest.
+    The first size that it accepts counts, since a thumbnail or a picture of the rig may be among the images. Raises
+    InputError if it accepts none: its error for the largest.
     """
     faults: dict[tuple[int, int], InputError] = {}
     for size in _sizes(folder):
@@ -215,10 +206,7 @@ def _stack(files: list[Path], counts: list[int], camera: Camera, channel: int) -
 def _check_levels(stack: Image, files: list[str], bits: int) -> None:
     """Check that images (P, H, W) have the bits that the sensor file states.
 
-    Raises
-    ------
-    InputError
-        If they have more, or are files of 8 bits that should have more.
+    Raises InputError if they have more, or are files of 8 bits that should have more.
     """
     for image, path in zip(stack, files, strict=True):
         if image.max() > 2**bits - 1:

@@ -20,6 +20,8 @@ def parsed_json(
 ) -> Any:
     """Return the value of a JSON text in UTF-8.
 
+    Raises InputError if it is not JSON.
+
     Parameters
     ----------
     data, where
@@ -28,11 +30,6 @@ def parsed_json(
         What it should be, for messages.
     constant
         Returns the value of ``NaN`` and of the infinities, which JSON does not have; by default null.
-
-    Raises
-    ------
-    InputError
-        If it is not JSON.
     """
     try:
         return json.loads(data.decode("utf-8-sig"), parse_constant=constant)

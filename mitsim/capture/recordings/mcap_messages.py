@@ -69,12 +69,8 @@ def mcap_messages(
 
     The overall checksums and the number of messages are checked after the last message.
 
-    Messages name the file ``where``, and what it should be: ``expected``, by default a recording of DepthAI.
-
-    Raises
-    ------
-    InputError
-        If the file is truncated or damaged, or exceeds a limit when unpacked.
+    Messages name the file ``where``, and what it should be: ``expected``, by default a recording of DepthAI. Raises
+    InputError if the file is truncated or damaged, or exceeds a limit when unpacked.
     """
     expected = expected or Expected()
     if data[: len(MCAP_MAGIC)] != MCAP_MAGIC:

@@ -60,6 +60,8 @@ class NxLibTree(JsonFields):
 def nxlib_rig(tree: NxLibTree, size: tuple[int, int] | None = None, *, dynamic: bool = True) -> Rig:
     """Return the left and right camera of a node, in the sensor frame, with the manufacturer's rectification.
 
+    Raises InputError if the node lacks a field, or a field is invalid.
+
     Parameters
     ----------
     tree
@@ -68,11 +70,6 @@ def nxlib_rig(tree: NxLibTree, size: tuple[int, int] | None = None, *, dynamic: 
         (width, height) [px] of the raw images; by default ``Sensor/Size``.
     dynamic
         Use the rectification as last corrected by the device, if present; False for the factory's.
-
-    Raises
-    ------
-    InputError
-        If the node lacks a field, or a field is invalid.
     """
     if size is None:
         columns, rows = tree.numbers("Sensor/Size", (2,)).astype(int).tolist()
@@ -122,10 +119,7 @@ def stereo_node(tree: NxLibTree, dynamic: bool = True) -> str:
 def sensor_from_rectified(tree: NxLibTree, *, dynamic: bool = True) -> Transform:
     """Return the rotation from the rectified left frame, that of NxLib's point maps, to the sensor frame.
 
-    Raises
-    ------
-    InputError
-        If the node has no rectifying rotation of the left camera.
+    Raises InputError if the node has no rectifying rotation of the left camera.
     """
     return Transform(_rotation(tree, f"{stereo_node(tree, dynamic)}/Left/Rotation").T, np.zeros(3))
 
@@ -133,10 +127,7 @@ def sensor_from_rectified(tree: NxLibTree, *, dynamic: bool = True) -> Transform
 def sensor_from_workspace(tree: NxLibTree, *, dynamic: bool = True) -> Transform | None:
     """Return ``Link`` as a transform from its target, a workspace, to the sensor frame [mm]; None without a link.
 
-    Raises
-    ------
-    InputError
-        If the link or the left rectifying rotation is incomplete or invalid.
+    Raises InputError if the link or the left rectifying rotation is incomplete or invalid.
     """
     link = link_of(tree)
     return None if link is None else sensor_from_rectified(tree, dynamic=dynamic) @ link
@@ -145,10 +136,7 @@ def sensor_from_workspace(tree: NxLibTree, *, dynamic: bool = True) -> Transform
 def link_of(tree: NxLibTree) -> Transform | None:
     """Return ``rectified_from_target`` of the tree's ``Link`` [mm], target to rectified left camera; None without one.
 
-    Raises
-    ------
-    InputError
-        If the link is present but invalid.
+    Raises InputError if the link is present but invalid.
     """
     if not tree.has("Link/Rotation") and not tree.has("Link/Translation"):
         return None

@@ -82,12 +82,8 @@ def read_stored_cloud(path: Path) -> StoredCloud:
     """Read a PLY, PCD, ZDF or NumPy file of another program; what its bytes are counts, not its suffix.
 
     A PLY often does not state its grid, though it has a point for every pixel, as PhoXi Control and Zivid Studio write
-    it: the grid is then found from the points.
-
-    Raises
-    ------
-    InputError
-        If the file is damaged, of none of these formats, or was written by mitsim.
+    it: the grid is then found from the points. Raises InputError if the file is damaged, of none of these formats, or
+    was written by mitsim.
     """
     expected = "a PLY, PCD, ZDF or NumPy file"
     if path.suffix.lower() == ".zdf" or read_bounded(path, expected, first=len(HDF5_MAGIC)) == HDF5_MAGIC:
@@ -153,6 +149,9 @@ def read_organised_cloud(
 ) -> Capture:
     """Read one PLY or PCD file.
 
+    Raises InputError if the file is damaged or has no grid, or no camera at the origin sees its points on the pixels of
+    the grid.
+
     Parameters
     ----------
     path
@@ -172,11 +171,6 @@ def read_organised_cloud(
         Name of the camera in the calibration; by default the first.
     sensor
         Name of the sensor; by default that of the calibration, or ``point-cloud``.
-
-    Raises
-    ------
-    InputError
-        If the file is damaged or has no grid, or no camera at the origin sees its points on the pixels of the grid.
 
     See Also
     --------

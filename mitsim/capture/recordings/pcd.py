@@ -26,10 +26,7 @@ _KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWP
 def decode_pcd(data: bytes, where: str | Path) -> tuple[NDArray[np.float32], dict[str, str]]:
     """Return the points (HEIGHT, WIDTH, 3) unchanged, and the header by key.
 
-    Raises
-    ------
-    InputError
-        If the bytes are not a complete PCD with x, y and z.
+    Raises InputError if the bytes are not a complete PCD with x, y and z.
     """
     header, body = _header(data, where)
     dtype, names = _fields(header, where)
@@ -132,12 +129,8 @@ def decode_lzf(data: bytes, size: int) -> bytes:
 
     A control byte c under 32 precedes c + 1 literal bytes. Otherwise its upper three bits are a length; 7 means that a
     byte follows to be added to it. Its lower five bits are the upper bits of a distance, whose lower eight follow. Then
-    length + 2 bytes are repeated from distance + 1 bytes before.
-
-    Raises
-    ------
-    ValueError
-        If the data do not decode to exactly that many bytes.
+    length + 2 bytes are repeated from distance + 1 bytes before. Raises ValueError if the data do not decode to exactly
+    that many bytes.
     """
     out = bytearray()
     at, end = 0, len(data)

@@ -90,10 +90,7 @@ class _Element:
 def decode_ply(data: bytes, where: str | Path) -> Ply:
     """Return points and grid from a PLY file's bytes.
 
-    Raises
-    ------
-    InputError
-        If the bytes are not a complete PLY whose vertices have x, y and z.
+    Raises InputError if the bytes are not a complete PLY whose vertices have x, y and z.
     """
     mark = re.search(rb"\nend_header[ \t]*\r?\n", data[:100_000])
     if not re.match(rb"ply[ \t]*\r?\n", data) or mark is None:

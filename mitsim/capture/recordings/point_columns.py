@@ -18,13 +18,9 @@ def check_points_first(table: NDArray[Any], path: str | Path, hint: str) -> None
     """Check that a table (n, columns) without names has x, y and z first.
 
     Numbers of a row, or of a row and a column, are whole, and three of a colour up to 255; three columns after them
-    that are not, or that do not vary, are x, y and z. A table of very many columns is a map of depths.
-
-    Raises
-    ------
-    InputError
-        If the first one or two columns count, the first three are colours, or the columns are too many. ``hint`` says
-        what to do about the first two.
+    that are not, or that do not vary, are x, y and z. A table of very many columns is a map of depths. Raises
+    InputError if the first one or two columns count, the first three are colours, or the columns are too many. ``hint``
+    says what to do about the first two.
     """
     if table.shape[1] > _MOST_COLUMNS:
         found = f"{table.shape[1]} columns without names, as of a map of depths"

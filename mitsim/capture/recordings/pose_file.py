@@ -46,10 +46,7 @@ _TURNS = ("orientation", "rotation", "quaternion", "xyzw", "wxyz")
 def read_pose(file: str | Path) -> Transform:
     """Return the pose of the sensor in the world [mm].
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or contains no rigid motion.
+    Raises InputError if the file cannot be read, or contains no rigid motion.
     """
     file = Path(file)
     data = read_bounded(file, "a pose")

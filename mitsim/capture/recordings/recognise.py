@@ -103,12 +103,8 @@ _NOT_READ = {
 def kind_of(path: str | Path, *, sensor: str | None = None, calibration: str | None = None) -> str:
     """Return the kind of a recording: by its first bytes, or for a folder by the names in it.
 
-    ``sensor`` and ``calibration`` are those that the user gives; a folder of images needs one of them.
-
-    Raises
-    ------
-    InputError
-        If the path does not exist, or its kind is unknown.
+    ``sensor`` and ``calibration`` are those that the user gives; a folder of images needs one of them. Raises
+    InputError if the path does not exist, or its kind is unknown.
     """
     path = Path(path)
     if path.is_dir():

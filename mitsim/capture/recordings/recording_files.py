@@ -53,10 +53,7 @@ _DAMAGED = (
 def recorded_names(path: Path, expected: str) -> list[str]:
     """List the files in a folder or zip down to the third level, with ``/`` between; ``expected`` is for messages.
 
-    Raises
-    ------
-    InputError
-        If it is neither, is damaged, or contains too many files.
+    Raises InputError if it is neither, is damaged, or contains too many files.
     """
     if path.is_dir():
         names = [
@@ -76,10 +73,7 @@ def recorded_names(path: Path, expected: str) -> list[str]:
 def recorded_files(path: Path, names: Iterable[str]) -> dict[str, bytes]:
     """Return the bytes of some files of a folder or zip, by name.
 
-    Raises
-    ------
-    InputError
-        If a file is missing, damaged, encrypted or too large.
+    Raises InputError if a file is missing, damaged, encrypted or too large.
     """
     out: dict[str, bytes] = {}
     total = 0
@@ -143,12 +137,8 @@ def _damaged(path: Path, error: BaseException) -> InputError:
 def frame_of(frame: int | str | None, path: Path, names: list[str] | None = None) -> int | None:
     """Return the number of a frame given by its number, counted from 0, or by its name.
 
-    ``names`` of the frames in order, if they have any.
-
-    Raises
-    ------
-    InputError
-        If it is neither; the error lists the readable frames.
+    ``names`` of the frames in order, if they have any. Raises InputError if it is neither; the error lists the readable
+    frames.
     """
     if frame is None or isinstance(frame, int) or (frame.isascii() and frame.isdigit()):
         if frame is not None and names is not None and not int(frame) < len(names):
@@ -162,6 +152,8 @@ def frame_of(frame: int | str | None, path: Path, names: list[str] | None = None
 def chosen_frame(frame: int | None, count: int, where: Path, label: str) -> int:
     """Return the number of the chosen frame, from 0; a single frame need not be chosen.
 
+    Raises InputError if there are several and none was chosen, or there is no such frame.
+
     Parameters
     ----------
     frame
@@ -170,11 +162,6 @@ def chosen_frame(frame: int | None, count: int, where: Path, label: str) -> int:
         Number of frames, and file that messages name.
     label
         Name of the frames in messages, in the plural.
-
-    Raises
-    ------
-    InputError
-        If there are several and none was chosen, or there is no such frame.
 
     See Also
     --------

@@ -58,6 +58,8 @@ def read_robi(
 ) -> tuple[Capture, list[Path]]:
     """Read one view, and list its files.
 
+    Raises InputError if a file is missing or invalid, or there are several views and none was chosen.
+
     Parameters
     ----------
     folder
@@ -68,11 +70,6 @@ def read_robi(
         Number of the view in ``list.txt``, counted from 0; required if there are several.
     sensor
         Name of the sensor; by default the folder's.
-
-    Raises
-    ------
-    InputError
-        If a file is missing or invalid, or there are several views and none was chosen.
     """
     folder = Path(folder)
     views = read_bounded(folder / "list.txt").decode("utf-8", "replace").split()

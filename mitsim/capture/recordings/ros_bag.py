@@ -77,10 +77,7 @@ class RosBag:
 def open_bag(path: Path) -> RosBag:
     """Open a bag: a file, or the folder of a ROS 2 bag, whose files follow one another.
 
-    Raises
-    ------
-    InputError
-        If it is missing, damaged, not indexed, packed as a whole, or no bag.
+    Raises InputError if it is missing, damaged, not indexed, packed as a whole, or no bag.
     """
     if not path.is_dir():
         return _opened(path)

@@ -56,10 +56,7 @@ _PACKED_HEADER = struct.Struct("<iff")
 def read_message(bag: RosBag, topic: Topic, number: int) -> Any:
     """Return a message of a topic by its number, from 0.
 
-    Raises
-    ------
-    InputError
-        If it cannot be read as a message of its type.
+    Raises InputError if it cannot be read as a message of its type.
     """
     data = bag.message(topic.name, number)
     where = f"{bag.path} {topic.name}"
@@ -93,10 +90,7 @@ def is_depth(message: Any) -> bool:
 def depth_of(message: Any, where: str) -> tuple[NDArray[Any], float]:
     """Return the numbers (H, W) of a depth image, uint16 or float32, and their unit [mm] by its encoding.
 
-    Raises
-    ------
-    InputError
-        If it has another encoding, was compressed with loss, or is damaged.
+    Raises InputError if it has another encoding, was compressed with loss, or is damaged.
     """
     encoding = encoding_of(message)
     if encoding not in DEPTHS:
@@ -123,10 +117,7 @@ def depth_of(message: Any, where: str) -> tuple[NDArray[Any], float]:
 def grey_of(message: Any, where: str, channel: int) -> NDArray[np.unsignedinteger[Any]]:
     """Return the grey image (H, W), or one ``channel`` (in OpenCV's order) of a colour image, uint8 or uint16.
 
-    Raises
-    ------
-    InputError
-        If it has an unknown encoding, or is damaged.
+    Raises InputError if it has an unknown encoding, or is damaged.
     """
     if not hasattr(message, "encoding"):
         return decode_grey(bytes(message.data), where, channel=channel)
@@ -160,10 +151,7 @@ def _pixels(message: Any, where: str) -> NDArray[Any]:
 def points_of(message: Any, where: str) -> NDArray[np.float32]:
     """Return the points (H, W, 3) of a cloud as in the message; a cloud without a grid has one row.
 
-    Raises
-    ------
-    InputError
-        If it has no x, y and z of floating point, or is damaged.
+    Raises InputError if it has no x, y and z of floating point, or is damaged.
     """
     fields = {str(field.name): (int(field.offset), _FIELDS.get(int(field.datatype), "")) for field in message.fields}
     if not all(fields.get(axis, (0, ""))[1] in ("f4", "f8") for axis in "xyz"):

@@ -59,10 +59,8 @@ class Chosen:
 def chosen_topics(bag: RosBag, names: Sequence[str]) -> Chosen:
     """Return the topics of these names; without names, the only depth image or cloud.
 
-    Raises
-    ------
-    InputError
-        If there is no such topic, or it has nothing that is read, or there are several; the error lists the topics.
+    Raises InputError if there is no such topic, or it has nothing that is read, or there are several; the error lists
+    the topics.
     """
     contents = {topic.name: content for topic in bag.topics.values() if (content := _content(bag, topic))}
     usable = {name: content for name, content in contents.items() if content != "image"}
@@ -148,12 +146,7 @@ def read_ros_depth(chosen: Chosen, frame: int | None, options: ReadOptions) -> C
 
     ``frame`` is the number of the message, from 0; required if there are several. By default the camera is the
     ``camera_info`` of the topic, and the depth of one level that of the encoding, or the one that RealSense's viewer
-    recorded.
-
-    Raises
-    ------
-    InputError
-        If the message or the calibration cannot be read, or they do not belong together.
+    recorded. Raises InputError if the message or the calibration cannot be read, or they do not belong together.
 
     See Also
     --------
@@ -186,12 +179,8 @@ def read_ros_pair(chosen: Chosen, frame: int | None, options: ReadOptions) -> tu
     """Read one stereo pair of a bag: the left image by its number, and the right image that is nearest in time.
 
     Returned with the numbers of both messages. ``frame`` is that of the left one, from 0; required if there are
-    several. By default the cameras are the ``camera_info`` of both topics.
-
-    Raises
-    ------
-    InputError
-        If a message or the calibration cannot be read, or they do not belong together.
+    several. By default the cameras are the ``camera_info`` of both topics. Raises InputError if a message or the
+    calibration cannot be read, or they do not belong together.
 
     See Also
     --------
@@ -215,10 +204,7 @@ def read_ros_pair(chosen: Chosen, frame: int | None, options: ReadOptions) -> tu
 def _of_same_time(bag: RosBag, topic: Topic, first: Any, number: int) -> tuple[Any, int]:
     """Return the message of a topic whose stamp is that of another one, and its number; it is searched near that one's.
 
-    Raises
-    ------
-    InputError
-        If none of them is of the same time.
+    Raises InputError if none of them is of the same time.
     """
     near = [index for index in range(number - 2, number + 3) if 0 <= index < topic.count]
     messages = [read_message(bag, topic, index) for index in near]

@@ -41,10 +41,7 @@ def stated_scales(table: Mapping[str, Any], depth: int = 0) -> Iterator[tuple[st
 def check_scale(stated: Mapping[str, float], where: str | Path) -> None:
     """Check that scales that a file states are 1 mm for one level, which an import assumes.
 
-    Raises
-    ------
-    InputError
-        If one is not; the error names what it probably means.
+    Raises InputError if one is not; the error names what it probably means.
     """
     for name, number in stated.items():
         probable = number

@@ -52,6 +52,9 @@ def read_stereo_pair(
 ) -> Capture:
     """Read one pair of a folder.
 
+    Raises InputError if an image is missing or does not fit the calibration, or there are several pairs and none was
+    chosen.
+
     Parameters
     ----------
     folder
@@ -66,11 +69,6 @@ def read_stereo_pair(
         Patterns of file names for cameras whose images are not named after them.
     channel
         Channel of colour images that is used.
-
-    Raises
-    ------
-    InputError
-        If an image is missing or does not fit the calibration, or there are several pairs and none was chosen.
 
     See Also
     --------
@@ -111,10 +109,7 @@ def _last_number(path: Path) -> int | None:
 def names_of_pair(calibrated: Calibrated, where: str | Path) -> list[str]:
     """Return the names of the left and the right camera of a calibration, which messages name ``where``.
 
-    Raises
-    ------
-    InputError
-        If it is not that of a pair.
+    Raises InputError if it is not that of a pair.
     """
     names = list(calibrated.rig.cameras)[:2]
     if len(names) < 2 or calibrated.unrelated:
@@ -133,6 +128,8 @@ def pair_capture(
 ) -> Capture:
     """Return the capture of a stereo pair.
 
+    Raises InputError if the size of an image differs from its camera's, or its type from that of the left one.
+
     Parameters
     ----------
     levels
@@ -143,11 +140,6 @@ def pair_capture(
         The cameras, and records of the import.
     sensor
         Name of the sensor; by default that of the calibration, or ``stereo-pair``.
-
-    Raises
-    ------
-    InputError
-        If the size of an image differs from its camera's, or its type from that of the left one.
 
     See Also
     --------

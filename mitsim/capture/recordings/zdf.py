@@ -56,10 +56,7 @@ class Zdf:
 def read_zdf(path: Path) -> Zdf:
     """Read a ``.zdf`` file.
 
-    Raises
-    ------
-    InputError
-        If it is no netCDF-4 file, is damaged or too large, or has no point cloud.
+    Raises InputError if it is no netCDF-4 file, is damaged or too large, or has no point cloud.
     """
     expected = "a .zdf file of Zivid"
     if read_bounded(path, expected, first=len(HDF5_MAGIC)) != HDF5_MAGIC:

@@ -160,10 +160,8 @@ def measured(capture: Capture, shot: Shot, geometry: Geometry, sensor: Sensor, k
 def check_directions(campaign: Campaign, shots: dict[Path, Shot]) -> None:
     """Check a few captures of :func:`found_shots`, of all tilts, for poses that are inverted as a whole.
 
-    Raises
-    ------
-    InputError
-        If the points of two or more lie in the plane of the coupon at the inverse pose, and those of none at its pose.
+    Raises InputError if the points of two or more lie in the plane of the coupon at the inverse pose, and those of none
+    at its pose.
     """
     told = []
     tilted = [folder for folder, shot in shots.items() if may_be_inverted(shot.series.sample, shot.sensor_from_coupon)]
@@ -247,12 +245,8 @@ def found_shots(folder: str | Path, campaign: Campaign) -> dict[Path, Shot]:
     """Return the captures of coupons in a folder and its subfolders as shots of a campaign.
 
     Each capture must name its sample (``settings.coupon.sample``) and have a pose, with the coupon's frame as the
-    world, z toward the sensor. It belongs to the nearest planned distance.
-
-    Raises
-    ------
-    InputError
-        If there is no capture, one whose sample or distance is not in the campaign, or two of one pose.
+    world, z toward the sensor. It belongs to the nearest planned distance. Raises InputError if there is no capture,
+    one whose sample or distance is not in the campaign, or two of one pose.
     """
     folder = Path(folder)
     folders = sorted(path.parent for path in folder.rglob("capture.json"))

@@ -90,12 +90,7 @@ def distances_between(performance_map: PerformanceMap) -> list[float]:
 def held_out_campaign(path: str | Path, sensor: Sensor, performance_map: PerformanceMap) -> Campaign:
     """Return the coupons of a campaign file at the distances of :func:`distances_between`.
 
-    These replace the distances of the file.
-
-    Raises
-    ------
-    InputError
-        If the map belongs to another sensor, or lacks a sample.
+    These replace the distances of the file. Raises InputError if the map belongs to another sensor, or lacks a sample.
     """
     file = read_toml(path, CampaignFile).model_copy(update={"distances_mm": distances_between(performance_map)})
     campaign = plan_campaign(path, file, sensor)
@@ -108,6 +103,9 @@ def held_out_live(
 ) -> LiveCampaign:
     """Return a campaign with a device for comparison with a map, at the stage positions within the map's distances.
 
+    Raises InputError if the campaign is not possible, the map belongs to another sensor or lacks a sample, or no
+    position is within its distances.
+
     Parameters
     ----------
     path, file
@@ -116,12 +114,6 @@ def held_out_live(
         Preset or file, as in :func:`~mitsim.maps.campaign.live.plan_live`.
     performance_map
         To be compared; it may be that of a simulated sensor, which compares the simulation with the device.
-
-    Raises
-    ------
-    InputError
-        If the campaign is not possible, the map belongs to another sensor or lacks a sample, or no position is within
-        its distances.
 
     See Also
     --------
@@ -145,10 +137,7 @@ def _check_map(campaign: Campaign, performance_map: PerformanceMap) -> None:
 def held_out_shots(campaign: Campaign, count: int, seed: int) -> list[Shot]:
     """Return ``count`` shots of each series of a campaign at random normals that its stage can show.
 
-    Raises
-    ------
-    InputError
-        If the stage shows hardly any of them.
+    Raises InputError if the stage shows hardly any of them.
     """
     shots = []
     for number, series in enumerate(campaign.series):
@@ -299,10 +288,7 @@ def held_out_orders(campaign: Campaign, shots: list[Shot], map_path: Path, repea
 def hold_out_order(held_out: HeldOutOrder) -> Pair:
     """Take, predict and compare one shot; workers call this function.
 
-    Raises
-    ------
-    InputError
-        If the map is missing, or has another content.
+    Raises InputError if the map is missing, or has another content.
     """
     performance_map = _map(held_out.map_path, held_out.digest)
     prepared = prepared_sensor(held_out.order.sensor)

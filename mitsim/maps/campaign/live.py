@@ -53,6 +53,8 @@ def plan_live(
 ) -> LiveCampaign:
     """Plan a campaign with a ``[device]``, read from the file ``path``.
 
+    Raises InputError for anything that would stop the campaign later.
+
     Parameters
     ----------
     path, file
@@ -62,11 +64,6 @@ def plan_live(
         capture.
     range_mm
         Range of distances; stage positions outside it are ignored.
-
-    Raises
-    ------
-    InputError
-        For anything that would stop the campaign later.
 
     See Also
     --------
@@ -138,10 +135,7 @@ def place_by_place(source: Source) -> Source:
 def live_source(live: LiveCampaign, mount: Mount) -> Iterator[CaptureSource]:
     """Return a source of captures from a stage and a camera, which are opened for the first shot and closed at the end.
 
-    Raises
-    ------
-    DeviceError
-        If one of them fails; kept captures stay.
+    Raises DeviceError if one of them fails; kept captures stay.
     """
     with ExitStack() as opened:
         hardware: list[tuple[OpenDevice, LiveStage]] = []

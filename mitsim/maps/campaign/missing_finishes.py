@@ -79,6 +79,9 @@ def map_with_finishes(
 ) -> PerformanceMap:
     """Return the map with samples for all needed finishes.
 
+    Raises InputError if a finish is missing and may not be characterised, or the map was not simulated. Not if the map
+    serves for screening alone.
+
     Parameters
     ----------
     performance_map
@@ -87,12 +90,6 @@ def map_with_finishes(
         Finishes of the scene, and how to characterise them.
     ask
         Answers whether finishes may be characterised now; None if nobody can answer.
-
-    Raises
-    ------
-    InputError
-        If a finish is missing and may not be characterised, or the map was not simulated. Not if the map serves for
-        screening alone.
     """
     unmeasured = {name for name in needed.finishes if needed.measured is not None and name not in needed.measured}
     measured = {name: finish for name, finish in needed.finishes.items() if name not in unmeasured}

@@ -183,6 +183,8 @@ def one_finish_campaign(finish: OneFinish, distance: float, file: CampaignFile, 
 def characterise_finish(finish: OneFinish, simulated: SimulatedSensor, distance: float, folder: Path) -> PerformanceMap:
     """Run the campaign of a finish at a distance [mm] in its own folder.
 
+    Raises MissingEnvironmentError if the disk is full.
+
     Parameters
     ----------
     finish
@@ -193,11 +195,6 @@ def characterise_finish(finish: OneFinish, simulated: SimulatedSensor, distance:
         [mm].
     folder
         Empty folder for the captures.
-
-    Raises
-    ------
-    MissingEnvironmentError
-        If the disk is full.
 
     See Also
     --------

@@ -120,12 +120,8 @@ class Campaign:
 def read_campaign(path: str | Path, sensor: Sensor, distances_mm: list[float] | None = None) -> Campaign:
     """Read a campaign file, and the coupons that it names (paths relative to it), for one sensor.
 
-    ``distances_mm`` apply if the file has none; without both, the distances cover the sensor's working range.
-
-    Raises
-    ------
-    InputError
-        For anything that would stop the campaign later, including an exposure that follows the scene.
+    ``distances_mm`` apply if the file has none; without both, the distances cover the sensor's working range. Raises
+    InputError for anything that would stop the campaign later, including an exposure that follows the scene.
     """
     return plan_campaign(path, read_toml(path, CampaignFile), sensor, distances_mm)
 
@@ -196,10 +192,7 @@ def half_size(sensor: Sensor, distance: float, side_px: float) -> float:
 def check_exposure(sensor: Sensor) -> None:
     """Reject a sensor whose exposure follows the scene.
 
-    Raises
-    ------
-    InputError
-        With the sensor and its rule.
+    Raises InputError with the sensor and its rule.
     """
     if sensor.exposure.base_s is None:
         hint = "a map holds for one exposure: with an automatic one, F depends on the rest of the view, "

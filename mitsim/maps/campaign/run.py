@@ -41,12 +41,8 @@ NAMED = 10
 def run_campaign(campaign: Campaign, source: Source, folder: str | Path) -> PerformanceMap:
     """Take every missing shot of a campaign, and make ``samples.nc`` and ``map.nc`` in ``folder``.
 
-    Raises
-    ------
-    InputError
-        If kept data is damaged, or the stage reaches no orientation.
-    MissingEnvironmentError
-        If the disk is full.
+    Raises InputError if kept data is damaged, or the stage reaches no orientation. Raises MissingEnvironmentError if
+    the disk is full.
     """
     file, captures = campaign.file, Path(folder) / KEPT
     captures.mkdir(parents=True, exist_ok=True)

@@ -109,12 +109,7 @@ class StageCalibration:
         """Return the ``[stage]`` table with the calibrated axes and normal, in the view frame of the coupon.
 
         ``eye`` (3,) is the position of the reference camera [mm]. The table's ``calibration`` becomes the checksum of
-        this one.
-
-        Raises
-        ------
-        InputError
-            If the table defines other axes.
+        this one. Raises InputError if the table defines other axes.
         """
         if tuple(axis.name for axis in table.axes) != self.names:
             allowed = ", ".join(axis.name for axis in table.axes)
@@ -171,10 +166,7 @@ def write_stage_calibration(
 def read_stage_calibration(path: str | Path) -> StageCalibration:
     """Read a stage calibration, written by :func:`write_stage_calibration` or by hand.
 
-    Raises
-    ------
-    InputError
-        If it is missing or damaged, with the field.
+    Raises InputError if it is missing or damaged, with the field.
     """
     table = read_json_object(Path(path), "a stage calibration: see docs/how-to/first-capture.md")
     read = validate(path, table, StageCalibrationFile)

@@ -85,10 +85,7 @@ def shot_folder(captures: Path, shot: Shot) -> Path:
 def write_shot(captures: Path, shot: Shot, finished: Finished) -> None:
     """Write a shot completely or not at all.
 
-    Raises
-    ------
-    MissingEnvironmentError
-        If the disk is full, or writing is not permitted.
+    Raises MissingEnvironmentError if the disk is full, or writing is not permitted.
     """
     folder = shot_folder(captures, shot)
     files = {"patches.npy": _table_bytes(finished.patches)}
@@ -121,10 +118,7 @@ def write_shot(captures: Path, shot: Shot, finished: Finished) -> None:
 def read_shot(captures: Path, shot: Shot) -> Finished | None:
     """Return a kept shot, None if it is missing or of another found capture; images are checked but not read.
 
-    Raises
-    ------
-    InputError
-        If any of its files is missing, truncated or changed, with the file.
+    Raises InputError if any of its files is missing, truncated or changed, with the file.
     """
     folder = shot_folder(captures, shot)
     if not folder.exists():

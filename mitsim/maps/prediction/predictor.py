@@ -186,10 +186,7 @@ class Predictor:
     ) -> Predicted:
         """Return F and sigma of every pixel of a view that shows the scene, and on request normals, from one kernel.
 
-        Raises
-        ------
-        InputError
-            If the view shows a face whose finish was not characterised.
+        Raises InputError if the view shows a face whose finish was not characterised.
         """
         seen = characterised.mapped.cast(self.view, world_from_sensor, self.margin, normals)
         for index, error in characterised.unknown.items():

@@ -56,10 +56,7 @@ class Source:
 def find_sources(folder: str | Path) -> list[Source]:
     """Return the captures of ``mitsim render --many`` in a folder, by finish and view.
 
-    Raises
-    ------
-    InputError
-        If there is none, or a scene no longer exists.
+    Raises InputError if there is none, or a scene no longer exists.
     """
     sources = []
     for path in sorted(Path(folder).glob("*/view_*/settings.json")):
@@ -81,10 +78,7 @@ def find_sources(folder: str | Path) -> list[Source]:
 def objects_of(names: Sequence[str], patterns: Sequence[str]) -> list[tuple[str, ...]]:
     """Return the shapes of each object, by patterns such as ``pin_1*``; without patterns, one object of all shapes.
 
-    Raises
-    ------
-    InputError
-        If a pattern matches no shape, or a shape belongs to two objects.
+    Raises InputError if a pattern matches no shape, or a shape belongs to two objects.
     """
     if not patterns:
         return [tuple(names)]
@@ -104,6 +98,9 @@ def objects_of(names: Sequence[str], patterns: Sequence[str]) -> list[tuple[str,
 def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train", patterns: Sequence[str] = ()) -> int:
     """Write a data set atomically, with one BOP scene for each finish, and return the number of images.
 
+    Raises InputError if ``output`` exists, a pattern matches nothing, or a capture cannot be used or shows other
+    objects.
+
     Parameters
     ----------
     sources
@@ -114,11 +111,6 @@ def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train
         Name of the split: train, val or test.
     patterns
         Patterns of the shapes of each object (:func:`objects_of`).
-
-    Raises
-    ------
-    InputError
-        If ``output`` exists, a pattern matches nothing, or a capture cannot be used or shows other objects.
 
     See Also
     --------

@@ -52,6 +52,8 @@ class Frame:
 def bop_frame(capture: Capture, scene: Scene, objects: Sequence[Scene], where: str | Path) -> tuple[Frame, float]:
     """Decode a capture onto the pixels of a pinhole for BOP; also return the scale of its depth images [mm].
 
+    Raises InputError if the capture has no pose, or cannot be decoded.
+
     Parameters
     ----------
     capture, where
@@ -60,11 +62,6 @@ def bop_frame(capture: Capture, scene: Scene, objects: Sequence[Scene], where: s
         The scene that was rendered.
     objects
         Parts of the scene (:meth:`mitsim.scene.load.Scene.only`).
-
-    Raises
-    ------
-    InputError
-        If the capture has no pose, or cannot be decoded.
     """
     if capture.world_from_sensor is None:
         raise InputError(where, "pose.json", "no pose", "a capture whose pose in the part frame is known")

@@ -55,10 +55,7 @@ within a few pixels of an edge. `draw` makes errors of neighbouring pixels indep
 def write_map_kernel(performance_map: PerformanceMap, folder: str | Path, baseline: NDArray[np.float64]) -> None:
     """Write the folder atomically; ``baseline`` (3,) is the sensor's, in its reference camera's frame.
 
-    Raises
-    ------
-    InputError
-        If the folder exists and contains other files.
+    Raises InputError if the folder exists and contains other files.
     """
     folder = Path(folder)
     if folder.exists() and any(folder.iterdir()) and not (folder / "sensor_map.py").is_file():

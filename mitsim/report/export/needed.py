@@ -11,10 +11,7 @@ from characterisation.files.errors import MissingEnvironmentError
 def needed(module: str, package: str, wanted: str) -> Any:
     """Import a module of the extra ``export``.
 
-    Raises
-    ------
-    MissingEnvironmentError
-        If it is not installed; ``wanted`` states the purpose, ``package`` its name on PyPI.
+    Raises MissingEnvironmentError if it is not installed; ``wanted`` states the purpose, ``package`` its name on PyPI.
     """
     try:
         return importlib.import_module(module)

@@ -82,12 +82,8 @@ def read_results(folder: str | Path, task_file: str | Path | None = None) -> Run
 
     The plan is the run's set of views, if it has one, in which every view measures everything; else the stated view.
 
-    ``task_file`` is the task TOML; None uses the copy in the run's folder.
-
-    Raises
-    ------
-    InputError
-        If the folder is not a run, has no statement, or the task is missing or a different one.
+    ``task_file`` is the task TOML; None uses the copy in the run's folder. Raises InputError if the folder is not a
+    run, has no statement, or the task is missing or a different one.
     """
     run = read_run(folder)
     if run.statement is None:

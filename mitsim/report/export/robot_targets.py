@@ -62,12 +62,8 @@ def read_targets(folder: str | Path, views: str = "best") -> tuple[list[RobotTar
     """Return the targets of a run's views, or of a folder of ``mitsim study score``; and the name of their tool.
 
     ``views``: ``best``, the run's set of views, or the best of every measurement, with the view of the statement first;
-    ``all``; or numbers, ``3,12``.
-
-    Raises
-    ------
-    InputError
-        If there are no poses, ``best`` is used for a folder without a race, or a view does not exist.
+    ``all``; or numbers, ``3,12``. Raises InputError if there are no poses, ``best`` is used for a folder without a
+    race, or a view does not exist.
     """
     path = Path(folder) / "poses" / "poses.json"
     document = read_json_object(path, "a folder made by mitsim run or mitsim study score")

@@ -48,12 +48,8 @@ class RunScene:
 def read_run_scene(folder: str | Path, views: str = "best") -> RunScene:
     """Read the three-dimensional content of a finished run.
 
-    ``views``: ``best``, views with clouds and best views of a measurement; ``all``; or numbers, ``3,12``.
-
-    Raises
-    ------
-    InputError
-        If the folder is not a run, or a view does not exist.
+    ``views``: ``best``, views with clouds and best views of a measurement; ``all``; or numbers, ``3,12``. Raises
+    InputError if the folder is not a run, or a view does not exist.
     """
     run = read_run(folder)
     shown = []
@@ -84,10 +80,7 @@ def chosen_views(run: Run, views: str) -> list[int]:
 def numbers_of(views: str, available: Sequence[int]) -> list[int]:
     """Return the view numbers selected by ``all`` or a comma-separated list, ascending.
 
-    Raises
-    ------
-    InputError
-        If the selection is neither, or a view does not exist.
+    Raises InputError if the selection is neither, or a view does not exist.
     """
     if views == "all":
         return sorted(available)

@@ -61,10 +61,7 @@ class TaskFeatures(Document):
 def read_features(path: str | Path) -> TaskFeatures:
     """Read a task, with or without measurements.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be used, or a measurement does not fit its features.
+    Raises InputError if the file cannot be used, or a measurement does not fit its features.
     """
     task = read_toml(path, TaskFeatures)
     if task.measurements:

@@ -97,6 +97,9 @@ def read_part(
 ) -> Part:
     """Read a STEP file or a mesh, and name its faces.
 
+    Raises InputError as :func:`~mitsim.scene.authoring.read_step.read_step`,
+    :func:`~mitsim.scene.authoring.read_mesh.read_mesh` and :func:`~mitsim.scene.authoring.segment_mesh.segment_mesh`.
+
     Parameters
     ----------
     path, units
@@ -105,12 +108,6 @@ def read_part(
         Of a mesh: neighbouring triangles with a smaller angle between them belong to one face.
     fineness
         Of the mesh of a STEP file.
-
-    Raises
-    ------
-    InputError
-        As :func:`~mitsim.scene.authoring.read_step.read_step`, :func:`~mitsim.scene.authoring.read_mesh.read_mesh` and
-        :func:`~mitsim.scene.authoring.segment_mesh.segment_mesh`.
 
     See Also
     --------
@@ -140,6 +137,9 @@ def write_part(
 ) -> Part:
     """Read a part, write its scene folder atomically, and return the part.
 
+    Raises InputError as :func:`read_part`; or if the folder exists or cannot be written. Raises OSError on a full disk,
+    see :func:`~characterisation.files.atomic_io.write_folder`.
+
     Parameters
     ----------
     path, units, angle_deg, fineness
@@ -148,13 +148,6 @@ def write_part(
         To be made.
     finishing
         Finish of all faces; ground aluminium by default.
-
-    Raises
-    ------
-    InputError
-        As :func:`read_part`; or if the folder exists or cannot be written.
-    OSError
-        On a full disk, see :func:`~characterisation.files.atomic_io.write_folder`.
 
     See Also
     --------

@@ -19,10 +19,7 @@ _BOTH = ("CARTESIAN_TRANSFORMATION_OPERATOR", "CARTESIAN_TRANSFORMATION_OPERATOR
 def check_placements(path: Path, text: StepText) -> None:
     """Check that every operator that places a component is a rigid motion.
 
-    Raises
-    ------
-    InputError
-        For the first that is not, with its number in the file.
+    Raises InputError for the first that is not, with its number in the file.
     """
     for entity in text.all(_BOTH[1]):
         *_, first, second, _, scale, third = (None,) * 5 + sum((entity.of(kind) or () for kind in _BOTH), ())

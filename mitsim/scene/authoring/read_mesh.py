@@ -57,13 +57,8 @@ def read_mesh(path: str | Path, units: str | None = None) -> Mesh:
     """Read any mesh that trimesh supports, in mm.
 
     ``units`` (``mm``, ``m``, ``inch``) of a file that does not state its own, mm if None. It takes precedence over a
-    stated unit that differs, with a remark.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, does not match its suffix, contains no triangles, or more than can be read, or needs a
-        package that is absent.
+    stated unit that differs, with a remark. Raises InputError if the file is missing, does not match its suffix,
+    contains no triangles, or more than can be read, or needs a package that is absent.
     """
     path = Path(path)
     check_part_file(path, units)
@@ -83,10 +78,7 @@ def read_mesh(path: str | Path, units: str | None = None) -> Mesh:
 def check_part_file(path: Path, units: str | None) -> None:
     """Check that a part's file exists, has a supported type, and that its unit may be given.
 
-    Raises
-    ------
-    InputError
-        If a check fails.
+    Raises InputError if a check fails.
     """
     kind = path.suffix.lower()
     if units is not None and units not in LENGTHS_MM:
@@ -219,12 +211,8 @@ def _folded(points: Floats, triangles: Ints) -> int:
 def check_size(path: Path, size: float, stated: str = "") -> list[str]:
     """Return a remark about the unit if a part of this diagonal [mm] is not of a usual size.
 
-    ``stated`` is the unit of a file in which ``--units`` cannot change it.
-
-    Raises
-    ------
-    InputError
-        If the part does not measure 1 mm to 100 m across.
+    ``stated`` is the unit of a file in which ``--units`` cannot change it. Raises InputError if the part does not
+    measure 1 mm to 100 m across.
     """
     hint = "give --units if the file has another unit: m or inch, for example"
     if stated:

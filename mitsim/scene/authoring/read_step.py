@@ -97,13 +97,8 @@ _DEFAULT = Fineness()
 def read_step(path: str | Path, fineness: Fineness = _DEFAULT, units: str | None = None) -> Drawn:
     """Read the faces of a STEP file, in mm, meshed as finely as asked, and report the progress.
 
-    ``units`` (``mm``, ``m``, ``inch``) of a file that does not state its own; mm if None.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, contains no faces, states another unit than ``units``, or the required library is
-        not installed.
+    ``units`` (``mm``, ``m``, ``inch``) of a file that does not state its own; mm if None. Raises InputError if the file
+    cannot be read, contains no faces, states another unit than ``units``, or the required library is not installed.
     """
     path = Path(path)
     if not step_installed():
@@ -171,10 +166,7 @@ def _requested(chord_mm: float) -> float:
 def run_worker(command: list[str], path: Path, check: Callable[[float], list[str]]) -> subprocess.CompletedProcess[str]:
     """Run the process that reads ``path``, check the size of the part before it is meshed, and report the progress.
 
-    Raises
-    ------
-    InputError
-        If it takes more than half an hour, or as ``check``.
+    Raises InputError if it takes more than half an hour, or as ``check``.
     """
     with (
         tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors,

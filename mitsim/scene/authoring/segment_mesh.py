@@ -49,6 +49,8 @@ class SegmentedMesh:
 def segment_mesh(vertices: Floats, triangles: Ints, angle_deg: float = 20.0, where: str = "mesh") -> SegmentedMesh:
     """Segment a mesh into faces, which have no names yet.
 
+    Raises InputError if no triangle has an area, or there are more than :data:`LARGEST_COUNT` faces.
+
     Parameters
     ----------
     vertices, triangles
@@ -57,11 +59,6 @@ def segment_mesh(vertices: Floats, triangles: Ints, angle_deg: float = 20.0, whe
         Neighbouring triangles with a smaller angle between them belong to one face.
     where
         Name of the mesh in messages.
-
-    Raises
-    ------
-    InputError
-        If no triangle has an area, or there are more than :data:`LARGEST_COUNT` faces.
     """
     mesh = trimesh.Trimesh(vertices, triangles, process=False)
     mesh.merge_vertices(digits_vertex=round(-np.log10(MERGE_MM)), merge_tex=True, merge_norm=True)

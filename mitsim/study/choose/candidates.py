@@ -49,6 +49,8 @@ def read_candidates(
 ) -> tuple[list[CandidateSensor], list[Excluded]]:
     """Open a study for each of the sensors.
 
+    Raises InputError if the study cannot be read, a sensor is unknown or named twice, or no sensor can be compared.
+
     Parameters
     ----------
     path
@@ -58,11 +60,6 @@ def read_candidates(
         selects a map: a file, or a sensor whose map comes with mitsim. Paths are relative to the working folder.
     ask
         Answers whether finishes that a sensor's map lacks may be characterised now; None if nobody can answer.
-
-    Raises
-    ------
-    InputError
-        If the study cannot be read, a sensor is unknown or named twice, or no sensor can be compared.
     """
     path = Path(path)
     file = read_toml(path, StudyFile)

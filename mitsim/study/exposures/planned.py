@@ -113,10 +113,7 @@ def plan_view(
 def rendered(measurements: RenderedMeasurements | MappedMeasurements) -> RenderedMeasurements:
     """Return the virtual measurements, if they are rendered.
 
-    Raises
-    ------
-    InputError
-        If they are drawn from a map.
+    Raises InputError if they are drawn from a map.
     """
     if not isinstance(measurements, RenderedMeasurements):
         raise InputError(
@@ -132,10 +129,7 @@ def rendered(measurements: RenderedMeasurements | MappedMeasurements) -> Rendere
 def stated_exposures(study: Study, exposures_s: Sequence[float], power: float) -> PlannedExposure:
     """Return the exposures [s] that a study states, checked.
 
-    Raises
-    ------
-    InputError
-        If the sensor cannot take or merge them.
+    Raises InputError if the sensor cannot take or merge them.
     """
     planned = PlannedExposure(tuple(sorted(exposures_s)), power)
     (shortest, longest), sensor = study.sensor.exposure.limits_s, study.sensor.name

@@ -171,10 +171,7 @@ def possible(now: Shortfall, effect: Effect) -> dict[str, float]:
 def same_direction(study: Study, view: View) -> View:
     """Return the view of a study with direction and roll of a view of another.
 
-    Raises
-    ------
-    InputError
-        If the study has none.
+    Raises InputError if the study has none.
     """
     for candidate in study.views:
         if float(candidate.direction @ view.direction) > 1 - 1e-9 and math.isclose(

@@ -83,6 +83,9 @@ def validate_captures(
 ) -> CaptureValidation:
     """Compare a simulated capture with a real one, and write the numbers and the twin to a folder.
 
+    Raises InputError if a folder is not a capture, the sensor is unknown or of another kind, no plane is visible, or
+    the captures do not show the same specimen.
+
     Parameters
     ----------
     real
@@ -99,12 +102,6 @@ def validate_captures(
         ``on`` or ``off``; None is what the settings of ``real`` say.
     seed
         Of the twin's noise and of the bootstrap.
-
-    Raises
-    ------
-    InputError
-        If a folder is not a capture, the sensor is unknown or of another kind, no plane is visible, or the captures do
-        not show the same specimen.
     """
     recorded = read_capture(real)
     if simulated is None and rendered_here(recorded):

@@ -124,6 +124,9 @@ def compare_captures(
 ) -> Comparison:
     """Compare a simulated capture with a real one.
 
+    Raises InputError if the simulated capture has another camera, its specimen is at another distance, or the specimen
+    is too small.
+
     Parameters
     ----------
     real, simulated
@@ -139,11 +142,6 @@ def compare_captures(
         are not comparable.
     seed
         Selects the draws of the bootstrap.
-
-    Raises
-    ------
-    InputError
-        If the simulated capture has another camera, its specimen is at another distance, or the specimen is too small.
     """
     _check(real, simulated, where)
     window = contrast_window(real, specimen)

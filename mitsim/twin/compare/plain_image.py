@@ -55,10 +55,7 @@ class PlainImage:
 def plain_image(capture: Capture) -> PlainImage:
     """Select the plain image of a capture.
 
-    Raises
-    ------
-    InputError
-        If the capture's technology needs a pattern and the settings do not name one.
+    Raises InputError if the capture's technology needs a pattern and the settings do not name one.
     """
     code = capture_pattern(capture)
     if isinstance(code, AmplitudeModulation):

@@ -72,6 +72,8 @@ def rebuild(
 ) -> Capture:
     """Simulate a real capture with a plane in place of its specimen.
 
+    Raises InputError if the sensor has another technology, or takes other images than the recording.
+
     Parameters
     ----------
     real
@@ -86,11 +88,6 @@ def rebuild(
         If false, the plate has the texture that the reference camera recorded, and even light.
     seed
         Selects the noise of the simulation.
-
-    Raises
-    ------
-    InputError
-        If the sensor has another technology, or takes other images than the recording.
     """
     check_technology(real, sensor, where)
     twin_sensor = like(real, sensor, where)
@@ -211,10 +208,7 @@ def _scale(
 def projector_was_on(real: Capture, state: Literal["on", "off"] | None, where: str) -> bool:
     """Return whether the projector was on: as ``state``, else as in the settings; codes and simulations need it on.
 
-    Raises
-    ------
-    InputError
-        If the state is unknown for a pair that is matched by its texture.
+    Raises InputError if the state is unknown for a pair that is matched by its texture.
     """
     if state is not None:
         return state == "on"

@@ -58,6 +58,9 @@ class Target:
 def seen_target(shape: str, window: Roi | None, cloud: PointCloud, name: str, distance: float | None = None) -> Target:
     """Return a target as a recorded cloud shows it.
 
+    Raises FitError if the points are too few or do not lie on the shape. Raises InputError if the window does not lie
+    in the grid.
+
     Parameters
     ----------
     shape
@@ -70,13 +73,6 @@ def seen_target(shape: str, window: Roi | None, cloud: PointCloud, name: str, di
         Name of the target in messages.
     distance
         True distance of a plane that is perpendicular to the axis of the grid [mm], in place of the recorded plane.
-
-    Raises
-    ------
-    FitError
-        If the points are too few or do not lie on the shape.
-    InputError
-        If the window does not lie in the grid.
 
     See Also
     --------
@@ -97,6 +93,9 @@ def simulated_target(
 ) -> tuple[PointCloud, Roi]:
     """Return the cloud of a simulated sensor before a target, and the window of its grid that shows the recorded one.
 
+    Raises FitError if more than half of the target lies beyond the depths that the sensor's decoder searches: all
+    points are false. Raises InputError if the sensor does not see the target.
+
     Parameters
     ----------
     target
@@ -109,13 +108,6 @@ def simulated_target(
         Name of the target in messages.
     seed
         Of the noise.
-
-    Raises
-    ------
-    FitError
-        If more than half of the target lies beyond the depths that the sensor's decoder searches: all points are false.
-    InputError
-        If the sensor does not see the target.
 
     See Also
     --------

@@ -92,6 +92,8 @@ def linearised(levels: NDArray[np.unsignedinteger[Any]] | Floats, chip: Imager) 
 def sensor_of(capture: Capture, name: str | None, where: str | Path, purpose: Purpose = "simulation") -> Sensor:
     """Return the sensor of a name or file, by default the preset that a capture names.
 
+    Raises InputError if the capture names none.
+
     Parameters
     ----------
     capture
@@ -102,11 +104,6 @@ def sensor_of(capture: Capture, name: str | None, where: str | Path, purpose: Pu
         The capture, for errors.
     purpose
         What the sensor is for.
-
-    Raises
-    ------
-    InputError
-        If the capture names none.
     """
     if name is None and capture.sensor not in presets():
         found = f"none, and {where} comes from {capture.sensor}, which is not a preset"
@@ -120,10 +117,7 @@ def sensor_of(capture: Capture, name: str | None, where: str | Path, purpose: Pu
 def chip_of(capture: Capture, imager: Imager, where: str) -> Imager:
     """Return the imager with the capture's number of bits: the sensor's, or its converter before companding.
 
-    Raises
-    ------
-    InputError
-        If neither has this number of bits.
+    Raises InputError if neither has this number of bits.
     """
     for chip in (imager, converter(imager, Noise.without("quantisation"))):
         if chip.bits == capture.bits:

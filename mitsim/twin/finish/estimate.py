@@ -85,12 +85,8 @@ class Fit:
 def fit_views(views: Sequence[CouponView], finish: MetalFinish | None) -> Fit:
     """Fit alpha, the power and the wide-angle share of a coupon to its views.
 
-    ``finish`` is the metal and process of the coupon, None for a diffuse sheet.
-
-    Raises
-    ------
-    InputError
-        If too few blocks on the coupon are free of saturation.
+    ``finish`` is the metal and process of the coupon, None for a diffuse sheet. Raises InputError if too few blocks on
+    the coupon are free of saturation.
     """
     problem = Problem(views, finish)
     if problem.count < FEWEST_BLOCKS:

@@ -49,6 +49,8 @@ _NEAR_PLANE = 0.02
 def find_specimen(capture: Capture, settings: Settings, roi: Roi | None, where: str) -> Specimen:
     """Estimate the plane and the outline of the specimen from the capture's decoded cloud.
 
+    Raises InputError if the capture has no images, the region is not in the image, or too few points lie in one plane.
+
     Parameters
     ----------
     capture, settings
@@ -65,11 +67,6 @@ def find_specimen(capture: Capture, settings: Settings, roi: Roi | None, where: 
     -------
     Specimen
         Its ``off_plane`` is a robust standard deviation with a region, and the rms distance without one.
-
-    Raises
-    ------
-    InputError
-        If the capture has no images, the region is not in the image, or too few points lie in one plane.
 
     See Also
     --------
@@ -134,6 +131,8 @@ def find_coupon(
 ) -> Specimen:
     """Return the coupon in a capture.
 
+    Raises InputError if no plane is found, or the sensor is behind the coupon.
+
     Parameters
     ----------
     capture, sensor
@@ -145,11 +144,6 @@ def find_coupon(
     roi
         Image region that shows the coupon. Without it the coupon follows from the capture's pose, otherwise from the
         plane of its cloud.
-
-    Raises
-    ------
-    InputError
-        If no plane is found, or the sensor is behind the coupon.
 
     See Also
     --------

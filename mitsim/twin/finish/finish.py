@@ -109,10 +109,7 @@ class MetalFinish:
 def metal_finish(finish: Finish, wavelength_nm: float, where: str) -> MetalFinish:
     """Return the finishes of all alphas with the metal and process of a scene's coupon; messages name ``where``.
 
-    Raises
-    ------
-    InputError
-        For a finish that is not a machined metal, or has a lay.
+    Raises InputError for a finish that is not a machined metal, or has a lay.
     """
     metal, _, process = finish.name.partition("/")
     if metal not in CONSTANTS or process not in PROCESSES or finish.scatter is None:

@@ -127,6 +127,9 @@ def observe(
 ) -> list[CouponView]:
     """Return the view of a coupon by every camera at every exposure.
 
+    Raises InputError if the capture is one of time of flight or has no images, or its exposures or its number of images
+    are wrong.
+
     Parameters
     ----------
     coupon_capture
@@ -139,11 +142,6 @@ def observe(
         ``mean`` if the capture has the sensor's own pattern, otherwise ``level``.
     lit_room
         Whether the images contain other light than that of the projector.
-
-    Raises
-    ------
-    InputError
-        If the capture is one of time of flight or has no images, or its exposures or its number of images are wrong.
     """
     sensor, capture, specimen, where = (
         renderer.sensor,

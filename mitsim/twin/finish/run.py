@@ -162,6 +162,9 @@ def fit_captures(
 ) -> CouponFit:
     """Fit a coupon's finish and the projector's power to captures of it.
 
+    Raises InputError if captures, sensor and scene do not fit each other, one is a copy of another, or too few blocks
+    are left.
+
     Parameters
     ----------
     captures
@@ -178,11 +181,6 @@ def fit_captures(
     roi
         Region of the first camera's image [px] that shows only the coupon. The plane is then fitted to its points, and
         the poses of the captures are not used.
-
-    Raises
-    ------
-    InputError
-        If captures, sensor and scene do not fit each other, one is a copy of another, or too few blocks are left.
     """
     if not captures:
         raise InputError("CAPTURES", "", "none", "one capture folder or more")

@@ -136,12 +136,8 @@ def known_specimen(world_from_sensor: Transform, width: float, height: float) ->
 def specimen_in_cloud(cloud: PointCloud, where: str) -> Specimen:
     """Find the plane through most points of a cloud, and the outline of the points in it.
 
-    ``off_plane`` of the result is their rms distance from the plane. Messages name ``where``.
-
-    Raises
-    ------
-    InputError
-        If too few points lie in one plane.
+    ``off_plane`` of the result is their rms distance from the plane. Messages name ``where``. Raises InputError if too
+    few points lie in one plane.
     """
     points = cloud.points[cloud.valid].astype(float)
     flat = plane_points(points)
@@ -165,6 +161,9 @@ def specimen_in_cloud(cloud: PointCloud, where: str) -> Specimen:
 def pose_over_coupon(cloud: PointCloud, window: Roi, where: str) -> Transform:
     """Return ``world_from_sensor``, with the frame of a coupon as the world.
 
+    Raises InputError if the window is not in the cloud, too few of its points lie in one plane, or the plane is seen
+    edge-on.
+
     Parameters
     ----------
     cloud
@@ -173,11 +172,6 @@ def pose_over_coupon(cloud: PointCloud, window: Roi, where: str) -> Transform:
         Pixels of the cloud that show only the coupon.
     where
         Name of the capture in messages.
-
-    Raises
-    ------
-    InputError
-        If the window is not in the cloud, too few of its points lie in one plane, or the plane is seen edge-on.
     """
     grid = cloud.grid
     asked = f"{window.left} {window.top} {window.width} {window.height}"

@@ -140,6 +140,8 @@ def fit_dots(
 ) -> DotsFit:
     """Fit parameters to one capture of dots.
 
+    Raises InputError if too little of the sheet is visible.
+
     Parameters
     ----------
     capture
@@ -156,11 +158,6 @@ def fit_dots(
         Six terms of the irradiance [W/mm^2] of the room, if known from another capture; otherwise they are fitted too.
     draws
         Number and seed of the simulations.
-
-    Raises
-    ------
-    InputError
-        If too little of the sheet is visible.
     """
     name, camera = next(iter(capture.rig.cameras.items()))
     seed = draws.seed

@@ -58,6 +58,9 @@ def read_input_captures(
 ) -> list[InputCapture]:
     """Read the captures from which a sensor is fitted.
 
+    Raises InputError if there is none, one is given twice or is a copy of another, or one is of another technology or
+    has no images.
+
     Parameters
     ----------
     folders
@@ -68,11 +71,6 @@ def read_input_captures(
         Captures without any light.
     sensor
         Sensor whose technology the captures must have.
-
-    Raises
-    ------
-    InputError
-        If there is none, one is given twice or is a copy of another, or one is of another technology or has no images.
     """
     requested: list[tuple[Path, Kind | None]] = [(folder, None) for folder in folders]
     requested += [(folder, "off") for folder in off] + [(folder, "dark") for folder in dark]

@@ -97,6 +97,8 @@ def fit_sensor(
 ) -> SensorFit:
     """Fit a sensor file to captures of a flat object.
 
+    Raises InputError if captures and sensor do not belong together, or too little is visible.
+
     Parameters
     ----------
     captures
@@ -111,11 +113,6 @@ def fit_sensor(
         Selects the noise of the simulations.
     draws
         Number of simulations to average.
-
-    Raises
-    ------
-    InputError
-        If captures and sensor do not belong together, or too little is visible.
     """
     chosen = load_sensor(sensor)
     input_captures = read_input_captures(captures, off, dark, chosen)
