@@ -119,10 +119,6 @@ def difference_to_surface(
         Rows and columns (h, w) of the cloud's grid; by default all.
     progress
         Iterates over the starts of the blocks of points, and may report them.
-
-    See Also
-    --------
-    difference_along_rays : two clouds on one grid
     """
     surface = reference.points[reference.valid].astype(np.float64)
     if len(surface) < NEIGHBOURS:

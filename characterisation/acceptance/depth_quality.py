@@ -117,11 +117,6 @@ def plane_quality(
         b of a stereo sensor.
     trimmed_share
         Share of the points excluded at either end of the depths.
-
-    See Also
-    --------
-    mean_depth_error : of the distance
-    temporal_noise : noise over frames
     """
     where = "plane_quality"
     region = _region(where, cloud, region)

@@ -119,11 +119,6 @@ def sphere_spacing_error(
         [mm].
     rejected_share
         As in :func:`probing_error`.
-
-    See Also
-    --------
-    probing_error : a single sphere
-    flatness_error : a plane
     """
     if not calibrated_distance > 0:
         raise InputError("sphere_spacing_error", "calibrated_distance", calibrated_distance, "a positive length in mm")

@@ -240,11 +240,6 @@ def density_fraction(
     cos_off_axis
         cos(phi) of the patch. A pixel of a flat imager covers lambda^2 cos^3(phi): without this factor an ideal sensor
         would reach 1.21 at 20 deg off its axis.
-
-    See Also
-    --------
-    reference_fraction : relative to an ideal surface
-    recovered_fraction : from numbers of points
     """
     count, area, distance = np.asarray(count, float), np.asarray(area, float), np.asarray(distance, float)
     solid_angle = angular_pitch**2 * np.asarray(cos_off_axis, float) ** 3
@@ -273,11 +268,6 @@ def reference_fraction(
     -------
     F, low, high, excess
         F and its interval, limited to at most 1, and the excess of F over 1. NaN where the reference has no point.
-
-    See Also
-    --------
-    density_fraction : from the density of the points
-    recovered_fraction : from numbers of points
     """
     theta, low, high = recovered_fraction(count, possible, confidence)
     theta_0, low_0, high_0 = recovered_fraction(reference_count, possible, confidence)

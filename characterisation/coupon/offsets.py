@@ -61,10 +61,6 @@ def known_offset(points: Floats, inlier: NDArray[np.bool_], normal: Floats, reac
         (p, n) mask of the points used.
     normal, reach
         The plane q . normal = reach, normal (3,) and reach [mm].
-
-    See Also
-    --------
-    neighbour_products : mean products with the offsets of neighbours
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         beyond = np.linalg.norm(points, axis=-1) * (1.0 - reach / (points @ normal))
@@ -107,10 +103,6 @@ def noise_area(k_0: Floats, k_1: Floats, k_2: Floats, radius_px: float) -> tuple
         K_0, K_1 and K_2 in units of sigma^2.
     radius_px
         Radius of the discs.
-
-    See Also
-    --------
-    own_area : the area of a field with these noise areas
     """
     persistent = np.maximum(k_2, 0.0)
     cell = np.sqrt(3) / 2 * (2 * radius_px) ** 2

@@ -112,10 +112,6 @@ def refine(
         Where to add normals.
     largest_angle
         Largest incidence [rad] of an added normal.
-
-    See Also
-    --------
-    cap_directions : the normals of a first campaign
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         measures = [

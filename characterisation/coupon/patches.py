@@ -100,10 +100,6 @@ def patch_centres(
         Radius of the discs, and their least distance from the edge of the coupon.
     step_px
         Distance between neighbouring centres.
-
-    See Also
-    --------
-    measure_patches : measures the patches about these pixels
     """
     corners, middle = outline(grid, coupon), grid.project(coupon.centre)
     if not len(corners) or not (np.isfinite(corners).all() and np.isfinite(middle).all()):
@@ -180,10 +176,6 @@ def measure_patches(
         Place: ``row``, ``column`` [px], ``distance`` [mm], ``normal_x`` and ``normal_y`` (N in the view frame),
         ``incidence`` [rad], ``off_axis`` [rad], ``included_angle`` [rad], ``semi_major`` and ``semi_minor`` [mm] of the
         ellipse on the surface, ``independent_share``.
-
-    See Also
-    --------
-    patch_residuals : the residuals of the patches
     """
     _check_sizes(coupon, radius_px, margin_px, step_px)
     _check_possible(cloud, angular_pitch, reference)

@@ -85,10 +85,6 @@ def standing_for(
         The map, and its nearest sample.
     finish, roughness, light
         Name, Ra [um] and optical properties of the other surface.
-
-    See Also
-    --------
-    nearest_sample : which sample that is
     """
     data = performance_map.data.isel(sample=[nearest.sample])
     data = data.drop_vars([name for name in data.variables if "lay" in data[name].dims or str(name).startswith("lay")])

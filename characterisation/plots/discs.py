@@ -60,10 +60,6 @@ def disc_image(axes: Axes, values: NDArray[np.floating], axis: NDArray[np.floati
         Nodes (n,) of both coordinates [1], equidistant, Lambert's equal-area projection.
     largest
         Largest incidence angle of the disc [rad].
-
-    See Also
-    --------
-    draw_performance : both quantities of a map, with their scales
     """
     rim = disc(axes, 2 * math.sin(largest / 2))
     reach = float(axis[-1]) + float(axis[1] - axis[0]) / 2
@@ -137,10 +133,6 @@ def draw_performance(
         Largest incidence angle of the discs [rad].
     limits
         Ends of the logarithmic scale of sigma [mm].
-
-    See Also
-    --------
-    disc_image : values on a single disc
     """
     quantities = (
         (fraction, Normalize(0, 1), SEQUENTIAL, "fraction of points recovered F [1]", "neither"),

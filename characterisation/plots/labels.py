@@ -37,10 +37,6 @@ def label_columns(
         Largest number of names on a side; the least important others are left out.
     longest
         Largest number of characters of a name; longer ones lack their middle.
-
-    See Also
-    --------
-    scale_bar : the length of a bar in the picture
     """
     span = high - low
     step = float(max(span[1], 0.62 * span[0])) / _ROWS
@@ -107,10 +103,6 @@ def scale_bar(axes: Axes, left_end: tuple[float, float], length: float, label: s
         Text above the bar.
     rise
         Distance of the label above the bar, in data units.
-
-    See Also
-    --------
-    round_length : a length for it
     """
     x, y = left_end
     axes.plot([x, x + length], [y, y], color=INK, lw=2.2, solid_capstyle="butt", zorder=6)

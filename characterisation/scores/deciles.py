@@ -182,10 +182,6 @@ def mean_ranks(cells: Sequence[xr.Dataset], quantity: str = "error") -> xr.Datas
         the number that have a rank. Cells of one sample share their views, so the interval is somewhat too narrow. The
         attribute ``correlation`` is the mean rank correlation of bin and quantity over the ``correlated`` cells that
         have one, ``correlation_low`` and ``correlation_high`` its interval.
-
-    See Also
-    --------
-    deciles : one cell
     """
     ranks = np.array([cell[f"{quantity}_rank"].values[1:] for cell in cells]).reshape(-1, BINS)
     rows = np.array([mean_interval(column[np.isfinite(column)]) for column in ranks.T])

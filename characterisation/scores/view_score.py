@@ -53,10 +53,6 @@ def view_statistics(
         Expected numbers of points, arrays (views, features); they may be fractional.
     mean_sigma, mean_sigma_white
         (views, features) [mm]; NaN where a view has no point on a feature.
-
-    See Also
-    --------
-    score_views : the scores from these inputs
     """
     arrays = [np.asarray(values, float) for values in (n, mean_sigma, n_white, mean_sigma_white, n_only_white)]
     shape = (len(arrays[0]), len(features))
@@ -185,10 +181,6 @@ def write_scores(
         The file.
     scores, extra, order
         As in :func:`score_table`.
-
-    See Also
-    --------
-    score_table : the rows of the file
     """
     rows = score_table(scores, extra, order)
     with atomic_write(path) as whole, whole.open("w", encoding="utf-8", newline="") as file:

@@ -137,10 +137,6 @@ def fewest_views(
         Time limit of the proof; after it, the greedy set is returned, marked as not exact.
     joined
         Returns the actual uncertainty of a set; by default :func:`set_uncertainty`.
-
-    See Also
-    --------
-    greedy_views : a small set, not necessarily the smallest
     """
     began = time.monotonic()
     uncertainty_of = joined or (lambda chosen: set_uncertainty(features, chosen))

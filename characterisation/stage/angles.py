@@ -216,10 +216,6 @@ def about_two(start: Floats, wanted: Floats, first: Floats, second: Floats) -> l
         Unit vectors (n, 3).
     first, second
         Unit axes (3,).
-
-    See Also
-    --------
-    about_one : a single axis
     """
     cos = float(first @ second)
     if abs(cos) > 1 - 1e-12:  # two parallel axes act as one

@@ -52,10 +52,6 @@ def packed(
         Capture to write, folder that messages name, and the maker's files by name.
     truth
         True values by camera.
-
-    See Also
-    --------
-    check_image : checks each image before it is packed
     """
     folder = Path(folder)
     extra = {("vendor", name): data for name, data in (vendor or {}).items()}

@@ -58,10 +58,6 @@ def draw_images(
         Axes to draw into, one for each camera; None for those of a new figure.
     image
         Number of the image, from 0; negative numbers count from the last.
-
-    See Also
-    --------
-    draw_maps : maps that a device computed
     """
     count = min(len(stack) for stack in stacks.values())
     if not -count <= image < count:
@@ -107,10 +103,6 @@ def draw_maps(
         Sensor and source, for the titles.
     ax
         Axes to draw into, one for each map; None for those of a new figure.
-
-    See Also
-    --------
-    draw_images : images of cameras
     """
     rows, columns = next(iter(maps.values())).shape
     size = ((_WIDTH_IN + _SCALE_IN) * len(maps), _WIDTH_IN * rows / columns + _LABELS_IN)

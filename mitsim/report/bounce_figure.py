@@ -64,10 +64,6 @@ def bounced_light(scene: Scene, sensor: Sensor, pose: Transform, visible: Visibl
         world_from_sensor.
     visible
         Surfaces that the reference camera sees from there.
-
-    See Also
-    --------
-    bounce_figure : draws it
     """
     rows, columns = np.nonzero(visible.shape >= 0)
     camera = sensor.rig.reference

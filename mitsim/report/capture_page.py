@@ -42,10 +42,6 @@ def write_capture_page(folder: Path, preamble: str, table: str, real: Shown, sim
         Texts of the page, in Markdown.
     real, simulated
         Data of the specimen in the two captures.
-
-    See Also
-    --------
-    capture_figure : the picture alone
     """
     write_png(capture_figure(real, simulated), folder / PICTURE, dpi=_DPI)
     page = folder / "index.md"

@@ -54,10 +54,6 @@ def difference_figure(
         Windows to outline [px], by name.
     part
         Part of the image that is shown [px]; None for all of it.
-
-    See Also
-    --------
-    distance_figure : the distance of a single cloud
     """
     part = part or Roi.whole(difference.shape[1], difference.shape[0])
     values = difference[np.isfinite(difference)]

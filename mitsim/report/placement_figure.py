@@ -102,10 +102,6 @@ def placement_figure(
         As of :func:`draw_placement`.
     stacked
         Whether the enlarged part is below, for narrow windows, not on the right.
-
-    See Also
-    --------
-    draw_placement : into a figure that exists
     """
     with drawing():
         figure = Figure(_STACKED_IN if stacked else _SIZE_IN)
@@ -134,10 +130,6 @@ def draw_placement(
         Verdict of each feature, a key of :data:`VERDICTS`.
     stacked
         Whether the enlarged part is below, not on the right.
-
-    See Also
-    --------
-    placement_figure : The same as a figure of its own.
     """
     matrices = [np.asarray(pose, float) for _, pose in poses]
     with drawing():

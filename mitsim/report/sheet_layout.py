@@ -72,10 +72,6 @@ def wrapped(text: str, size: float, across: float, weight: str = "normal") -> li
     ----------
     text, size, weight, across
         The text, size [pt] and weight of the font, and largest width of a line [in].
-
-    See Also
-    --------
-    text_width : of one line
     """
     lines, line, width = list[str](), "", 0.0
     for word in text.split(" "):
@@ -133,10 +129,6 @@ class Page:
             Distance from the margin [in], and the line.
         size, colour, weight
             Of the font; the size in pt.
-
-        See Also
-        --------
-        write : several lines
         """
         x, y = (MARGIN + left) / WIDTH, self.place / HEIGHT
         self.figure.text(x, y, text, fontsize=size, color=colour, fontweight=weight, va="top")
@@ -160,10 +152,6 @@ class Page:
             Of the font; the size in pt.
         left, across
             Distance from the margin, and largest width of a line [in].
-
-        See Also
-        --------
-        put : one line at a place
         """
         for line in wrapped(text, size, across, weight):
             self.put(left, line, size, colour, weight)
@@ -191,10 +179,6 @@ class Columns:
         Largest size of text [pt].
     first
         Least width of the first column at the size that is chosen, unless no size leaves it [in].
-
-    See Also
-    --------
-    Page : the page of the table
     """
 
     def __init__(

@@ -112,10 +112,6 @@ def shown_cloud(cloud: PointCloud, part_from_sensor: Floats, features: Sequence[
         The cloud, and the pose of its sensor, (4, 4) [mm].
     features, most
         Names of the features of the task, and largest number of points.
-
-    See Also
-    --------
-    packed_cloud : its bytes in the page
     """
     valid, stride = cloud.valid, 1.0
     rows, columns = np.nonzero(valid)

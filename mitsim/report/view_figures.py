@@ -61,10 +61,6 @@ def uncertainty_figure(scores: xr.Dataset, measurement: str, unit: str, checked:
         Name of the measurement, and its unit: mm or deg.
     checked, best
         Numbers of the views that were rendered, and of the best one; None if no view can make the measurement.
-
-    See Also
-    --------
-    agreement_figure : the errors of the checked views
     """
     worst_first = np.argsort(-scores["uncertainty_rank"].sel(measurement=measurement).values, kind="stable")
     scores = scores.isel(view=worst_first)

@@ -145,10 +145,6 @@ def finished_orders(
         Start the work on an item; return the index of the next among those that wait, None without room.
     given_up, idle_s, idle
         When no item was finished for ``idle_s`` [s], ends if given up, and else calls ``idle``.
-
-    See Also
-    --------
-    results_of : in the sequence of the orders
     """
     try:
         while waiting or running:
@@ -313,10 +309,6 @@ def results_of(
         None for this process.
     label
         Of the progress on stderr.
-
-    See Also
-    --------
-    finished_orders : as they are finished
     """
     if workers is None:
         return [work(order) for order in track(orders, label)]

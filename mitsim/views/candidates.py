@@ -138,10 +138,6 @@ def candidate_views(
         nor as far as the next standoff, which is a separate view.
     where
         File of the table, for error messages.
-
-    See Also
-    --------
-    directions_above : the directions
     """
     target = np.asarray(table.target_mm if table.target_mm is not None else centre, float)
     near, far = range_mm or sensor.working_range_mm

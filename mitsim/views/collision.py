@@ -156,10 +156,6 @@ def is_near(part: Obstacle, box: BodyBox, part_from_sensor: Transform, clearance
         Pose of the sensor.
     clearance
         [mm].
-
-    See Also
-    --------
-    box_distance : the distance of each triangle
     """
     centre = part_from_sensor.points(box.centre)
     reach = float(np.linalg.norm(box.half)) + clearance

@@ -27,10 +27,6 @@ def chosen_standoffs(where: str | Path, table: ViewsTable, sensor: Sensor, radiu
         Sensor with its working range.
     radius_mm
         Radius of a ball around the part.
-
-    See Also
-    --------
-    characterised_range : the range in which a view may lie
     """
     near, far = sensor.working_range_mm
     for standoff in table.standoffs:
@@ -59,10 +55,6 @@ def characterised_range(
         [mm] of the views.
     distances
         Characterised distances [mm].
-
-    See Also
-    --------
-    chosen_standoffs : the distances of the views
     """
     for standoff in standoffs:
         if not min(distances) <= standoff <= max(distances):

@@ -139,10 +139,6 @@ def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above 
         ``views_scored`` counts the views that were scored.
     list of dict
         For every view, the input quantities of its measurements, from which sets of views are chosen.
-
-    See Also
-    --------
-    screening_risk : the risk that orders them
     """
     looking = predictor.thinned_to(RAYS)
     names = list(task.shapes)

@@ -136,10 +136,6 @@ def calibrated_by(tables: dict[str, dict[str, Any]], where: Path, size: tuple[in
         The recording, for messages.
     size
         (width, height) [px] of the images.
-
-    See Also
-    --------
-    read_calibration : of a file
     """
     cameras = ["camera"] if len(tables) == 1 else ["left", "right"]
     asked = {"file": list(tables), "projector": False, "cameras": cameras}
@@ -165,10 +161,6 @@ def camera_of(calibrated: Calibrated, name: str | None, size: tuple[int, int], w
         (width, height) [px] of the images; that of the camera must be the same.
     where
         File of the images, for messages.
-
-    See Also
-    --------
-    read_calibration : all cameras
     """
     cameras = calibrated.rig.cameras
     if name is not None and name not in cameras:

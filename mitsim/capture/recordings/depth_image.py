@@ -71,10 +71,6 @@ def read_depth_image(
         Name of the sensor; by default that of the calibration, or ``depth-camera``.
     frame
         Number of one of several images in a file of NumPy, from 0.
-
-    See Also
-    --------
-    depth_capture : the capture of a depth image
     """
     path = Path(path)
     of_disparities = _DISPARITIES.match(path.resolve().parent.name) and "depth" not in path.stem.lower()
@@ -196,10 +192,6 @@ def depth_capture(
         Name of the camera; by default the first.
     sensor
         Name of the sensor; by default that of the calibration, or ``depth-camera``.
-
-    See Also
-    --------
-    read_depth_image : of a file
     """
     height, width = depth.shape
     name, eye = camera_of(calibrated, camera, (width, height), where)

@@ -110,10 +110,6 @@ def read_depthai_recording(
         n of a disparity in units of 1/2^n px.
     sensor
         Name of the sensor; by default that of the calibration.
-
-    See Also
-    --------
-    recorded_streams : the files of its streams
     """
     path = Path(path)
     streams = recorded_streams(path)

@@ -171,10 +171,6 @@ def read_organised_cloud(
         Name of the camera in the calibration; by default the first.
     sensor
         Name of the sensor; by default that of the calibration, or ``point-cloud``.
-
-    See Also
-    --------
-    read_stored_cloud : any file of a cloud, by its bytes
     """
     stored = path if isinstance(path, StoredCloud) else read_stored_cloud(Path(path))
     path = stored.path

@@ -162,10 +162,6 @@ def chosen_frame(frame: int | None, count: int, where: Path, label: str) -> int:
         Number of frames, and file that messages name.
     label
         Name of the frames in messages, in the plural.
-
-    See Also
-    --------
-    frame_of : a frame by its number or name
     """
     if frame is None and count > 1:
         allowed, hint = "one in a capture", f"choose with --frame 0 to {count - 1}"

@@ -147,11 +147,6 @@ def read_ros_depth(chosen: Chosen, frame: int | None, options: ReadOptions) -> C
     ``frame`` is the number of the message, from 0; required if there are several. By default the camera is the
     ``camera_info`` of the topic, and the depth of one level that of the encoding, or the one that RealSense's viewer
     recorded. Raises InputError if the message or the calibration cannot be read, or they do not belong together.
-
-    See Also
-    --------
-    read_ros_cloud : a cloud
-    read_ros_pair : a stereo pair
     """
     bag, topic = chosen.bag, chosen.topics[0]
     where = label_of(topic, bag.path)
@@ -181,10 +176,6 @@ def read_ros_pair(chosen: Chosen, frame: int | None, options: ReadOptions) -> tu
     Returned with the numbers of both messages. ``frame`` is that of the left one, from 0; required if there are
     several. By default the cameras are the ``camera_info`` of both topics. Raises InputError if a message or the
     calibration cannot be read, or they do not belong together.
-
-    See Also
-    --------
-    read_ros_depth : a depth image
     """
     bag, (left, right) = chosen.bag, chosen.topics
     number = chosen_frame(frame, left.count, bag.path, f"messages of {left.name}")

@@ -69,10 +69,6 @@ def read_stereo_pair(
         Patterns of file names for cameras whose images are not named after them.
     channel
         Channel of colour images that is used.
-
-    See Also
-    --------
-    pair_files : the images of one camera
     """
     folder = Path(folder)
     calibrated = at_size_of_images(folder, lambda size: read_calibration(calibration, size))  # for the names alone
@@ -140,10 +136,6 @@ def pair_capture(
         The cameras, and records of the import.
     sensor
         Name of the sensor; by default that of the calibration, or ``stereo-pair``.
-
-    See Also
-    --------
-    read_stereo_pair : of a folder
     """
     first = next(iter(levels.values()))
     for name, image in levels.items():

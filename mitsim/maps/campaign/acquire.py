@@ -133,10 +133,6 @@ def measured(capture: Capture, shot: Shot, geometry: Geometry, sensor: Sensor, k
         Sensor of the campaign; pose and calibration are those of the capture, if it has them.
     keep_images
         Whether the result contains the capture.
-
-    See Also
-    --------
-    coupon_cloud : the cloud that it measures
     """
     sample, pose = shot.series.sample, coupon_place(capture, shot)
     coupon = sample.at(pose)
@@ -206,10 +202,6 @@ def coupon_cloud(capture: Capture, coupon: Coupon, geometry: Geometry, sensor: S
         That of the capture.
     sensor
         Gives the decoder, and the imager if the capture does not state its own.
-
-    See Also
-    --------
-    measured : decodes and measures the patches
     """
     grid = geometry.grid
     seen = outline(grid, coupon)

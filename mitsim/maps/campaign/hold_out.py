@@ -114,10 +114,6 @@ def held_out_live(
         Preset or file, as in :func:`~mitsim.maps.campaign.live.plan_live`.
     performance_map
         To be compared; it may be that of a simulated sensor, which compares the simulation with the device.
-
-    See Also
-    --------
-    held_out_campaign : simulated coupons in place of a device
     """
     distances = performance_map.data["distance"].values.astype(float)
     live = plan_live(path, file, sensor, (distances.min() * (1 + LIVE_MARGIN), distances.max() * (1 - LIVE_MARGIN)))
@@ -175,10 +171,6 @@ def compare(
         Takes a shot.
     repeats
         Captures of each shot, as in :func:`compared`.
-
-    See Also
-    --------
-    held_out_orders : the same on workers
     """
     prepared = PreparedSensor(campaign.sensor)
     for shot in shots:
@@ -206,10 +198,6 @@ def compared(
         Takes a shot.
     repeats
         Number of captures with fresh noise.
-
-    See Also
-    --------
-    compare : all shots
     """
     sensor = prepared.sensor
     seeds = (shot.series.seed + 2**32 * number for number in range(MOST_REPEATS * repeats))
@@ -276,10 +264,6 @@ def held_out_orders(campaign: Campaign, shots: list[Shot], map_path: Path, repea
         Path of the map, the same on every machine.
     repeats
         Captures of each shot.
-
-    See Also
-    --------
-    compare : in this process
     """
     path, digest = str(map_path.absolute()), _digest(map_path)
     return [HeldOutOrder(order_of(shot, campaign), path, digest, repeats) for shot in shots]

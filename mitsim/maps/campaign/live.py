@@ -64,10 +64,6 @@ def plan_live(
         capture.
     range_mm
         Range of distances; stage positions outside it are ignored.
-
-    See Also
-    --------
-    live_source : takes the captures
     """
     path, device, stage = Path(path), file.device, file.stage
     if device is None:

@@ -165,10 +165,6 @@ def one_finish_campaign(finish: OneFinish, distance: float, file: CampaignFile, 
         The plan, from :func:`plan_of`.
     lay_deg
         Angle of u [deg], if the finish has a lay.
-
-    See Also
-    --------
-    characterise_finish : runs it
     """
     half = half_size(finish.sensor, distance, COUPON_PX if file.coupon_px is None else file.coupon_px)
     recipe = CouponRecipe(finish.finish.name, (), finish.sensor.wavelength_nm)
@@ -195,10 +191,6 @@ def characterise_finish(finish: OneFinish, simulated: SimulatedSensor, distance:
         [mm].
     folder
         Empty folder for the captures.
-
-    See Also
-    --------
-    one_finish_campaign : the campaign alone
     """
     file, made = plan_of(finish.largest_deg, finish.seed), []
     for turn in finish.turns:

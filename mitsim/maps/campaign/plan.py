@@ -146,10 +146,6 @@ def plan_campaign(
         Distances if the file has none.
     stage_tables
         Live stage as calibrated at each distance, for captures with the file's ``device``.
-
-    See Also
-    --------
-    read_campaign : the file
     """
     if file.device is not None and stage_tables is None:
         hint = "only campaigns and validations of maps take captures with a device"

@@ -80,10 +80,6 @@ def measure_captures(campaign: Campaign, shots: Sequence[Shot], source: Source, 
         Returns their results.
     folder
         For the map and the measured shots.
-
-    See Also
-    --------
-    run_campaign : captures that are taken
     """
     captures = Path(folder) / KEPT
     captures.mkdir(parents=True, exist_ok=True)

@@ -147,10 +147,6 @@ def write_stage_calibration(
     board_from_coupon
         The coupon's middle and axes on the board, z out of the face toward the sensor. Default: the coupon's frame is
         that of the board.
-
-    See Also
-    --------
-    read_stage_calibration : the inverse
     """
     coupon = Transform.from_matrix(fit.zero_pose) @ (board_from_coupon or Transform.identity())
     lines = zip(names, fit.axes.directions, fit.axes.points, strict=True)

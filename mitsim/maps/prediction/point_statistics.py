@@ -37,11 +37,6 @@ def performance(
         Map of the sensor.
     finish
         Replaces the finishes of the scene: matt white, to normalise the view score.
-
-    See Also
-    --------
-    expected_points : the points themselves
-    feature_statistics : of whole features
     """
     answers = map_answers(ideal, scene, performance_map, finish)
     return answers.fraction, answers.sigma
@@ -141,10 +136,6 @@ def expected_points(
         Effects that flat coupons cannot show (:mod:`mitsim.maps.prediction.perturbation`).
     answers
         Of the map for all points of the view, if they are known.
-
-    See Also
-    --------
-    feature_statistics : numbers and mean sigma of each shape
     """
     ideal, labels, world_from_sensor = view.ideal, view.labels, view.world_from_sensor
     finish = scene.finishes[shape]
@@ -212,10 +203,6 @@ def feature_statistics(
         F and sigma [mm] (n,) of the points, from :func:`performance`.
     shapes
         Indices into the scene's names.
-
-    See Also
-    --------
-    expected_points : the points of one shape
     """
     label = labels.reshape(-1)[ideal.pixel]
     weight = np.where(np.isfinite(sigma), np.nan_to_num(fraction), 0.0)

@@ -258,10 +258,6 @@ class Predictor:
             F and sigma [mm] (n,); NaN where the map has no answer. Such points are lost.
         rng
             Random generator.
-
-        See Also
-        --------
-        predict : from the map
         """
         size = (self.grid.height, self.grid.width)
 

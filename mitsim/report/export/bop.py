@@ -111,10 +111,6 @@ def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train
         Name of the split: train, val or test.
     patterns
         Patterns of the shapes of each object (:func:`objects_of`).
-
-    See Also
-    --------
-    find_sources : the captures of a folder
     """
     output = Path(output).absolute()
     if output.exists():

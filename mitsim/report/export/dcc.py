@@ -76,10 +76,6 @@ def write_dcc(run_results: RunResults, declared: Declaration, issuer: Issuer, pa
         Results of a run, and their declaration.
     issuer, path
         Who issues the certificate, and file to write.
-
-    See Also
-    --------
-    dcc_document : the document alone
     """
     register_namespace("dcc", DCC)
     register_namespace("si", SI)

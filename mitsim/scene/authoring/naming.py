@@ -177,10 +177,6 @@ def described_name(face: Face, faces: Sequence[Face], low: Floats, high: Floats)
         The face, and all of the part.
     low, high
         (3,) [mm] Corners of the part.
-
-    See Also
-    --------
-    cylinder_kind : the kind of a cylinder
     """
     surface, part = face.surface, float(np.linalg.norm(high - low))
     if isinstance(surface, Plane):

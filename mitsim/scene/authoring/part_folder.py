@@ -108,10 +108,6 @@ def read_part(
         Of a mesh: neighbouring triangles with a smaller angle between them belong to one face.
     fineness
         Of the mesh of a STEP file.
-
-    See Also
-    --------
-    write_part : its scene folder
     """
     path = Path(path)
     check_part_file(path, units)
@@ -148,10 +144,6 @@ def write_part(
         To be made.
     finishing
         Finish of all faces; ground aluminium by default.
-
-    See Also
-    --------
-    read_part : the part without a folder
     """
     path, folder = Path(path), Path(folder).absolute()
     finishing = finishing or Finishing()

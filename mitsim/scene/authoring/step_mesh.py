@@ -53,10 +53,6 @@ def mesh_together(faces: list[Any], chord: float, bend: float, delabella: bool =
     delabella
         Which of OpenCASCADE's two ways connects the same points. Delabella takes a seventeenth of the time for 146,000
         triangles of a torus.
-
-    See Also
-    --------
-    mesh : all faces, each with its chord
     """
     from OCP.BRep import BRep_Builder
     from OCP.BRepMesh import BRepMesh_IncrementalMesh
@@ -113,10 +109,6 @@ def fitted_chords(faces: list[Any], kinds: list[str], chord: float, largest_chor
         Least and largest chord.
     fitted
         Chord of a face whose radius has the standard uncertainty 1, as for :func:`mesh`.
-
-    See Also
-    --------
-    radius_uncertainty : of a face
     """
     out = np.full(len(faces), chord)
     for number, (face, kind) in enumerate(zip(faces, kinds, strict=True)):
@@ -151,10 +143,6 @@ def chords(
         Of faces that a task can measure, one or for each face, and of other faces.
     most
         Triangles of all faces.
-
-    See Also
-    --------
-    mesh : meshes with them
     """
     measured = np.array([kind in MEASURED for kind in kinds])
     out = np.where(measured, chord, other_chord)
@@ -174,10 +162,6 @@ def expected(kinds: list[str], counts: np.ndarray, coarse: float, chord: float |
     ----------
     kinds, counts, coarse, chord
         As for :func:`chords`.
-
-    See Also
-    --------
-    chords : within a number of triangles
     """
     straight = np.array([kind in ("plane", "cylinder") for kind in kinds])
     return np.maximum(counts * (coarse / chord) ** np.where(straight, 0.5, 1.0), 1.0)
@@ -193,10 +177,6 @@ def counted(shapes: list[Any], faces: list[Any], kinds: list[str], chord: float,
     ----------
     shapes, faces, kinds, chord, most
         As for :func:`mesh`.
-
-    See Also
-    --------
-    mesh : as finely as asked
     """
     from OCP.BRepTools import BRepTools
 
@@ -249,10 +229,6 @@ def mesh(  # noqa: PLR0913 - one number each
     fitted
         Chord [mm] of a sphere or cylinder whose radius a fit determines with the standard uncertainty 1, for one point
         of noise 1 on each mm^2; 0: all measured faces have ``chord``.
-
-    See Also
-    --------
-    triangles_of : the mesh of a face as arrays
     """
     if not faces:
         return chord

@@ -63,10 +63,6 @@ def state_by_screening(result: SensorResult, count: int, limit: TimeLimit, whole
         paths of its view are traced by then.
     whole
         Time of the comparison.
-
-    See Also
-    --------
-    race_and_state : from the best view by a race
     """
     for view in shortlist(result.scores, 1):
         _state(result, view, count, limit)

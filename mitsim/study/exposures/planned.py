@@ -64,10 +64,6 @@ def kept_plan(
         Of the plans of a study.
     digest
         Of all that determines a trial: a plan of another digest is made again.
-
-    See Also
-    --------
-    stated_exposures : exposures that a study states
     """
     path = folder / f"view_{view.number:04d}.json"
     digest_of_plan = with_exposure(digest, None, asdict(rules))

@@ -98,10 +98,6 @@ def texture_of(specimen: Specimen, camera: Camera, electrons: Floats, light: Lig
         Light of a white plate on the imagers, of the region of the image that shows the plate.
     name
         Name of the camera in ``light``.
-
-    See Also
-    --------
-    printed : the same for every pixel of the camera, without a texture
     """
     roi = light.rois[name]
     inside = roi.slices
@@ -141,10 +137,6 @@ def printed(
         Name of the camera in ``light``.
     plain
         The images whose largest level is the plain image.
-
-    See Also
-    --------
-    texture_of : the reflectance of the plate instead of the light of its image
     """
     inside, radiance = light.rois[name].slices, light.radiance[name]
     there = image_mask(specimen, camera)[inside]

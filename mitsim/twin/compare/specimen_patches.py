@@ -105,10 +105,6 @@ def specimen_patches(
         Pose and extent of the specimen, in the sensor frame of the capture.
     window_px
         Side of the window of local mean and deviation [px].
-
-    See Also
-    --------
-    patch_rows : the row errors alone
     """
     camera, image = capture.rig.reference, reference_levels(capture).astype(float)
     on_image = image_mask(specimen, camera, MARGIN_PX)
@@ -173,10 +169,6 @@ def patch_rows(
         Rectified geometry of its pair of cameras.
     specimen
         Pose and extent of the specimen.
-
-    See Also
-    --------
-    specimen_patches : all quantities of the patches
     """
     cloud, on_grid, corners = _cloud_patches(capture, settings, geometry, specimen)
     valid = _tiles(np.where(on_grid, cloud.valid.astype(float), np.nan), corners)

@@ -73,10 +73,6 @@ def seen_target(shape: str, window: Roi | None, cloud: PointCloud, name: str, di
         Name of the target in messages.
     distance
         True distance of a plane that is perpendicular to the axis of the grid [mm], in place of the recorded plane.
-
-    See Also
-    --------
-    simulated_target : its twin
     """
     points, grid = window_points(window, cloud, name), cloud.grid
     if distance is not None:
@@ -108,10 +104,6 @@ def simulated_target(
         Name of the target in messages.
     seed
         Of the noise.
-
-    See Also
-    --------
-    seen_target : the recorded one
     """
     shown = _shown_points(target, recorded.grid)
     near, far = sensor.settings.near_mm, sensor.settings.far_mm

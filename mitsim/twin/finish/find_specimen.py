@@ -67,10 +67,6 @@ def find_specimen(capture: Capture, settings: Settings, roi: Roi | None, where: 
     -------
     Specimen
         Its ``off_plane`` is a robust standard deviation with a region, and the rms distance without one.
-
-    See Also
-    --------
-    find_coupon : a coupon whose pose may be known
     """
     if not capture.images:
         raise InputError(where, "images", "none", "a capture with images, not only a map of the device")
@@ -144,10 +140,6 @@ def find_coupon(
     roi
         Image region that shows the coupon. Without it the coupon follows from the capture's pose, otherwise from the
         plane of its cloud.
-
-    See Also
-    --------
-    find_specimen : the estimate without a pose
     """
     if roi is not None:
         return find_specimen(capture, sensor.settings, roi, where)
@@ -183,10 +175,6 @@ def on_specimen(specimen: Specimen, origin: Floats, rays: Floats, pitch: float, 
         Angle between neighbouring rays [rad].
     margin_px
         Margin [px].
-
-    See Also
-    --------
-    image_mask : The same for the pixels of a camera.
     """
     points, reach, cosine = feet_of(specimen.world_from_sensor, origin, rays)
     down = cosine > GRAZING

@@ -105,11 +105,6 @@ def fit_defocus(
         (n, 2, H, W) images of stripes and of their inverses [e-].
     widths
         (n,) of the stripes [projector px].
-
-    See Also
-    --------
-    modulation : of stripes after a blur
-    fitted_blur : the blur of a modulation
     """
     projector = source.capture.rig.projector
     assert projector is not None

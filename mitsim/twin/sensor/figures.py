@@ -111,10 +111,6 @@ def field_figures(levels: Floats, field: SpecimenField, window_px: int, black: f
         Side of the window of local means [px], several run lengths of the pattern wide.
     black
         Level that is subtracted first [DN].
-
-    See Also
-    --------
-    patch_figures : the features of every patch
     """
     table = patch_figures(np.asarray(levels, float) - black, field, window_px)
     basis = field.basis if len(table) >= _FEWEST_FOR_TERMS else field.basis[:, :1]
