@@ -274,14 +274,9 @@ def _along_ray(points: Floats, beside: Floats, eye: Floats) -> Floats:
 def _over_surface(local: Floats, spread: Floats, axes: Floats, apart: Floats) -> Floats:
     """Return the heights (n,) of points over the surface of second order through their neighbours, NaN beyond its edge.
 
-    Parameters
-    ----------
-    local, spread
-        Points (n, 3) and neighbours (n, k, 3) about the middle of the neighbours [mm].
-    axes
-        (n, 3, 3) Columns: direction of the heights, and two across it.
-    apart
-        (n,) [mm] About the distance of the neighbours.
+    ``local`` (n, 3) and ``spread`` (n, k, 3) are points and neighbours about the middle of the neighbours [mm]. The
+    columns of ``axes`` (n, 3, 3) are the direction of the heights, and two across it; ``apart`` (n,) [mm] is about the
+    distance of the neighbours.
     """
     height, *foot = np.einsum("nij,ni->jn", axes, local)
     heights, *feet = np.moveaxis(spread @ axes, -1, 0)

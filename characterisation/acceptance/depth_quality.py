@@ -157,17 +157,8 @@ def mean_depth_error(
 
     5 % of the depths are excluded at either end, and 10 captures are used (docs.luxonis.com, depth accuracy). Their
     board is perpendicular to the axis, and the error is that of its depth. Here each point is compared with the true
-    plane along its own ray, which is the same for such a board. Raises InputError if there is no cloud, or a region
-    does not match one.
-
-    Parameters
-    ----------
-    clouds
-        Captures of one target.
-    ground_truth
-        True pose of the target.
-    region
-        (H, W) mask of the target; the whole grid if None.
+    plane along its own ray, which is the same for such a board. ``region`` (H, W) masks the target; None is the whole
+    grid. Raises InputError if there is no cloud, or a region does not match one.
     """
     where = "mean_depth_error"
     _check_clouds(where, clouds, 1, "Luxonis takes 10", alike=False)

@@ -54,19 +54,10 @@ class ProbingError:
 def flatness_error(points: ArrayLike, rejected_share: float = REJECTED_SHARE) -> float:
     """Return the flatness measurement error of VDI/VDE 2634-2 [mm].
 
-    It is the range of the signed distances from the least-squares plane. Raises InputError if there are fewer than 4
-    points, or the share is out of range.
-
-    Parameters
-    ----------
-    points
-        (n, 3) points [mm] of a calibrated plane; rows with NaN are ignored.
-    rejected_share
-        Share of the points that may be rejected, 0..0.1; the plane is fitted again without them.
-
-    See Also
-    --------
-    characterisation.acceptance.range_uncertainty.flatness_uncertainty
+    It is the range of the signed distances of ``points`` (n, 3) [mm] of a calibrated plane from the least-squares
+    plane; rows with NaN are ignored. A ``rejected_share`` of the points, 0..0.1, may be rejected; the plane is fitted
+    again without them. Its uncertainty: :func:`characterisation.acceptance.range_uncertainty.flatness_uncertainty`.
+    Raises InputError if there are fewer than 4 points, or the share is out of range.
     """
     points = _usable("flatness_error", points, 4, rejected_share)
     kept = _nearest(plane_distances(points), rejected_share)
@@ -78,21 +69,10 @@ def probing_error(
 ) -> ProbingError:
     """Return the probing errors of VDI/VDE 2634-2: form PF and size PS of a sphere of free radius.
 
-    Raises InputError if there are fewer than 5 points, they do not curve enough for a sphere, or an argument is out of
-    range.
-
-    Parameters
-    ----------
-    points
-        (n, 3) points [mm] of the sphere; rows with NaN are ignored.
-    calibrated_diameter
-        [mm].
-    rejected_share
-        Share of the points that may be rejected, 0..0.1; the sphere is fitted again without them.
-
-    See Also
-    --------
-    characterisation.acceptance.range_uncertainty.form_error_uncertainty
+    ``points`` (n, 3) [mm] are of the sphere; rows with NaN are ignored. A ``rejected_share`` of them, 0..0.1, may be
+    rejected; the sphere is fitted again without them. ``calibrated_diameter`` in mm. The uncertainty of the form:
+    :func:`characterisation.acceptance.range_uncertainty.form_error_uncertainty`. Raises InputError if there are fewer
+    than 5 points, they do not curve enough for a sphere, or an argument is out of range.
     """
     if not calibrated_diameter > 0:
         raise InputError("probing_error", "calibrated_diameter", calibrated_diameter, "a positive length in mm")

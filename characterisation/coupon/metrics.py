@@ -69,12 +69,8 @@ def ray_noise_std(points: NDArray[np.floating]) -> RayNoise:
     """Measure the noise along the view ray of patches of a flat surface.
 
     P = P_eps + eps V^ and sigma^2 = sum of eps^2 / (n - 3). P is a measured point, P_eps the point of the fitted plane
-    on the same ray (talk of Kinnell and Justham, 2018, slide *Point Cloud Processing*).
-
-    Parameters
-    ----------
-    points
-        (..., n, 3) points [mm] seen from the origin (the optical centre of the sensor); NaN points are skipped.
+    on the same ray (talk of Kinnell and Justham, 2018, slide *Point Cloud Processing*). ``points`` (..., n, 3) [mm] are
+    seen from the origin (the optical centre of the sensor); NaN points are skipped.
     """
     points = np.asarray(points, np.float64)
     shape = points.shape[:-2]
@@ -187,16 +183,12 @@ def _robust_sigma(residual: Floats, present: NDArray[np.bool_]) -> Floats:
 def recovered_fraction(
     count: ArrayLike, possible: ArrayLike, confidence: float = 0.95
 ) -> tuple[Floats, Floats, Floats]:
-    """Return F = recovered points / possible points, with a Clopper-Pearson interval.
+    """Return F = recovered points / possible points, and the ends of its Clopper-Pearson interval.
 
     F is that of the talk's slide *Point Cloud Processing*: density of recovered points over maximum possible density.
-    ``possible`` need not be whole.
-
-    Returns
-    -------
-    F, low, high
-        Arrays in 0..1, NaN where no point was possible. The interval assumes independent pixels. Neighbouring pixels of
-        SGBM are not independent, so the width of the interval is a lower bound of the spread.
+    ``possible`` need not be whole. All three are in 0..1, NaN where no point was possible. The interval assumes
+    independent pixels. Neighbouring pixels of SGBM are not independent, so the width of the interval is a lower bound
+    of the spread.
     """
     n, m = np.asarray(count, float), np.asarray(possible, float)
     if np.any(n > m) or np.any(n < 0):

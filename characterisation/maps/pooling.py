@@ -94,18 +94,12 @@ class Pooled:
 
 
 def pool(patches: xr.Dataset, nominal: float, positions: Floats) -> Pooled:
-    """Estimate F and sigma at positions of the equal-area plane, from the patches of a sample at one nominal distance.
+    """Estimate F and sigma at ``positions`` (q, 2) of the equal-area plane, from the patches of a sample at one
+    distance.
 
-    Parameters
-    ----------
-    patches
-        Table of :func:`characterisation.coupon.patches.measure_patches` with the column ``orientation``, the number of
-        the capture. Without this column, patches of one normal are one capture. Without ``distance``, all are at the
-        nominal one.
-    nominal
-        |V| [mm] of the coupon's centre.
-    positions
-        (q, 2) in the plane.
+    ``patches`` is a table of :func:`characterisation.coupon.patches.measure_patches` with the column ``orientation``,
+    the number of the capture. Without this column, patches of one normal are one capture. Without ``distance``, all are
+    at the ``nominal`` one, |V| [mm] of the coupon's centre.
     """
     with threadpool_limits(1, user_api="blas"):  # threads slow down thousands of small fits
         return _pool(patches, nominal, positions)

@@ -23,24 +23,12 @@ NORMAL_COVERAGE = math.erf(COVERAGE_FACTOR / math.sqrt(2))
 
 
 def coverage_interval(z: Floats, confidence: float = 0.95) -> tuple[float, float, float]:
-    """Return the share of |z| up to 2, and its Clopper-Pearson interval.
+    """Return the share of |z| up to 2, and the ends of its Clopper-Pearson interval; NaN without any z.
 
-    Repeats of one view have systematic errors in common, so they count as fewer trials. The effective number is p (1 -
-    p) over the variance of p between views (Korn and Graubard, Survey Methodology 24 (1998) 193-201), but at least the
-    number of views and at most that of all trials. Where all errors or none lie within 2 u, this variance is unknown,
-    and each view counts as one trial.
-
-    Parameters
-    ----------
-    z
-        (views, repeats) with NaN for missing values.
-    confidence
-        Confidence of the interval, 0..1.
-
-    Returns
-    -------
-    coverage, low, high
-        NaN without any z.
+    ``z`` (views, repeats) is NaN for missing values. Repeats of one view have systematic errors in common, so they
+    count as fewer trials. The effective number is p (1 - p) over the variance of p between views (Korn and Graubard,
+    Survey Methodology 24 (1998) 193-201), but at least the number of views and at most that of all trials. Where all
+    errors or none lie within 2 u, this variance is unknown, and each view counts as one trial.
     """
     finite = np.isfinite(z)
     trials, inside = finite.sum(axis=1), (finite & (np.abs(z) <= COVERAGE_FACTOR)).sum(axis=1)

@@ -145,16 +145,10 @@ def deciles(score: ArrayLike, error: ArrayLike, tried: ArrayLike | None = None) 
 def bin_ranks(values: ArrayLike, views: ArrayLike) -> Floats:
     """Return the rank (bin,) of the bins 1 to 10 by a quantity that is good when small; NaN for bin 0.
 
+    ``values`` (bin,) are those of the bins 0 to 10, NaN without a value; ``views`` (bin,) are their numbers of views.
     Rank 1 is the smallest value. Equal values share their mean rank. A bin whose views have no value ranks after all
     others, since nothing can be measured from it; several such bins share a rank. A bin without views has no rank. If
     only k bins hold views, rank r of k becomes 10 (r - 1/2) / k + 1/2, so that cells of few views can be averaged.
-
-    Parameters
-    ----------
-    values
-        (bin,) for the bins 0 to 10, NaN without a value.
-    views
-        (bin,) number of views.
     """
     quantity, occupied = np.asarray(values, float).copy(), np.asarray(views) > 0
     occupied[IMPOSSIBLE] = False
@@ -168,20 +162,11 @@ def bin_ranks(values: ArrayLike, views: ArrayLike) -> Floats:
 def mean_ranks(cells: Sequence[xr.Dataset], quantity: str = "error") -> xr.Dataset:
     """Return the mean rank of each bin over cells: measurements of samples, each from :func:`deciles`.
 
-    Parameters
-    ----------
-    cells
-        At least one.
-    quantity
-        ``error``, ``deviation`` or ``share``.
-
-    Returns
-    -------
-    xarray.Dataset
-        Over ``bin`` 1 to 10: ``rank``, its 95 % interval ``rank_low`` and ``rank_high`` by Student's t, and ``cells``,
-        the number that have a rank. Cells of one sample share their views, so the interval is somewhat too narrow. The
-        attribute ``correlation`` is the mean rank correlation of bin and quantity over the ``correlated`` cells that
-        have one, ``correlation_low`` and ``correlation_high`` its interval.
+    ``quantity`` is ``error``, ``deviation`` or ``share``. The result has over ``bin`` 1 to 10: ``rank``, its 95 %
+    interval ``rank_low`` and ``rank_high`` by Student's t, and ``cells``, the number that have a rank. Cells of one
+    sample share their views, so the interval is somewhat too narrow. The attribute ``correlation`` is the mean rank
+    correlation of bin and quantity over the ``correlated`` cells that have one, ``correlation_low`` and
+    ``correlation_high`` its interval.
     """
     ranks = np.array([cell[f"{quantity}_rank"].values[1:] for cell in cells]).reshape(-1, BINS)
     rows = np.array([mean_interval(column[np.isfinite(column)]) for column in ranks.T])

@@ -68,25 +68,14 @@ def view_statistics(
 def score_views(views: xr.Dataset, task: Task, minimum_points: float = 100) -> xr.Dataset:
     """Score and rank every view for every measurement of a task.
 
-    Raises ValueError if a feature or variable is absent, or numbers are invalid (see :func:`view_statistics`).
+    ``views`` holds the variables of :data:`INPUTS` over (view, feature), from :func:`view_statistics`, with every
+    feature of the task. A measurement is impossible from a view with fewer than ``minimum_points`` expected points on
+    one of its features. Raises ValueError if a feature or variable is absent, or numbers are invalid.
 
-    Parameters
-    ----------
-    views
-        The variables of :data:`INPUTS` over (view, feature), from :func:`view_statistics`, with every feature of the
-        task.
-    task
-        The task, which gives the features of each measurement.
-    minimum_points
-        A measurement is impossible from a view with fewer expected points on one of its features.
-
-    Returns
-    -------
-    xarray.Dataset
-        ``S_f``, ``S_f_hat``, ``R_f`` (view, feature); ``S_m``, ``R_m``, ``V_m``, ``possible``, ``rank`` and
-        ``limited_by`` (measurement, view); and ``n``. Where a measurement is impossible, V_m is 0 regardless of S_m
-        R_m. ``limited_by`` then names the feature with the fewest points; elsewhere it is "". Rank 1 is best.
-        Impossible views rank after all possible ones; of equal views the lower index ranks first.
+    The result has ``S_f``, ``S_f_hat``, ``R_f`` (view, feature); ``S_m``, ``R_m``, ``V_m``, ``possible``, ``rank`` and
+    ``limited_by`` (measurement, view); and ``n``. Where a measurement is impossible, V_m is 0 regardless of S_m R_m.
+    ``limited_by`` then names the feature with the fewest points; elsewhere it is "". Rank 1 is best. Impossible views
+    rank after all possible ones; of equal views the lower index ranks first.
     """
     _check(views)
     names = list(task.shapes)

@@ -90,16 +90,10 @@ def calibration_angles(limits: ArrayLike, count: int) -> Floats:
 
 
 def calibrate_with_board(angles: ArrayLike, poses: ArrayLike) -> BoardCalibration:
-    """Estimate the axes from poses of a board.
+    """Estimate the axes from ``poses`` (n, 4, 4) of a board, ``sensor_from_board`` [mm], at read-back ``angles`` (n, k)
+    [rad].
 
-    Raises InputError if the captures do not determine the axes; the message names the axis.
-
-    Parameters
-    ----------
-    angles
-        (n, k) read-back angles [rad].
-    poses
-        (n, 4, 4) ``sensor_from_board`` [mm]; those with NaN are ignored.
+    Poses with NaN are ignored. Raises InputError if the captures do not determine the axes; the message names the axis.
     """
     angles, poses = _usable(np.asarray(angles, float), np.asarray(poses, float))
     axes, zero = axes_from_rotations(angles, poses[:, :3, :3], poses[:, :3, 3])

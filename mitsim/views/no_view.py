@@ -26,14 +26,8 @@ TOGETHER = "The table [set] of a study finds the fewest views that measure toget
 def why_no_view(scores: xr.Dataset, measurement: str, shapes: Sequence[str]) -> str:
     """Return the reason why no view can make a measurement, in words; empty if a view can.
 
-    Parameters
-    ----------
-    scores
-        Scores of all views, as of :func:`mitsim.views.view_scores.score_candidates`.
-    measurement
-        Name of the measurement.
-    shapes
-        Names of the shapes of the scene that it depends on.
+    ``scores`` are of all views (:func:`mitsim.views.view_scores.score_candidates`), ``shapes`` the names of the shapes
+    of the scene that the measurement depends on.
     """
     here = scores.sel(measurement=measurement)
     if here["uncertainty_possible"].values.any():

@@ -73,18 +73,11 @@ class RigFile(Document):
 
 
 def read_calibration(source: str | Path, size: tuple[int, int] | None = None) -> Calibrated:
-    """Read the cameras of a preset by name, or of a file.
+    """Read the cameras of a preset by name, or of a file by its path.
 
-    Raises InputError if there is no such file, it has none of the formats above, or its numbers cannot belong to its
-    images.
-
-    Parameters
-    ----------
-    source
-        Name of a preset, or path of a file.
-    size
-        (width, height) [px] of the images: the size of an OpenCV file without one, and the size to which the cameras
-        of a preset or of a DepthAI calibration are scaled.
+    ``size`` (width, height) [px] of the images is that of an OpenCV file without one, and the size to which the cameras
+    of a preset or of a DepthAI calibration are scaled. Raises InputError if there is no such file, it has none of the
+    formats above, or its numbers cannot belong to its images.
     """
     read = _read(source, size)
     if read.nominal and size is not None:
@@ -126,16 +119,9 @@ def _is_of_capture(cameras: Any) -> bool:
 def calibrated_by(tables: dict[str, dict[str, Any]], where: Path, size: tuple[int, int] | None) -> Calibrated:
     """Return the cameras of ROS's ``camera_info`` messages, by topic: one camera, or the left and the right of a pair.
 
-    Raises InputError if values are missing, or cannot belong to the images.
-
-    Parameters
-    ----------
-    tables
-        The fields of each message by name, in the order of the cameras.
-    where
-        The recording, for messages.
-    size
-        (width, height) [px] of the images.
+    ``tables`` are the fields of each message by name, in the order of the cameras; messages name the recording
+    ``where``; ``size`` (width, height) [px] of the images. Raises InputError if values are missing, or cannot belong to
+    the images.
     """
     cameras = ["camera"] if len(tables) == 1 else ["left", "right"]
     asked = {"file": list(tables), "projector": False, "cameras": cameras}

@@ -49,25 +49,16 @@ class _ImageSet:
 
 
 def read_ensenso(path: str | Path, *, dynamic: bool = True, frame: int | None = None) -> Capture:
-    """Read one image set of a recording.
+    """Read one image set of a recording: a zip or .enscam file, or a folder.
 
-    Raises InputError if a file is missing or damaged, or the calibration lacks a field; the error names it.
+    It holds ``<base>_left.png``, ``<base>_right.png`` and ``<base>_calib.json``, or a FlexView series of them, at its
+    top or up to two levels down; PNG or TIFF. ``dynamic`` takes the rectification as last corrected by the device, not
+    the factory's. ``frame`` is the number of the set, counted from 0 in the order of the names; required if there are
+    several.
 
-    Parameters
-    ----------
-    path
-        A zip or .enscam file, or a folder, with ``<base>_left.png``, ``<base>_right.png`` and ``<base>_calib.json``,
-        or a FlexView series of them, at its top or up to two levels down; PNG or TIFF.
-    dynamic
-        Use the rectification as last corrected by the device; False for the factory's.
-    frame
-        Number of the set, counted from 0 in the order of the names; required if the recording contains several.
-
-    Returns
-    -------
-    Capture
-        ``source`` is ``device``, or ``simulated`` for the vendor's virtual cameras. The images of a FlexView series
-        are in the order of the pattern's shifts, for each side.
+    ``source`` of the capture is ``device``, or ``simulated`` for the vendor's virtual cameras. The images of a FlexView
+    series are in the order of the pattern's shifts, for each side. Raises InputError if a file is missing or damaged,
+    or the calibration lacks a field; the error names it.
     """
     path = Path(path)
     chosen = _image_set(path, frame)

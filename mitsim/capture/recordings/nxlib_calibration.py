@@ -60,16 +60,9 @@ class NxLibTree(JsonFields):
 def nxlib_rig(tree: NxLibTree, size: tuple[int, int] | None = None, *, dynamic: bool = True) -> Rig:
     """Return the left and right camera of a node, in the sensor frame, with the manufacturer's rectification.
 
-    Raises InputError if the node lacks a field, or a field is invalid.
-
-    Parameters
-    ----------
-    tree
-        Node of the camera in the tree of NxLib.
-    size
-        (width, height) [px] of the raw images; by default ``Sensor/Size``.
-    dynamic
-        Use the rectification as last corrected by the device, if present; False for the factory's.
+    ``tree`` is the node of the camera in the tree of NxLib; ``size`` (width, height) [px] of the raw images is by
+    default ``Sensor/Size``. ``dynamic`` takes the rectification as last corrected by the device, if present, not the
+    factory's. Raises InputError if the node lacks a field, or a field is invalid.
     """
     if size is None:
         columns, rows = tree.numbers("Sensor/Size", (2,)).astype(int).tolist()

@@ -77,19 +77,10 @@ def seen_finishes(scene: Scene) -> dict[str, Finish]:
 def map_with_finishes(
     performance_map: PerformanceMap, needed: NeededFinishes, ask: Ask | None = None
 ) -> PerformanceMap:
-    """Return the map with samples for all needed finishes.
+    """Return the map of the sensor with samples for all finishes of the scene that are ``needed``.
 
-    Raises InputError if a finish is missing and may not be characterised, or the map was not simulated. Not if the map
-    serves for screening alone.
-
-    Parameters
-    ----------
-    performance_map
-        Map of the sensor.
-    needed
-        Finishes of the scene, and how to characterise them.
-    ask
-        Answers whether finishes may be characterised now; None if nobody can answer.
+    ``ask`` answers whether finishes may be characterised now; None if nobody can answer. Raises InputError if a finish
+    is missing and may not be characterised, or the map was not simulated; not if the map serves for screening alone.
     """
     unmeasured = {name for name in needed.finishes if needed.measured is not None and name not in needed.measured}
     measured = {name: finish for name, finish in needed.finishes.items() if name not in unmeasured}

@@ -26,17 +26,7 @@ _RAYS = 40_000
 
 
 def faces_in_sight(predictor: Predictor, scene: Scene, world_from_sensor: Transform) -> dict[str, float]:
-    """Return the features of a view that see other faces, with the share of directions in which these lie.
-
-    Parameters
-    ----------
-    predictor
-        Of the sensor.
-    scene
-        The part.
-    world_from_sensor
-        Pose of the view.
-    """
+    """Return the features of a view that see other faces, with the share of directions in which these lie."""
     looking = predictor.thinned_to(_RAYS) if predictor.step == 1 else predictor
     surfaces = looking.surfaces(scene, world_from_sensor)
     ideal = looking.ideal(surfaces)

@@ -82,13 +82,9 @@ def triangle_count(face: Any) -> int:
 def radius_uncertainty(normals: np.ndarray, areas: np.ndarray) -> float:
     """Return the standard uncertainty of a fitted radius, for one point of noise 1 per unit of area.
 
-    The points of a sphere or cylinder depend on its radius by 1, and on its centre by their normal n. With their means
-    <.> over the area A the least squares leave the variance of the radius 1 / (A (1 - <n> <n n^T>^-1 <n>)).
-
-    Parameters
-    ----------
-    normals, areas
-        Unit normals (m, 3) of the facets, and their areas (m,).
+    ``normals`` (m, 3) are the unit normals of the facets, ``areas`` (m,) their areas. The points of a sphere or
+    cylinder depend on its radius by 1, and on its centre by their normal n. With their means <.> over the area A the
+    least squares leave the variance of the radius 1 / (A (1 - <n> <n n^T>^-1 <n>)).
     """
     share = areas / areas.sum()
     mean, product = share @ normals, (normals * share[:, None]).T @ normals

@@ -49,17 +49,10 @@ def read_candidates(
 ) -> tuple[list[CandidateSensor], list[Excluded]]:
     """Open a study for each of the sensors.
 
+    ``sensors`` are ``all`` for every preset, names of presets, or paths of sensor TOML files. ``=MAP`` after a name or
+    path selects a map: a file, or a sensor whose map comes with mitsim. Paths are relative to the working folder.
+    ``ask`` answers whether finishes that a sensor's map lacks may be characterised now; None if nobody can answer.
     Raises InputError if the study cannot be read, a sensor is unknown or named twice, or no sensor can be compared.
-
-    Parameters
-    ----------
-    path
-        Path of the study file.
-    sensors
-        ``all`` for every preset, the name of a preset, or the path of a sensor TOML file. ``=MAP`` after a name or path
-        selects a map: a file, or a sensor whose map comes with mitsim. Paths are relative to the working folder.
-    ask
-        Answers whether finishes that a sensor's map lacks may be characterised now; None if nobody can answer.
     """
     path = Path(path)
     file = read_toml(path, StudyFile)

@@ -37,12 +37,8 @@ RankKey = tuple[int, tuple[float, ...]]
 def rank_key(demands: Iterable[float], impossible: int | None = None) -> RankKey:
     """Return the key that sorts sensors, best first, from the demands of one of them.
 
-    Parameters
-    ----------
-    demands
-        Demand of each measurement that is compared; infinite or NaN for an impossible one.
-    impossible
-        Number of impossible measurements, if others than those compared count too; by default that of ``demands``.
+    ``demands`` are those of the measurements that are compared; infinite or NaN for an impossible one. ``impossible``
+    is the number of impossible measurements, if others than those compared count too.
     """
     every = list(demands)
     possible = sorted((demand for demand in every if math.isfinite(demand)), reverse=True)
@@ -50,18 +46,11 @@ def rank_key(demands: Iterable[float], impossible: int | None = None) -> RankKey
 
 
 def rank_keys(demands: ArrayLike, has_tolerance: ArrayLike, references: ArrayLike = True) -> list[RankKey]:
-    """Return the key of every sensor.
+    """Return the key of every sensor from ``demands`` (sensor, measurement), infinite for an impossible measurement.
 
-    Parameters
-    ----------
-    demands
-        Demands (sensor, measurement), infinite for an impossible measurement. Without a tolerance, they are in the unit
-        of the measurement.
-    has_tolerance
-        Whether a measurement (measurement,) has a tolerance. If a sensor can make one that has, only those with a
-        tolerance are compared: the others have no limit. Impossible ones count with and without tolerance.
-    references
-        Sensors (sensor,) whose least demand is 1 if there are no tolerances; by default all.
+    If a sensor can make a measurement that ``has_tolerance`` (measurement,), only those with a tolerance are compared:
+    the others have no limit. Impossible ones count with and without tolerance. If there are no tolerances, demands are
+    in the unit of the measurement, and the least of the sensors ``references`` (sensor,), by default all, is 1.
     """
     table, compared = np.asarray(demands, float), np.asarray(has_tolerance, bool)
     impossible = (~np.isfinite(table)).sum(axis=1)
@@ -82,15 +71,10 @@ def relative_to_least(demands: ArrayLike, references: ArrayLike) -> Floats:
 
 
 def unpromising(keys: Sequence[RankKey], tolerances: bool) -> list[str]:
-    """Return for each screened sensor the reason against measuring it, empty if it is promising.
+    """Return for each screened sensor, by its key, the reason against measuring it, empty if it is promising.
 
-    Parameters
-    ----------
-    keys
-        Keys of the sensors by screening.
-    tolerances
-        Whether the demands are relative to a limit; otherwise they are relative to those of the best sensor. A limit
-        that the best sensor exceeds excludes no sensor that is about as good.
+    With ``tolerances`` the demands are relative to a limit; otherwise to those of the best sensor. A limit that the
+    best sensor exceeds excludes no sensor that is about as good.
     """
     first = min(keys)
     least = max((1.0, *first[1]) if tolerances else first[1], default=math.inf)

@@ -54,14 +54,8 @@ def least_uncertainty(stated: Statement, effect: Effect) -> float:
 def can_fit(stated: Statement, uncertainty: float, unbiased: bool) -> bool:
     """Return whether a measurement with another standard uncertainty can fit its tolerance.
 
-    Parameters
-    ----------
-    stated
-        Its statement, with a decision.
-    uncertainty
-        Standard uncertainty after the change, in its unit. The distribution of the error keeps its form.
-    unbiased
-        Whether the bias is gone; otherwise it stays.
+    ``stated`` is its statement, with a decision; ``uncertainty`` that after the change, in its unit. The distribution
+    of the error keeps its form. The bias stays, unless the change makes the measurement ``unbiased``.
     """
     decided = stated.decided
     if decided is None:

@@ -148,20 +148,10 @@ def _decoder(
 ) -> tuple[Settings, Imager | None, str]:
     """Return the settings that decode both captures, their imager, and whose they are, in words.
 
-    Those of the simulated sensor, within the depths that ``recorded`` states: its decoder is part of it. If
-    ``recorded`` has other images than it takes, those of ``recorded``: a matcher of four shifted patterns has 40 times
-    the noise of another on one of them, and one of dots 20 times on a print with the projector off.
-
-    Parameters
-    ----------
-    recorded
-        The real capture.
-    given
-        The simulated capture, if the user names one.
-    twin_sensor
-        The sensor to simulate otherwise.
-    on
-        Whether the projector was on in ``recorded``.
+    Those of the simulated sensor, within the depths that ``recorded`` states: its decoder is part of it; ``given`` is
+    the simulated capture, if the user names one. If ``recorded``, with the projector ``on``, has other images than it
+    takes, those of ``recorded``: a matcher of four shifted patterns has 40 times the noise of another on one of them,
+    and one of dots 20 times on a print with the projector off.
     """
     stated = recorded.decoding
     device = None if stated.near_mm is None or stated.far_mm is None else (stated.near_mm, stated.far_mm)

@@ -161,17 +161,8 @@ def specimen_in_cloud(cloud: PointCloud, where: str) -> Specimen:
 def pose_over_coupon(cloud: PointCloud, window: Roi, where: str) -> Transform:
     """Return ``world_from_sensor``, with the frame of a coupon as the world.
 
-    Raises InputError if the window is not in the cloud, too few of its points lie in one plane, or the plane is seen
-    edge-on.
-
-    Parameters
-    ----------
-    cloud
-        Points of the coupon [mm] in the sensor frame, and of other things.
-    window
-        Pixels of the cloud that show only the coupon.
-    where
-        Name of the capture in messages.
+    The pixels of ``window`` show only the coupon; ``where`` names the capture in messages. Raises InputError if the
+    window is not in the cloud, too few of its points lie in one plane, or the plane is seen edge-on.
     """
     grid = cloud.grid
     asked = f"{window.left} {window.top} {window.width} {window.height}"

@@ -250,14 +250,8 @@ def fit_dots(
 def field_misfits(names: Sequence[tuple[str, str]], off: Floats, basis: Floats) -> dict[str, float]:
     """Return the root mean square over the patches of each feature's difference.
 
-    Parameters
-    ----------
-    names
-        Feature and term of each coefficient.
-    off
-        Differences (n,) of the coefficients, of logarithms.
-    basis
-        The terms at the patches (P, 6).
+    ``names`` are feature and term of each coefficient, ``off`` (n,) the differences of the coefficients, of logarithms,
+    ``basis`` (P, 6) the terms at the patches.
     """
     over_field = dict[str, Floats]()
     for (figure, term), value in zip(names, off, strict=True):
