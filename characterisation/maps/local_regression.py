@@ -190,13 +190,7 @@ class _Tile:
     """The places of one tile and the rows about them, arranged for matrix products."""
 
     def __init__(
-        self,
-        data: Observations,
-        by_abscissa: NDArray[np.int64],
-        at: Floats,
-        radius: Floats,
-        slopes: Slopes,
-        link: str,
+        self, data: Observations, by_abscissa: NDArray[np.int64], at: Floats, radius: Floats, slopes: Slopes, link: str
     ) -> None:
         self.log = link == "log"
         self.away = np.array([0.0, *slopes.mean, 0.0, 0.0, 0.0])

@@ -10,14 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import (
-    BeforeValidator,
-    Field,
-    InstanceOf,
-    PlainSerializer,
-    ValidationInfo,
-    field_validator,
-)
+from pydantic import BeforeValidator, Field, InstanceOf, PlainSerializer, ValidationInfo, field_validator
 
 from characterisation.files.documents import Document, validate
 from characterisation.files.errors import InputError
@@ -58,9 +51,7 @@ def _roi(value: Any) -> Any:
 
 
 WrittenRoi = Annotated[
-    InstanceOf[Roi],
-    BeforeValidator(_roi),
-    PlainSerializer(lambda roi: [roi.left, roi.top, roi.width, roi.height]),
+    InstanceOf[Roi], BeforeValidator(_roi), PlainSerializer(lambda roi: [roi.left, roi.top, roi.width, roi.height])
 ]
 
 
@@ -82,11 +73,7 @@ class Decoding(Document):
     decoder: Settings | None = None
     imager: WrittenImager | None = None
     pattern: (
-        Annotated[
-            DotPattern | LightCode | ImagesDescription | AmplitudeModulation,
-            Field(discriminator="kind"),
-        ]
-        | None
+        Annotated[DotPattern | LightCode | ImagesDescription | AmplitudeModulation, Field(discriminator="kind")] | None
     ) = None
     projector_size_px: tuple[Side, Side] | None = None
     exposure_s: Exposure | Annotated[tuple[Exposure, ...], Field(min_length=1, max_length=1000)] | None = None

@@ -125,8 +125,8 @@ def cloud_figures(cloud: PointCloud, artefacts: Artefacts, baseline_mm: float | 
 def joint_figures(clouds: Sequence[PointCloud], artefacts: Artefacts) -> list[Result]:
     """Return the figures of every plane that need two or more captures of one pose.
 
-    Temporal noise [mm] over the window; global planarity trueness [mm]; with a
-    distance mean depth error [%]. Definitions and sources: :mod:`characterisation.acceptance.depth_quality`. Raises
+    Temporal noise [mm] over the window; global planarity trueness [mm]; with a distance mean depth error [%].
+    Definitions and sources: :mod:`characterisation.acceptance.depth_quality`. Raises
     InputError if there are fewer than two clouds, their grids differ in size, or a window does not lie in the grid.
     """
     out: list[Result] = []

@@ -49,10 +49,7 @@ _POLL_S = 0.2
 _GROUP = Path("/sys/fs/cgroup")
 _GROUP_FILES = (
     (("memory.max", "memory.current", "memory.stat"), "inactive_file"),
-    (
-        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "memory/memory.stat"),
-        "total_inactive_file",
-    ),
+    (("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "memory/memory.stat"), "total_inactive_file"),
 )
 
 

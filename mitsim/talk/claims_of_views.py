@@ -164,10 +164,7 @@ _SURVIVORS = (
 
 
 def _example(judged: JudgedViews, example: ExampleEntry) -> Claim:
-    cell, errors = (
-        judged.cell(example.sample, example.measurement, "V_m"),
-        judged.errors[example.sample],
-    )
+    cell, errors = (judged.cell(example.sample, example.measurement, "V_m"), judged.errors[example.sample])
     values, views, share = cell["error"].values, cell["views"].values, cell["share"].values
     unit = unit_symbol(str(judged.scores[example.sample]["unit"].sel(measurement=example.measurement).item()))
     possible = int(views[1:].sum())

@@ -27,11 +27,7 @@ from characterisation.point_cloud import Status
 from characterisation.scores.view_score import rank_views, score_views, view_statistics
 from characterisation.tasks.covariance import LEAST_CHANCE, ExpectedPoints
 from characterisation.tasks.measurement_model import InputQuantity
-from characterisation.tasks.prediction import (
-    ExpectedMeasurement,
-    expected_inputs,
-    expected_measurement,
-)
+from characterisation.tasks.prediction import ExpectedMeasurement, expected_inputs, expected_measurement
 from characterisation.tasks.task_file import Task
 from characterisation.words.progress import track
 from mitsim.maps.campaign.acquire import one_ahead

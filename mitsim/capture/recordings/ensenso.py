@@ -124,11 +124,7 @@ def _image_set(path: Path, frame: int | None) -> _ImageSet:
     ]
     if frame is None and strays:
         raise InputError(
-            path,
-            PurePosixPath(strays[0]).name,
-            "an image without its calibration",
-            "complete image sets",
-            hint,
+            path, PurePosixPath(strays[0]).name, "an image without its calibration", "complete image sets", hint
         )
     base = bases[number]
     left, right = (_of_side(path, base, side, names, hint) for side in ("left", "right"))

@@ -28,13 +28,7 @@ from rosbags.rosbag1.reader import decompressors
 
 from characterisation.files.errors import InputError
 from mitsim.capture.recordings.mcap_messages import Expected, mcap_messages
-from mitsim.capture.recordings.recording_files import (
-    BAG_MAGIC,
-    LARGEST_RECORDING,
-    MCAP_MAGIC,
-    MOST_FILES,
-    SQLITE_MAGIC,
-)
+from mitsim.capture.recordings.recording_files import BAG_MAGIC, LARGEST_RECORDING, MCAP_MAGIC, MOST_FILES, SQLITE_MAGIC
 from mitsim.sensor.projector_images import counted
 
 #: first bytes of data packed by Zstandard

@@ -16,16 +16,7 @@ import numpy as np
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
-from mitsim.capture.grey_image import (
-    CHANNELS,
-    SUFFIXES,
-    Image,
-    bits_of,
-    channel_name,
-    from_bit_0,
-    is_colour,
-    read_grey,
-)
+from mitsim.capture.grey_image import CHANNELS, SUFFIXES, Image, bits_of, channel_name, from_bit_0, is_colour, read_grey
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
 from mitsim.capture.recordings.image_folder import at_size_of_images
 from mitsim.capture.recordings.recording_files import chosen_frame, frame_of

@@ -167,11 +167,7 @@ def simple(kind: str, surface: Any) -> dict[str, Any]:
     """Return the numbers of a simple surface."""
     frame = surface.Position()
     at, along = frame.Location(), frame.Axis().Direction()
-    out: dict[str, Any] = {
-        "kind": kind,
-        "point": [at.X(), at.Y(), at.Z()],
-        "axis": [along.X(), along.Y(), along.Z()],
-    }
+    out: dict[str, Any] = {"kind": kind, "point": [at.X(), at.Y(), at.Z()], "axis": [along.X(), along.Y(), along.Z()]}
     if kind in ("cylinder", "sphere"):
         out["radius"] = surface.Radius()
     if kind == "cone":

@@ -47,11 +47,7 @@ def feature_keys(face: Face) -> dict[str, Any]:
     if not isinstance(surface, Plane | Cylinder | Cone):
         return {}
     along = surface.normal if isinstance(surface, Plane) else surface.axis
-    keys: dict[str, Any] = {
-        "kind": surface.kind,
-        "point_mm": numbers(surface.point),
-        "direction": numbers(along, 7),
-    }
+    keys: dict[str, Any] = {"kind": surface.kind, "point_mm": numbers(surface.point), "direction": numbers(along, 7)}
     if isinstance(surface, Cylinder | Cone):
         keys["radius_mm"] = number(surface.radius)
     if isinstance(surface, Cone):

@@ -180,10 +180,7 @@ def _possible_points(renderer: RenderedMeasurements, view: View) -> dict[str, _P
     """Return the points of every needed feature that all cameras and the projector can see."""
     scene, pose = renderer.study.scene, view.world_from_sensor
     surfaces = renderer.predictor.surfaces(scene, pose)
-    ideal, labels = (
-        renderer.predictor.ideal(surfaces),
-        renderer.predictor.labels(scene, pose, surfaces),
-    )
+    ideal, labels = (renderer.predictor.ideal(surfaces), renderer.predictor.labels(scene, pose, surfaces))
     label = labels.reshape(-1)[ideal.pixel]
     out = {}
     for name in needed_shapes(renderer.study.task):

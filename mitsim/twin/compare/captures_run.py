@@ -218,13 +218,7 @@ def _distance(specimen: Specimen) -> float:
 
 
 def _preamble(
-    real: Capture,
-    simulated: Capture,
-    specimen: Specimen,
-    comparison: Comparison,
-    where: Path,
-    on: bool,
-    decoder: str,
+    real: Capture, simulated: Capture, specimen: Specimen, comparison: Comparison, where: Path, on: bool, decoder: str
 ) -> str:
     rebuilt = simulated.settings.get("rebuilt", {})
     power = rebuilt.get("power_times_reflectance_w")

@@ -154,11 +154,7 @@ class Problem:
             return np.array([np.log(values[0]), *values[1:]]), slopes
         x, lobe, wide, *room = values
         power = lobe + wide
-        slopes[:3, :3] = [
-            [0.0, 1 / power, 1 / power],
-            [1.0, 0.0, 0.0],
-            [0.0, -wide / power**2, lobe / power**2],
-        ]
+        slopes[:3, :3] = [[0.0, 1 / power, 1 / power], [1.0, 0.0, 0.0], [0.0, -wide / power**2, lobe / power**2]]
         return np.array([np.log(power), x, wide / power, *room]), slopes
 
     def variance(self, values: Floats) -> tuple[Floats, float]:
