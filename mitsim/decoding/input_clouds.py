@@ -130,7 +130,7 @@ def read_cloud(
         if stored.size is None:
             return _plain(path, *plain_cloud(stored.points, path, unit, stored.unit))
         try:
-            capture = read_organised_cloud(stored, unit=unit)
+            capture = read_organised_cloud(stored, ReadOptions(unit=unit))
         except InputError as error:
             if not reference:
                 raise _of_import(error) from None

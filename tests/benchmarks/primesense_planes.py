@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from real_uncertainties import smooth_residuals
 
 from mitsim.capture.recordings.organised_cloud import read_organised_cloud
+from mitsim.capture.recordings.read_options import ReadOptions
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decoding.cloud import capture_cloud
@@ -45,7 +46,7 @@ def main(data: Path, blocks: list[int]) -> None:
     warnings.simplefilter("ignore", RuntimeWarning)  # cells without a point
     print(HEAD + "\n| --- | --- | --- | --- | --- | --- | --- |")
     for name, axes in CLOUDS:
-        points = read_organised_cloud(data / "primesense_pcl" / f"{name}.pcd", axes=axes).derived["points"]
+        points = read_organised_cloud(data / "primesense_pcl" / f"{name}.pcd", ReadOptions(axes=axes)).derived["points"]
         rows = windows(np.asarray(points, float), step=20)
         chosen: list[tuple[float, int, int, Floats]] = []
         for one in sorted(rows, key=lambda row: row[0]):

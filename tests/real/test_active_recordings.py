@@ -121,7 +121,7 @@ def test_distance_of_a_wall_through_two_fisheye_lenses(real_data):
     folder = real_data / "oak" / "wall_3470mm"
     if not folder.is_dir():
         pytest.skip("no recording of the wall")
-    capture = read_stereo_pair(folder, folder / calibration, frame=0)
+    capture = read_stereo_pair(folder, ReadOptions(calibration=folder / calibration, frame=0))
     expected = depthai_rig(folder / calibration)
     for name, camera in capture.rig.cameras.items():  # read here by a few lines of their own
         np.testing.assert_array_equal(camera.matrix, expected.cameras[name].matrix)

@@ -16,6 +16,7 @@ import yaml
 from characterisation.files.errors import InputError
 from mitsim.capture.recordings.calibration_file import camera_of, read_calibration
 from mitsim.capture.recordings.depth_image import read_depth_image
+from mitsim.capture.recordings.read_options import ReadOptions
 from mitsim.sensor.preset import load_sensor
 
 SIZE = (640, 480)
@@ -288,8 +289,8 @@ def test_of_several_cameras_of_one_size_one_is_to_be_named(tmp_path):
     cv2.imwrite(str(tmp_path / "depth.png"), np.full(SIZE[::-1], 1000, np.uint16))
     saved(tmp_path / "a.json", colour_and_depth(SIZE))
     with pytest.raises(InputError, match="--camera: found 2 cameras: color 640 x 480 px, depth 640 x 480 px"):
-        read_depth_image(tmp_path / "depth.png", tmp_path / "a.json")
-    capture = read_depth_image(tmp_path / "depth.png", tmp_path / "a.json", camera="depth")
+        read_depth_image(tmp_path / "depth.png", ReadOptions(calibration=tmp_path / "a.json"))
+    capture = read_depth_image(tmp_path / "depth.png", ReadOptions(calibration=tmp_path / "a.json", camera="depth"))
     sees(capture.rig.reference, K, D)
 
 

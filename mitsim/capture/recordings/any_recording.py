@@ -23,17 +23,14 @@ from mitsim.capture.recordings.depth_image import read_depth_image
 from mitsim.capture.recordings.depthai_recording import calibration_beside, read_depthai_recording, recorded_streams
 from mitsim.capture.recordings.ensenso import ensenso_originals, image_sets, read_ensenso
 from mitsim.capture.recordings.image_folder import at_size_of_images, read_image_folder
-from mitsim.capture.recordings.organised_cloud import Axes, StoredCloud, read_organised_cloud
+from mitsim.capture.recordings.organised_cloud import read_organised_cloud
 from mitsim.capture.recordings.pose_file import read_pose, unit_note
 from mitsim.capture.recordings.read_options import ReadOptions
 from mitsim.capture.recordings.recognise import NAMES, kind_of
 from mitsim.capture.recordings.recording_files import frame_of, needs_recordings, plain_name
 from mitsim.capture.recordings.robi import read_robi
 from mitsim.capture.recordings.stereo_pair import read_stereo_pair
-from mitsim.sensor.calibration_qualifiers import LENGTHS_MM
 from mitsim.sensor.preset import load_sensor
-
-AXES: tuple[Axes, ...] = ("opencv", "opengl")
 
 #: what the numbers of a depth image are distances along
 ALONG = ("axis", "ray")
@@ -82,35 +79,17 @@ def _read_images(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, b
 
 
 def _read_pair(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
-    source = _cameras(path, options, "a stereo pair")
-    capture = read_stereo_pair(
-        path,
-        source,
-        frame=options.frame,
-        sensor=options.named,
-        images=options.images,
-        channel=channel_of(options.channel),
-    )
+    capture = read_stereo_pair(path, options)
     kept = [path / name for name in capture.settings["files"].values()]
-    return capture, _originals([*kept, *_file_of(source)])
+    return capture, _originals([*kept, *_file_of(options.cameras)])
 
 
 def _read_depth(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
-    source = _cameras(path, options, "a depth image")
-    capture = read_depth_image(
-        path,
-        source,
-        scale_mm=options.scale_mm,
-        invalid=options.invalid,
-        camera=options.camera,
-        sensor=options.named,
-        frame=frame_of(options.frame, path),
-    )
-    return capture, _originals([path, *_file_of(source)])
+    return read_depth_image(path, options), _originals([path, *_file_of(options.cameras)])
 
 
 def _read_cloud(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
-    capture = _organised(path, options)
+    capture = read_organised_cloud(path, options)
     beside = [*_file_of(options.cameras), *([] if options.link is None else [Path(options.link)])]
     return capture, _originals([path, *beside])
 
@@ -127,33 +106,9 @@ def _read_array(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, by
     return _read_depth(path, options) if is_depth else _read_cloud(path, options)
 
 
-def _organised(cloud: Path | StoredCloud, options: ReadOptions) -> Capture:
-    """Read an organised cloud with the options of all clouds."""
-    axes = next((name for name in AXES if name == (options.axes or AXES[0])), None)
-    if axes is None:
-        raise InputError("--axes", "", repr(options.axes), " | ".join(AXES))
-    if options.unit is not None and options.unit not in LENGTHS_MM:
-        raise InputError("--unit", "", repr(options.unit), " | ".join(LENGTHS_MM))
-    return read_organised_cloud(
-        cloud,
-        calibration=options.cameras,
-        unit=options.unit,
-        axes=axes,
-        link=options.link,
-        camera=options.camera,
-        sensor=options.named,
-    )
-
-
 def _read_depthai(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
-    calibration = Path(options.calibration) if options.calibration else calibration_beside(path)
-    capture = read_depthai_recording(
-        path,
-        calibration,
-        frame=frame_of(options.frame, path),
-        subpixel_bits=options.subpixel_bits,
-        sensor=options.named,
-    )
+    capture = read_depthai_recording(path, options)
+    calibration = Path(options.calibration or calibration_beside(path))
     return capture, _originals([*recorded_streams(path).values(), calibration])
 
 
@@ -165,7 +120,7 @@ def _read_ros(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, byte
     frame = frame_of(options.frame, path)
     numbers: tuple[int, ...] = (frame or 0,)
     if chosen.content == "cloud":
-        capture = _organised(ros_recording.read_ros_cloud(chosen, frame), options)
+        capture = read_organised_cloud(ros_recording.read_ros_cloud(chosen, frame), options)
     elif chosen.content == "pair":
         capture, numbers = ros_recording.read_ros_pair(chosen, frame, options)
     else:
@@ -178,7 +133,7 @@ def _read_ros(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, byte
 
 
 def _read_robi(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
-    capture, files = read_robi(path, options.calibration, frame=frame_of(options.frame, path), sensor=options.named)
+    capture, files = read_robi(path, options)
     return capture, _originals(files)
 
 
@@ -278,12 +233,6 @@ def _options_for_all(options: ReadOptions) -> tuple[dict[str, Any], dict[str, An
             raise InputError("--projector", "", repr(options.projector), "on | off")
         records["projector_on"] = options.projector == "on"
     return decoding, records
-
-
-def _cameras(path: Path, options: ReadOptions, kind: str) -> str:
-    if options.cameras is None:
-        raise InputError(path, "", f"{kind} alone", "the camera that took it: --calibration FILE, or --sensor")
-    return options.cameras
 
 
 def _file_of(source: Any) -> list[Path]:

@@ -26,6 +26,8 @@ from mitsim.capture.npy import NPY_MAGIC
 from mitsim.capture.recordings.array_file import arrays_in, disparities, is_disparity, map_among, unit_of_depths
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
 from mitsim.capture.recordings.cloud_numbers import FAR_BEYOND, FARTHEST_MM, METRES_UNDER, NEITHER_ABOVE
+from mitsim.capture.recordings.read_options import ReadOptions
+from mitsim.capture.recordings.recording_files import frame_of
 from mitsim.capture.recordings.stated_scale import check_scale, stated_scales
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.png import LONGEST_SIDE_PX
@@ -39,45 +41,22 @@ _DISPARITIES = re.compile(r"disp(?:arit(?:y|ies))?s?(?![a-z])", re.IGNORECASE)
 _MARKED = 0.01
 
 
-def read_depth_image(
-    path: str | Path,
-    calibration: str | Path,
-    *,
-    scale_mm: float | None = None,
-    invalid: int | None = None,
-    camera: str | None = None,
-    sensor: str | None = None,
-    frame: int | None = None,
-) -> Capture:
-    """Read one depth image.
+def read_depth_image(path: str | Path, options: ReadOptions) -> Capture:
+    """Read one depth image, or one of several in a file of NumPy.
 
-    Raises InputError if the image or the calibration cannot be read, the image has 8 bits, its size differs from the
-    camera's, or it has disparities or an unknown unit.
-
-    Parameters
-    ----------
-    path
-        Path of the image.
-    calibration
-        A preset's name or a file, see :mod:`mitsim.capture.recordings.calibration_file`.
-    scale_mm
-        Depth of one level [mm]; by default 1, or 1000 for floating point with a median under
-        :data:`~mitsim.capture.recordings.cloud_numbers.METRES_UNDER`.
-    invalid
-        Level of missing depths, beside 0, the largest one of 16 bits, and those under 0 or far beyond all others.
-    camera
-        Name of the camera in the calibration; by default the first.
-    sensor
-        Name of the sensor; by default that of the calibration, or ``depth-camera``.
-    frame
-        Number of one of several images in a file of NumPy, from 0.
+    The depth of one level is by default 1 mm, or 1000 mm for floating point with a median under
+    :data:`~mitsim.capture.recordings.cloud_numbers.METRES_UNDER`. Depths are missing at the level ``invalid``, at 0 and
+    the largest one of 16 bits, and where they are under 0 or far beyond all others. Raises InputError if no camera is
+    given, the image or the calibration cannot be read, the image has 8 bits, its size differs from the camera's, or it
+    has disparities or an unknown unit.
     """
     path = Path(path)
+    calibration, frame = options.cameras_of(path, "a depth image"), frame_of(options.frame, path)
     of_disparities = _DISPARITIES.match(path.resolve().parent.name) and "depth" not in path.stem.lower()
     if of_disparities or is_disparity(path.stem):
         raise disparities(path)
     image, beside, unit_mm = _levels(path, frame)
-    scale_mm = scale_mm or unit_mm
+    scale_mm, invalid = options.scale_mm or unit_mm, options.invalid
     if image.dtype == np.uint8:
         hint = "an 8-bit picture has lost its depths: save the device's 16 bits"
         raise InputError(path, "depth", "8 bits", "16 bits", hint)
@@ -106,7 +85,7 @@ def read_depth_image(
     if assumed and image.dtype.kind != "f":
         check_scale(beside, path)
         check_scale(read.depth_scales, calibration)
-    return depth_capture(depth, read, path, settings, camera=camera, sensor=sensor)
+    return depth_capture(depth, read, path, settings, camera=options.camera, sensor=options.named)
 
 
 def missing_depths(image: NDArray[Any], invalid: int = 0) -> tuple[NDArray[np.bool_], list[str]]:

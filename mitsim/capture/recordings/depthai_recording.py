@@ -33,7 +33,8 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.capture.recordings.depth_image import missing_depths
 from mitsim.capture.recordings.depthai_calibration import DepthaiCalibration, read_depthai_calibration
-from mitsim.capture.recordings.recording_files import needs_recordings
+from mitsim.capture.recordings.read_options import ReadOptions
+from mitsim.capture.recordings.recording_files import frame_of, needs_recordings
 from mitsim.sensor.camera import Camera, Rig, stereo_rectification
 from mitsim.sensor.transforms import Transform
 
@@ -85,36 +86,17 @@ def recorded_streams(path: str | Path) -> dict[str, Path]:
     return streams
 
 
-def read_depthai_recording(
-    path: str | Path,
-    calibration: str | Path | None = None,
-    *,
-    frame: int | None = None,
-    subpixel_bits: int | None = None,
-    sensor: str | None = None,
-) -> Capture:
-    """Read one frame of a recording.
+def read_depthai_recording(path: str | Path, options: ReadOptions) -> Capture:
+    """Read one frame of a recording: an .mcap file, or a folder of them, one for each stream.
 
-    Raises InputError if a file is missing, damaged or lossily compressed, or not of the calibration and its camera.
-    Raises MissingEnvironmentError without the packages of the extra ``recordings``.
-
-    Parameters
-    ----------
-    path
-        An .mcap file, or a folder of them, one for each stream.
-    calibration
-        JSON as DepthAI saves it; by default ``calibration.json`` or the only ``*calib*.json`` beside the streams.
-    frame
-        Number of the frame, counted from 0; required if there are several.
-    subpixel_bits
-        n of a disparity in units of 1/2^n px.
-    sensor
-        Name of the sensor; by default that of the calibration.
+    The calibration is JSON as DepthAI saves it; by default ``calibration.json`` or the only ``*calib*.json`` beside the
+    streams. Raises InputError if a file is missing, damaged or lossily compressed, or not of the calibration and its
+    camera. Raises MissingEnvironmentError without the packages of the extra ``recordings``.
     """
     path = Path(path)
     streams = recorded_streams(path)
-    device_calibration = read_depthai_calibration(calibration or calibration_beside(path))
-    frames = _read_frames(streams, frame)
+    device_calibration = read_depthai_calibration(options.calibration or calibration_beside(path))
+    frames = _read_frames(streams, frame_of(options.frame, path))
     for stream, one in frames.items():
         socket = device_calibration.right if stream == "right" else device_calibration.left
         if one.socket not in (0, socket):
@@ -131,7 +113,7 @@ def read_depthai_recording(
     }
     if first.exposure_s > 0:
         settings["sensitivity_iso"] = first.sensitivity_iso
-    derived = _derived(frames, device_calibration, subpixel_bits, settings)
+    derived = _derived(frames, device_calibration, options.subpixel_bits, settings)
     images: dict[str, NDArray[Any]] = {}
     if {"left", "right"} <= set(frames):
         technology, settings["measured_from"] = "active_stereo", "raw pair"
@@ -146,7 +128,7 @@ def read_depthai_recording(
     else:
         raise InputError(path, ", ".join(streams), "a single image", "left and right, disparity, or depth")
     return Capture(
-        sensor=sensor or device_calibration.name,
+        sensor=options.named or device_calibration.name,
         technology=technology,
         source="replay",
         rig=rig,

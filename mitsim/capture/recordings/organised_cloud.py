@@ -18,7 +18,7 @@ import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,13 +36,15 @@ from mitsim.capture.recordings.nxlib_calibration import NxLibTree, link_of, sens
 from mitsim.capture.recordings.pcd import decode_pcd
 from mitsim.capture.recordings.pinhole_fit import fit_pinhole, grid_of, off_the_rays
 from mitsim.capture.recordings.ply import decode_ply
+from mitsim.capture.recordings.read_options import ReadOptions
 from mitsim.capture.recordings.zdf import HDF5_MAGIC, read_zdf
-from mitsim.sensor.calibration_qualifiers import check_camera
+from mitsim.sensor.calibration_qualifiers import LENGTHS_MM, check_camera
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.transforms import Transform
 
 Points = NDArray[np.float32]
-Axes = Literal["opencv", "opengl"]
+#: directions of the axes of a cloud: x right, y down, z forward; or y up and z backward
+AXES = ("opencv", "opengl")
 
 #: largest accepted median distance of the points from the pixels of a given camera [px]; assumed
 CAMERA_OFF_PX = 1.0
@@ -137,47 +139,28 @@ def _of_npy(path: Path, data: bytes) -> StoredCloud:
     return StoredCloud(path, points, (values.shape[1], values.shape[0]), {}, note=note)
 
 
-def read_organised_cloud(
-    path: str | Path | StoredCloud,
-    *,
-    calibration: str | Path | None = None,
-    unit: str | None = None,
-    axes: Axes = "opencv",
-    link: str | Path | None = None,
-    camera: str | None = None,
-    sensor: str | None = None,
-) -> Capture:
-    """Read one PLY or PCD file.
+def read_organised_cloud(path: str | Path | StoredCloud, options: ReadOptions) -> Capture:
+    """Read an organised cloud of a file, or the one that was read from it.
 
-    Raises InputError if the file is damaged or has no grid, or no camera at the origin sees its points on the pixels of
-    the grid.
-
-    Parameters
-    ----------
-    path
-        Path of the file, or the cloud that was read from it.
-    calibration
-        The camera of the grid, see :mod:`mitsim.capture.recordings.calibration_file`; by default a pinhole is fitted.
-        With a rectification, the grid may also be that of the rectified left image, at full or reduced size.
-    unit
-        One of :data:`~mitsim.sensor.calibration_qualifiers.LENGTHS_MM`; by default that of the file, else metres if the
-        median distance is under :data:`~mitsim.capture.recordings.cloud_numbers.METRES_UNDER`, else millimetres.
-    axes
-        ``opencv``: x right, y down, z forward; ``opengl``: y up and z backward, which is converted.
-    link
-        The ``*_calib.json`` of an Ensenso whose ``Link`` transformed the points. It is inverted, and the points are
-        rotated from the rectified left frame to the sensor frame.
-    camera
-        Name of the camera in the calibration; by default the first.
-    sensor
-        Name of the sensor; by default that of the calibration, or ``point-cloud``.
+    Without a calibration, a pinhole is fitted. If a calibration has a rectification, the grid may also be that of the
+    rectified left image, at full or reduced size. The unit is by default that of the file, else metres if the median
+    distance is under :data:`~mitsim.capture.recordings.cloud_numbers.METRES_UNDER`, else millimetres. Axes of
+    ``opengl`` are converted to ``opencv``. ``link``, the ``*_calib.json`` of an Ensenso whose ``Link`` transformed the
+    points, is inverted, and the points are rotated from the rectified left frame to the sensor frame. Raises InputError
+    if the file is damaged or has no grid, or no camera at the origin sees its points on the pixels of the grid.
     """
+    axes, link, camera = options.axes or AXES[0], options.link, options.camera
+    if axes not in AXES:
+        raise InputError("--axes", "", repr(axes), " | ".join(AXES))
+    if options.unit is not None and options.unit not in LENGTHS_MM:
+        raise InputError("--unit", "", repr(options.unit), " | ".join(LENGTHS_MM))
+    sensor = options.named
     stored = path if isinstance(path, StoredCloud) else read_stored_cloud(Path(path))
     path = stored.path
-    points, calibrated = _on_grid(stored, calibration, camera)
+    points, calibrated = _on_grid(stored, options.cameras, camera)
     settings: dict[str, Any] = {"imported_from": path.name, "axes_of_file": axes} | stored.records
     points[points[..., 2] == 0] = np.nan  # in the plane of the optical centre
-    settings["unit_of_file"], _ = scale_to_mm(points, path, unit or stored.unit, "check --unit")
+    settings["unit_of_file"], _ = scale_to_mm(points, path, options.unit or stored.unit, "check --unit")
     count = int(np.isfinite(points[..., 0]).sum())
     if count < LEAST_POINTS and calibrated is None:
         raise InputError(path, "", f"{count} points", f"{LEAST_POINTS} or more")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
+from characterisation.files.errors import InputError
 from mitsim.sensor.preset import named_sensor
 
 
@@ -54,3 +56,12 @@ class ReadOptions:
     def cameras(self) -> str | None:
         """Return the source of the cameras: the calibration, else the sensor."""
         return self.calibration or self.sensor
+
+    def cameras_of(self, path: str | Path, kind: str) -> str:
+        """Return the source of the cameras of a recording, such as ``a stereo pair``, which needs one.
+
+        Raises InputError if none is given.
+        """
+        if self.cameras is None:
+            raise InputError(path, "", f"{kind} alone", "the camera that took it: --calibration FILE, or --sensor")
+        return self.cameras

@@ -27,7 +27,8 @@ from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_image import read_grey
 from mitsim.capture.recordings.depth_image import missing_depths
 from mitsim.capture.recordings.json_fields import JsonFields, nearest_rotation, parsed_json
-from mitsim.capture.recordings.recording_files import chosen_frame
+from mitsim.capture.recordings.read_options import ReadOptions
+from mitsim.capture.recordings.recording_files import chosen_frame, frame_of
 from mitsim.sensor.calibration_qualifiers import check_camera
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.transforms import Transform
@@ -53,30 +54,20 @@ def is_robi(folder: Path) -> bool:
     return (folder / "list.txt").is_file() and (folder / "StereoPattern").is_dir()
 
 
-def read_robi(
-    folder: str | Path, calibration: str | Path | None = None, *, frame: int | None = None, sensor: str | None = None
-) -> tuple[Capture, list[Path]]:
-    """Read one view, and list its files.
+def read_robi(folder: str | Path, options: ReadOptions) -> tuple[Capture, list[Path]]:
+    """Read one view of ``Scene_N/Ensenso`` or ``Scene_N/RealSense``, and list its files.
 
-    Raises InputError if a file is missing or invalid, or there are several views and none was chosen.
-
-    Parameters
-    ----------
-    folder
-        ``Scene_N/Ensenso`` or ``Scene_N/RealSense``.
-    calibration
-        The folder with ``<sensor>_LEFT.yml`` etc.; by default ``cam`` in one of the parent folders.
-    frame
-        Number of the view in ``list.txt``, counted from 0; required if there are several.
-    sensor
-        Name of the sensor; by default the folder's.
+    The calibration is the folder with ``<sensor>_LEFT.yml`` etc.; by default ``cam`` in one of the parent folders.
+    ``frame`` is the number of the view in ``list.txt``. Raises InputError if a file is missing or invalid, or there are
+    several views and none was chosen.
     """
     folder = Path(folder)
+    frame, sensor = frame_of(options.frame, folder), options.named
     views = read_bounded(folder / "list.txt").decode("utf-8", "replace").split()
     if not views:
         raise InputError(folder / "list.txt", "", "no view", "the names of the views, one per line: view_0")
     view = views[chosen_frame(frame, len(views), folder, "views of list.txt")]
-    where = _calibrations(folder, calibration)
+    where = _calibrations(folder, options.calibration)
     files = {
         "left": folder / "StereoPattern" / f"LEFT_{view}.bmp",
         "right": folder / "StereoPattern" / f"RIGHT_{view}.bmp",

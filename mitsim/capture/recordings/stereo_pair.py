@@ -16,9 +16,19 @@ import numpy as np
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
-from mitsim.capture.grey_image import CHANNELS, SUFFIXES, Image, bits_of, channel_name, from_bit_0, is_colour, read_grey
+from mitsim.capture.grey_image import (
+    SUFFIXES,
+    Image,
+    bits_of,
+    channel_name,
+    channel_of,
+    from_bit_0,
+    is_colour,
+    read_grey,
+)
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
 from mitsim.capture.recordings.image_folder import at_size_of_images
+from mitsim.capture.recordings.read_options import ReadOptions
 from mitsim.capture.recordings.recording_files import chosen_frame, frame_of
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.projector_images import counted
@@ -32,39 +42,19 @@ _POSE = (
 )
 
 
-def read_stereo_pair(
-    folder: str | Path,
-    calibration: str | Path,
-    *,
-    frame: int | str | None = None,
-    sensor: str | None = None,
-    images: dict[str, str] | None = None,
-    channel: int = CHANNELS["green"],
-) -> Capture:
-    """Read one pair of a folder.
+def read_stereo_pair(folder: str | Path, options: ReadOptions) -> Capture:
+    """Read one pair of a folder of images whose names begin with those of the two cameras: ``left_0.png``.
 
-    Raises InputError if an image is missing or does not fit the calibration, or there are several pairs and none was
-    chosen.
-
-    Parameters
-    ----------
-    folder
-        With images whose names begin with those of the two cameras: ``left_0.png``, ``right_0.png``.
-    calibration
-        Of two cameras, the left one first, see :mod:`mitsim.capture.recordings.calibration_file`.
-    frame
-        Number of the pair, counted from 0, or the name of its left image; required if there are several.
-    sensor
-        Name of the sensor; by default that of the calibration, or ``stereo-pair``.
-    images
-        Patterns of file names for cameras whose images are not named after them.
-    channel
-        Channel of colour images that is used.
+    The calibration has two cameras, the left one first; ``images`` are patterns of file names for cameras whose images
+    are not named after them. ``frame`` is the number of the pair, counted from 0, or the name of its left image. Raises
+    InputError if an image is missing or does not fit the calibration, or there are several pairs and none was chosen.
     """
     folder = Path(folder)
+    calibration, frame, sensor = options.cameras_of(folder, "a stereo pair"), options.frame, options.named
+    channel = channel_of(options.channel)
     calibrated = at_size_of_images(folder, lambda size: read_calibration(calibration, size))  # for the names alone
     names = names_of_pair(calibrated, calibration)
-    files = {name: pair_files(folder, name, (images or {}).get(name)) for name in names}
+    files = {name: pair_files(folder, name, (options.images or {}).get(name)) for name in names}
     counts = [len(paths) for paths in files.values()]
     if counts[0] != counts[1] or counts[0] == 0:
         found = " and ".join(f"{len(paths)} of {name}" for name, paths in files.items())

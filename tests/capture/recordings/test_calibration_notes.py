@@ -13,6 +13,7 @@ from characterisation.files.errors import InputError
 from mitsim.capture.folder import read_capture
 from mitsim.capture.recordings.calibration_file import read_calibration
 from mitsim.capture.recordings.depth_image import read_depth_image
+from mitsim.capture.recordings.read_options import ReadOptions
 from mitsim.cli.program import app
 from tests.capture.recordings.cloud_files_of_others import pcd, pinhole_cloud
 
@@ -76,7 +77,7 @@ def test_a_wall_seen_by_a_part_of_the_imager(tmp_path):
         f"  data: [60.0, 0.0, {WIDTH + 31.5}, 0.0, 60.0, {HEIGHT + 23.5}, 0.0, 0.0, 1.0]\n"
         f"roi:\n  x_offset: {WIDTH}\n  y_offset: {HEIGHT}\n  height: {HEIGHT}\n  width: {WIDTH}\n"
     )
-    capture = read_depth_image(tmp_path / "depth.png", tmp_path / "info.yaml")
+    capture = read_depth_image(tmp_path / "depth.png", ReadOptions(calibration=tmp_path / "info.yaml"))
     middle = capture.rig.reference.rays(np.array([[31.5, 23.5]]))[0]
     np.testing.assert_allclose(middle, [0, 0, 1], atol=1e-12)
     assert "principal point 95.5, 71.5 of the full imager, 31.5, 23.5 of the images" in capture.settings["warnings"][0]
@@ -88,7 +89,7 @@ def test_images_scaled_from_the_calibrated_size_get_the_optics_to_write(tmp_path
         "camera_matrix: [[120., 0., 63.5], [0., 120., 47.5], [0., 0., 1.]]\nimage_width: 128\nimage_height: 96\n"
     )
     with pytest.raises(InputError, match="found 64 x 48 px; allowed: 128 x 96 px") as caught:
-        read_depth_image(tmp_path / "depth.png", tmp_path / "calib.yml")
+        read_depth_image(tmp_path / "depth.png", ReadOptions(calibration=tmp_path / "calib.yml"))
     assert "focal_px = [60.0, 60.0], principal_px = [31.5, 23.5]" in caught.value.hint
 
 

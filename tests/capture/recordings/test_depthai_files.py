@@ -31,6 +31,7 @@ from mitsim.capture.recordings.depthai_calibration import DepthaiCalibration, re
 from mitsim.capture.recordings.depthai_frames import RecordedFrame, read_frames
 from mitsim.capture.recordings.depthai_recording import read_depthai_recording
 from mitsim.capture.recordings.mcap_messages import mcap_messages
+from mitsim.capture.recordings.read_options import ReadOptions
 from mitsim.decoding.cloud import capture_cloud, decoder_settings
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.transforms import Transform
@@ -236,8 +237,8 @@ def only(recorded, place: Path, *names: str) -> Path:
 def test_a_recorded_pair_comes_back_bit_by_bit_with_the_devices_maps_beside(recorded, tmp_path):
     folder, streams = recorded
     with pytest.raises(InputError, match=r"3 frames; allowed: one in a capture.*choose with --frame 0 to 2"):
-        read_depthai_recording(folder)
-    capture = read_depthai_recording(folder, frame=1)
+        read_depthai_recording(folder, ReadOptions())
+    capture = read_depthai_recording(folder, ReadOptions(frame=1))
     assert (capture.technology, capture.source, capture.sensor) == ("active_stereo", "replay", "OAK-D-TEST")
     for side in ("left", "right"):
         np.testing.assert_array_equal(capture.images[side][0], streams[side][1])
@@ -252,7 +253,7 @@ def test_a_recorded_pair_comes_back_bit_by_bit_with_the_devices_maps_beside(reco
 
 def test_disparity_goes_before_depth_and_is_triangulated_with_the_calibrated_baseline(recorded, tmp_path):
     """The depth beside it was made with the designed 75 mm: it tells how disparity is counted, and nothing else."""
-    capture = read_depthai_recording(only(recorded, tmp_path / "r", "disparity", "depth"), frame=2)
+    capture = read_depthai_recording(only(recorded, tmp_path / "r", "disparity", "depth"), ReadOptions(frame=2))
     assert (capture.technology, capture.settings["measured_from"]) == ("disparity_map", "disparity")
     assert (capture.settings["subpixel_bits"], capture.settings["subpixel_bits_from"]) == (3, "depth")
     cloud = capture_cloud(capture, decoder_settings(capture)[0])
@@ -264,7 +265,7 @@ def test_disparity_goes_before_depth_and_is_triangulated_with_the_calibrated_bas
 
 def test_depth_alone_is_taken_as_it_is_and_says_so(recorded, tmp_path):
     folder = only(recorded, tmp_path / "r", "depth")
-    capture = read_depthai_recording(folder / "depth.mcap", frame=0)
+    capture = read_depthai_recording(folder / "depth.mcap", ReadOptions(frame=0))
     assert (capture.technology, capture.settings["measured_from"]) == ("depth_map", "device depth")
     cloud = capture_cloud(capture, decoder_settings(capture)[0])
     raw = recorded[1]["depth"][0]
@@ -285,7 +286,7 @@ def test_the_largest_level_of_the_devices_depth_is_no_depth(recorded, monkeypatc
         return frames | {"depth": replace(frames["depth"], image=levels)}
 
     monkeypatch.setattr(depthai_recording, "_read_frames", saturated)
-    capture = read_depthai_recording(recorded[0], frame=1)
+    capture = read_depthai_recording(recorded[0], ReadOptions(frame=1))
     missing = recorded[1]["depth"][1] == 0
     missing[20, 50] = True
     np.testing.assert_array_equal(np.isnan(capture.derived["depth"]), missing)
@@ -294,8 +295,8 @@ def test_the_largest_level_of_the_devices_depth_is_no_depth(recorded, monkeypatc
 
 def test_how_disparity_is_counted_is_told_or_assumed(recorded, tmp_path):
     folder = only(recorded, tmp_path / "r", "disparity")
-    told = read_depthai_recording(folder, frame=0, subpixel_bits=3)
-    assumed = read_depthai_recording(folder, frame=0)
+    told = read_depthai_recording(folder, ReadOptions(frame=0, subpixel_bits=3))
+    assumed = read_depthai_recording(folder, ReadOptions(frame=0))
     assert (told.settings["subpixel_bits_from"], assumed.settings["subpixel_bits_from"]) == ("option", "default")
     np.testing.assert_array_equal(told.derived["disparity"], assumed.derived["disparity"] * 4)
 
@@ -307,10 +308,10 @@ def test_damage_is_refused(recorded, tmp_path):
     content[len(content) // 3] ^= 1
     file.write_bytes(content)
     with pytest.raises(InputError, match=r"depth\.mcap: byte \d+: found a damaged record"):
-        read_depthai_recording(folder, frame=0)
+        read_depthai_recording(folder, ReadOptions(frame=0))
     file.write_bytes(content[:-100])
     with pytest.raises(InputError, match="truncated"):
-        read_depthai_recording(folder, frame=0)
+        read_depthai_recording(folder, ReadOptions(frame=0))
 
 
 FRAMES = {"uint8": (np.uint8, False), "uint8, grey": (np.uint8, True), "uint16": (np.uint16, False)}
@@ -374,7 +375,7 @@ def test_recordings_packed_in_other_ways_hold_the_same_frames(recorded, tmp_path
 
 def test_reading_needs_no_depthai(recorded, monkeypatch):
     monkeypatch.setitem(sys.modules, "depthai", None)
-    assert read_depthai_recording(recorded[0], frame=0).technology == "active_stereo"
+    assert read_depthai_recording(recorded[0], ReadOptions(frame=0)).technology == "active_stereo"
 
 
 @settings(max_examples=400)
@@ -539,7 +540,7 @@ def test_any_description_and_any_message_are_read_or_refused_in_words(recorded, 
         file.write_bytes(content)
         save(Path(place) / "calibration.json", calibration())
         try:
-            capture = read_depthai_recording(file, frame=0)
+            capture = read_depthai_recording(file, ReadOptions(frame=0))
         except InputError as error:
             assert error.where == str(file)
         else:
@@ -549,18 +550,18 @@ def test_any_description_and_any_message_are_read_or_refused_in_words(recorded, 
 def test_videos_and_doubtful_folders_are_refused(tmp_path):
     save(tmp_path / "calibration.json", calibration())
     with pytest.raises(InputError, match=r"no \.mcap; allowed: files whose names say left"):
-        read_depthai_recording(tmp_path)
+        read_depthai_recording(tmp_path, ReadOptions())
     (tmp_path / "left.mp4").write_bytes(b"")
     with pytest.raises(InputError, match=r"found a video.*compressed with loss"):
-        read_depthai_recording(tmp_path)
+        read_depthai_recording(tmp_path, ReadOptions())
     for name in ("left.mcap", "CAM_B_raw.mcap", "rectifiedLeft.mcap"):
         (tmp_path / name).write_bytes(b"")
     with pytest.raises(InputError, match=r"left: found CAM_B_raw\.mcap and left\.mcap; allowed: one file"):
-        read_depthai_recording(tmp_path)
+        read_depthai_recording(tmp_path, ReadOptions())
     (tmp_path / "CAM_B_raw.mcap").unlink()
     (tmp_path / "calibration.json").rename(tmp_path / "elsewhere.json")
     with pytest.raises(InputError, match="one calibration beside the recording"):
-        read_depthai_recording(tmp_path)
+        read_depthai_recording(tmp_path, ReadOptions())
 
 
 def test_without_the_extra_other_recordings_load_and_these_say_what_to_install(recorded):
@@ -600,10 +601,10 @@ def test_a_map_of_another_camera_is_refused(recorded, tmp_path, name, socket, is
     file = folder / f"{name}.mcap"
     file.write_bytes(changed(file.read_bytes(), instanceNum=socket))
     if is_read:
-        assert read_depthai_recording(folder, frame=0).derived[name].any()
+        assert read_depthai_recording(folder, ReadOptions(frame=0)).derived[name].any()
         return
     with pytest.raises(InputError, match="instanceNum: found 2; allowed: the camera at socket 1"):
-        read_depthai_recording(folder, frame=0)
+        read_depthai_recording(folder, ReadOptions(frame=0))
 
 
 def test_depth_and_disparity_have_one_frame():

@@ -61,7 +61,7 @@ def decoded(capture: Capture, folder: Path):
 def test_a_cloud_comes_out_as_it_went_in_and_brings_its_camera(tmp_path, name):
     kind, _, ending = name.partition(".")
     content = pcd(CLOUD, kind) if ending == "pcd" else ply(CLOUD, kind)
-    capture = read_organised_cloud(save(tmp_path / name, content))
+    capture = read_organised_cloud(save(tmp_path / name, content), ReadOptions())
     assert (capture.technology, capture.source, capture.sensor) == ("point_map", "device", "point-cloud")
     assert capture.settings["unit_of_file"] == "mm"
     # float32 points: 6e-8 of 60 px
@@ -76,10 +76,10 @@ def test_a_cloud_comes_out_as_it_went_in_and_brings_its_camera(tmp_path, name):
 
 def test_units_are_told_by_the_distance_or_by_the_user(tmp_path):
     metres = save(tmp_path / "m.pcd", pcd(CLOUD / 1000, "binary"))
-    capture = read_organised_cloud(metres)
+    capture = read_organised_cloud(metres, ReadOptions())
     assert capture.settings["unit_of_file"] == "m"
     np.testing.assert_allclose(capture.derived["points"], CLOUD, rtol=1e-6)
-    forced = read_organised_cloud(metres, unit="cm")
+    forced = read_organised_cloud(metres, ReadOptions(unit="cm"))
     np.testing.assert_allclose(forced.derived["points"], CLOUD / 100, rtol=1e-6)
 
 
@@ -88,11 +88,11 @@ def test_coordinates_that_are_no_measurement_are_refused(tmp_path, value, unit):
     points = CLOUD.copy()
     points[5, 5] = value
     with pytest.raises(InputError, match=r"up to 1e\+06 mm\. check --unit"):
-        read_organised_cloud(save(tmp_path / "far.pcd", pcd(points, "binary")), unit=unit)
+        read_organised_cloud(save(tmp_path / "far.pcd", pcd(points, "binary")), ReadOptions(unit=unit))
 
 
 def test_zeros_are_no_points(tmp_path):
-    capture = read_organised_cloud(save(tmp_path / "z.pcd", pcd(np.nan_to_num(CLOUD), "binary")))
+    capture = read_organised_cloud(save(tmp_path / "z.pcd", pcd(np.nan_to_num(CLOUD), "binary")), ReadOptions())
     np.testing.assert_array_equal(capture.derived["points"], CLOUD)
 
 
@@ -105,17 +105,17 @@ def test_points_that_stand_for_missing_ones_leave_the_grid(tmp_path, ending, mar
     if mark[2] == 0:  # pixels without a depth, whose x and y the program keeps
         points[np.isnan(CLOUD[..., 0]), 0] = np.arange(np.isnan(CLOUD[..., 0]).sum())
     content = pcd(points, "binary") if ending == "pcd" else ply(points, "binary_little_endian", grid="none")
-    capture = read_organised_cloud(save(tmp_path / f"a.{ending}", content))
+    capture = read_organised_cloud(save(tmp_path / f"a.{ending}", content), ReadOptions())
     np.testing.assert_array_equal(capture.derived["points"], CLOUD)
     assert ("left out, since" in str(capture.settings.get("warnings"))) == (mark[2] != 0)
 
 
 def test_the_unit_in_a_remark_of_a_ply_counts(tmp_path):
     content = ply(CLOUD * 1000, "ascii").replace(b"\nelement", b"\ncomment units: micrometers\nelement", 1)
-    capture = read_organised_cloud(save(tmp_path / "a.ply", content))
+    capture = read_organised_cloud(save(tmp_path / "a.ply", content), ReadOptions())
     assert capture.settings["unit_of_file"] == "um"
     np.testing.assert_allclose(capture.derived["points"], CLOUD, rtol=1e-6)
-    given = read_organised_cloud(tmp_path / "a.ply", unit="mm")
+    given = read_organised_cloud(tmp_path / "a.ply", ReadOptions(unit="mm"))
     assert given.settings["unit_of_file"] == "mm"
 
 
@@ -131,15 +131,15 @@ def test_options_of_depths_and_of_points_are_told_apart(tmp_path):
 def test_clouds_with_y_up_are_refused_or_turned(tmp_path):
     path = save(tmp_path / "up.pcd", pcd(CLOUD * np.array([1, -1, -1], np.float32), "binary"))
     with pytest.raises(InputError, match=r"behind the camera.*--axes opengl"):
-        read_organised_cloud(path)
-    np.testing.assert_array_equal(read_organised_cloud(path, axes="opengl").derived["points"], CLOUD)
+        read_organised_cloud(path, ReadOptions())
+    np.testing.assert_array_equal(read_organised_cloud(path, ReadOptions(axes="opengl")).derived["points"], CLOUD)
 
 
 @pytest.mark.parametrize("mirrored", [[-1, 1, 1], [1, -1, 1]])
 def test_mirrored_clouds_are_refused(tmp_path, mirrored):
     path = save(tmp_path / "left.pcd", pcd(CLOUD * np.array(mirrored, np.float32), "binary"))
     with pytest.raises(InputError, match="points that match no camera at the origin"):
-        read_organised_cloud(path)
+        read_organised_cloud(path, ReadOptions())
 
 
 def test_a_cloud_in_a_workspace_is_refused_and_its_link_undone(tmp_path):
@@ -150,7 +150,7 @@ def test_a_cloud_in_a_workspace_is_refused_and_its_link_undone(tmp_path):
     moved = rectified_from_workspace.inverse().points(CLOUD).astype(np.float32)
     path = save(tmp_path / "w.pcd", pcd(moved, "binary"))
     with pytest.raises(InputError, match="workspace"):
-        read_organised_cloud(path)
+        read_organised_cloud(path, ReadOptions())
     angle = float(np.linalg.norm(turn.as_rotvec()))
     link = {
         "Target": "Workspace",
@@ -159,7 +159,7 @@ def test_a_cloud_in_a_workspace_is_refused_and_its_link_undone(tmp_path):
     }
     calibration = {"Stereo": {"Left": {"Rotation": rectified_from_left.T.tolist()}}}  # stored by columns
     calib = save(tmp_path / "1_2_calib.json", json.dumps({"Link": link, "Calibration": calibration}).encode())
-    capture = read_organised_cloud(path, link=calib)
+    capture = read_organised_cloud(path, ReadOptions(link=calib))
     np.testing.assert_allclose(capture.derived["points"], CLOUD @ rectified_from_left, atol=1e-3)
     np.testing.assert_allclose(capture.rig.reference.sensor_from_camera.rotation, rectified_from_left.T, atol=1e-12)
     sensor_from_workspace = Transform.from_matrix(capture.settings["sensor_from_workspace"])
@@ -169,21 +169,21 @@ def test_a_cloud_in_a_workspace_is_refused_and_its_link_undone(tmp_path):
     np.testing.assert_allclose(seen, np.stack([columns, rows], axis=-1), atol=2e-3)
     bare = save(tmp_path / "3_4_calib.json", json.dumps({"Link": link}).encode())
     with pytest.raises(InputError, match="Calibration/Stereo/Left/Rotation: found nothing"):
-        read_organised_cloud(path, link=bare)
+        read_organised_cloud(path, ReadOptions(link=bare))
 
 
 def test_clouds_that_state_no_grid_have_the_one_of_their_points_or_are_refused(tmp_path):
     for name, content in (("a.ply", ply(CLOUD, grid="none")), ("b.pcd", pcd(CLOUD, "binary", height=1))):
         path = save(tmp_path / name, content)
         for calibration in (None, pinhole(tmp_path)):
-            capture = read_organised_cloud(path, calibration=calibration)
+            capture = read_organised_cloud(path, ReadOptions(calibration=calibration))
             np.testing.assert_array_equal(capture.derived["points"], CLOUD)
     held = np.isfinite(CLOUD[..., 0])
     for name, content in (("a.ply", ply(CLOUD[held][None], grid="none")), ("b.pcd", pcd(CLOUD[held][None], "binary"))):
         with pytest.raises(InputError, match=r"without a grid.*--calibration"):
-            read_organised_cloud(save(tmp_path / name, content))
+            read_organised_cloud(save(tmp_path / name, content), ReadOptions())
         with pytest.raises(InputError, match=f"{held.sum()} points; allowed: 64 x 48"):
-            read_organised_cloud(tmp_path / name, calibration=pinhole(tmp_path))
+            read_organised_cloud(tmp_path / name, ReadOptions(calibration=pinhole(tmp_path)))
 
 
 def test_a_lens_with_distortion_is_fitted_or_given(tmp_path):
@@ -192,17 +192,19 @@ def test_a_lens_with_distortion_is_fitted_or_given(tmp_path):
     local = camera.rays(camera.pixel_grid())
     points = (local / local[..., 2:] * CLOUD[..., 2:]).astype(np.float32)
     path = save(tmp_path / "d.pcd", pcd(points, "binary"))
-    assert read_organised_cloud(path).rig.reference.distortion[:2] == pytest.approx([-0.2, 0.05], abs=1e-2)
+    assert read_organised_cloud(path, ReadOptions()).rig.reference.distortion[:2] == pytest.approx(
+        [-0.2, 0.05], abs=1e-2
+    )
     shifted = save(tmp_path / "e.pcd", pcd(points + np.float32([30, 0, 0]), "binary"))
     with pytest.raises(InputError, match=r"points that match no camera at the origin: .* px rms.*--calibration"):
-        read_organised_cloud(shifted)
-    capture = read_organised_cloud(path, calibration=pinhole(tmp_path, distortion=[-0.2, 0.05, 0, 0, 0]))
+        read_organised_cloud(shifted, ReadOptions())
+    capture = read_organised_cloud(path, ReadOptions(calibration=pinhole(tmp_path, distortion=[-0.2, 0.05, 0, 0, 0])))
     assert capture.settings["off_the_rays_px"] < 1e-3
     cloud = decoded(capture, tmp_path / "c")
     seen, pixels = camera.project(cloud.points[cloud.valid].astype(float)), camera.pixel_grid()[cloud.valid]
     np.testing.assert_allclose(seen, pixels, atol=1e-3)
     with pytest.raises(InputError, match="px from the view rays of their pixels"):
-        read_organised_cloud(path, calibration=pinhole(tmp_path, cx=35.0))
+        read_organised_cloud(path, ReadOptions(calibration=pinhole(tmp_path, cx=35.0)))
 
 
 DAMAGED = {
@@ -268,7 +270,9 @@ def depth_png(folder: Path, depth: np.ndarray, name: str = "depth.png") -> Path:
 @pytest.mark.parametrize(("scale", "invalid"), [(1.0, 0), (0.1, 0), (0.5, 65535)])
 def test_a_depth_image_becomes_points_on_its_cameras_rays(tmp_path, name, scale, invalid):
     levels = np.where(np.isfinite(CLOUD[..., 2]), np.rint(CLOUD[..., 2] / scale), invalid).astype(np.uint16)
-    capture = read_depth_image(depth_png(tmp_path, levels, name), pinhole(tmp_path), scale_mm=scale, invalid=invalid)
+    capture = read_depth_image(
+        depth_png(tmp_path, levels, name), ReadOptions(calibration=pinhole(tmp_path), scale_mm=scale, invalid=invalid)
+    )
     assert capture.technology == "depth_map"
     cloud = decoded(capture, tmp_path / "c")
     known = levels != invalid
@@ -298,7 +302,7 @@ def test_levels_that_no_surface_has_are_missing(tmp_path, mark, kind, warning):
     levels = np.where(hole, 0, np.rint(CLOUD[..., 2])).astype(kind)
     levels[hole] = mark
     assert cv2.imwrite(str(tmp_path / "depth.tif"), levels)
-    capture = read_depth_image(tmp_path / "depth.tif", pinhole(tmp_path))
+    capture = read_depth_image(tmp_path / "depth.tif", ReadOptions(calibration=pinhole(tmp_path)))
     np.testing.assert_array_equal(capture.derived["depth"], np.where(hole, np.nan, np.rint(CLOUD[..., 2])))
     told = capture.settings.get("warnings", [])
     assert warning is None or [warning in each for each in told] == [True]
@@ -309,7 +313,10 @@ def test_levels_that_no_surface_has_are_missing(tmp_path, mark, kind, warning):
 def test_a_cloud_is_not_named_after_another_format(tmp_path, name):
     """Before, a PLY file had the name of an STL or a PCD."""
     write_capture(
-        read_depth_image(depth_png(tmp_path, np.full((48, 64), 700, np.uint16)), pinhole(tmp_path)), tmp_path / "c"
+        read_depth_image(
+            depth_png(tmp_path, np.full((48, 64), 700, np.uint16)), ReadOptions(calibration=pinhole(tmp_path))
+        ),
+        tmp_path / "c",
     )
     done = mitsim_here("decode", tmp_path / "c", "-o", tmp_path / name, code=2)
     assert "allowed: a PLY file: cloud.ply" in done.stderr
@@ -318,36 +325,38 @@ def test_a_cloud_is_not_named_after_another_format(tmp_path, name):
 
 def test_a_wall_far_behind_is_a_surface(tmp_path):
     levels = np.where(np.isnan(CLOUD[..., 2]), 6500, np.rint(CLOUD[..., 2])).astype(np.uint16)
-    capture = read_depth_image(depth_png(tmp_path, levels), pinhole(tmp_path))
+    capture = read_depth_image(depth_png(tmp_path, levels), ReadOptions(calibration=pinhole(tmp_path)))
     assert np.isfinite(capture.derived["depth"]).all()
     only_behind = np.where(np.isnan(CLOUD[..., 2]), 0, -CLOUD[..., 2])
     assert cv2.imwrite(str(tmp_path / "behind.tif"), only_behind)
     with pytest.raises(InputError, match="check --scale"):
-        read_depth_image(tmp_path / "behind.tif", pinhole(tmp_path))
+        read_depth_image(tmp_path / "behind.tif", ReadOptions(calibration=pinhole(tmp_path)))
 
 
 def test_what_is_wrong_with_a_depth_image_is_named(tmp_path):
     good = np.full((HEIGHT, WIDTH), 700, np.uint16)
     with pytest.raises(InputError, match=r"8 bits.*has lost its depths"):
-        read_depth_image(depth_png(tmp_path, good.astype(np.uint8)), pinhole(tmp_path))
+        read_depth_image(depth_png(tmp_path, good.astype(np.uint8)), ReadOptions(calibration=pinhole(tmp_path)))
     with pytest.raises(InputError, match="size: found 64 x 47 px; allowed: 64 x 48 px"):
-        read_depth_image(depth_png(tmp_path, good[1:]), pinhole(tmp_path))
+        read_depth_image(depth_png(tmp_path, good[1:]), ReadOptions(calibration=pinhole(tmp_path)))
     with pytest.raises(InputError, match="only the level 0"):
-        read_depth_image(depth_png(tmp_path, good * 0), pinhole(tmp_path))
+        read_depth_image(depth_png(tmp_path, good * 0), ReadOptions(calibration=pinhole(tmp_path)))
     with pytest.raises(InputError, match=r"depth: found 70000 to inf mm; .*check --scale"):
         far = good.astype(np.float32)
         far[0, 0] = 1e38  # before, infinity in the capture
         assert cv2.imwrite(str(tmp_path / "far.tif"), far)
-        read_depth_image(tmp_path / "far.tif", pinhole(tmp_path), scale_mm=100)
+        read_depth_image(tmp_path / "far.tif", ReadOptions(calibration=pinhole(tmp_path), scale_mm=100))
     with pytest.raises(InputError, match="--camera: found 'right'; allowed: camera"):
-        read_depth_image(depth_png(tmp_path, good), pinhole(tmp_path), camera="right")
+        read_depth_image(depth_png(tmp_path, good), ReadOptions(calibration=pinhole(tmp_path), camera="right"))
     with pytest.raises(InputError, match="no such file"):
-        read_depth_image(depth_png(tmp_path, good), tmp_path / "nothing.json")
+        read_depth_image(depth_png(tmp_path, good), ReadOptions(calibration=tmp_path / "nothing.json"))
 
 
 def test_a_devices_map_is_decoded_with_the_range_of_its_sensor(tmp_path, n10):
     """Settings of any sensor give the range; of the device's own, all is taken."""
-    capture = replace(read_organised_cloud(save(tmp_path / "a.pcd", pcd(CLOUD, "binary"))), sensor=n10.name)
+    capture = replace(
+        read_organised_cloud(save(tmp_path / "a.pcd", pcd(CLOUD, "binary")), ReadOptions()), sensor=n10.name
+    )
     near = n10.matcher.model_copy(update={"near_mm": 690.0, "far_mm": 720.0})
     cloud = capture_cloud(capture, near)
     z = CLOUD[..., 2]
@@ -434,19 +443,19 @@ def test_a_stereo_pair_and_opencvs_calibration_measure_a_plane(tmp_path, rng):
         depth_png(tmp_path / "pair", colour, f"right_{number}.png")
     calibration = save(tmp_path / "stereo.yml", STEREO.encode())
     with pytest.raises(InputError, match=r"2 pairs.*--frame 0 to 1"):
-        read_stereo_pair(tmp_path / "pair", calibration)
+        read_stereo_pair(tmp_path / "pair", ReadOptions(calibration=calibration))
     for number, depth in ((0, 500.0), (1, 1000.0)):
-        capture = read_stereo_pair(tmp_path / "pair", calibration, frame=number)
+        capture = read_stereo_pair(tmp_path / "pair", ReadOptions(calibration=calibration, frame=number))
         cloud = decoded(capture, tmp_path / f"c{number}")
         assert cloud.valid.mean() > 0.5
         assert np.median(cloud.points[cloud.valid][:, 2]) == pytest.approx(depth, rel=0.01)
     with pytest.raises(InputError, match="--frame: found 2"):
-        read_stereo_pair(tmp_path / "pair", calibration, frame=2)
+        read_stereo_pair(tmp_path / "pair", ReadOptions(calibration=calibration, frame=2))
     with pytest.raises(InputError, match="two cameras"):
-        read_stereo_pair(tmp_path / "pair", pinhole(tmp_path))
+        read_stereo_pair(tmp_path / "pair", ReadOptions(calibration=pinhole(tmp_path)))
     (tmp_path / "pair" / "right_1.png").unlink()
     with pytest.raises(InputError, match="2 of left and 1 of right"):
-        read_stereo_pair(tmp_path / "pair", calibration)
+        read_stereo_pair(tmp_path / "pair", ReadOptions(calibration=calibration))
 
 
 def test_a_thumbnail_beside_a_pair_does_not_count(tmp_path):
@@ -455,12 +464,12 @@ def test_a_thumbnail_beside_a_pair_does_not_count(tmp_path):
     for name, shape in (("a_preview", (12, 20)), ("left_0", (120, 200)), ("right_0", (120, 200))):
         depth_png(tmp_path / "pair", np.full(shape, 90, np.uint8), f"{name}.png")
     calibration = save(tmp_path / "stereo.yml", STEREO.replace("image_size: [200, 120]\n", "").encode())
-    capture = read_stereo_pair(tmp_path / "pair", calibration)
+    capture = read_stereo_pair(tmp_path / "pair", ReadOptions(calibration=calibration))
     assert capture.images["left"].shape == (1, 120, 200)
     assert (capture.rig.reference.width, capture.rig.reference.height) == (200, 120)
     wrong = save(tmp_path / "wrong.yml", calibration.read_bytes().replace(b"300., 0., 100.", b"300., 0., 9000."))
     with pytest.raises(InputError, match=r"wrong\.yml: .*principal"):
-        read_stereo_pair(tmp_path / "pair", wrong)
+        read_stereo_pair(tmp_path / "pair", ReadOptions(calibration=wrong))
 
 
 @pytest.mark.parametrize(
@@ -478,7 +487,9 @@ def test_a_pair_that_contradicts_its_calibration_is_said(tmp_path, rng, order, t
     (tmp_path / "pair").mkdir()
     for side, shift in zip(("left", "right"), order, strict=True):
         depth_png(tmp_path / "pair", texture[:, 100 + shift : 300 + shift], f"{side}.png")
-    capture = read_stereo_pair(tmp_path / "pair", save(tmp_path / "stereo.yml", STEREO.encode()))
+    capture = read_stereo_pair(
+        tmp_path / "pair", ReadOptions(calibration=save(tmp_path / "stereo.yml", STEREO.encode()))
+    )
     warnings = checked_cloud(capture, *decoder_settings(capture)).warnings
     assert [told in each for each in warnings] == ([True] if told else [])
 
@@ -493,7 +504,9 @@ def test_a_pair_of_more_bits_has_the_contrast_of_one_of_eight(tmp_path, rng, fac
     (tmp_path / "pair").mkdir()
     for side, shift in (("left", 0), ("right", 24)):
         depth_png(tmp_path / "pair", np.repeat(levels, 2, axis=0)[:, 50 + shift : 250 + shift], f"{side}.png")
-    capture = read_stereo_pair(tmp_path / "pair", save(tmp_path / "stereo.yml", STEREO.encode()))
+    capture = read_stereo_pair(
+        tmp_path / "pair", ReadOptions(calibration=save(tmp_path / "stereo.yml", STEREO.encode()))
+    )
     assert (capture.bits, capture.settings.get("empty_bits", 0)) == (bits, empty)
     assert capture.images["left"].max() == (255 if empty else levels[:, 50:250].max())
 
@@ -505,4 +518,4 @@ def test_a_damaged_colour_image_is_not_half_read(tmp_path):
         path = depth_png(tmp_path / "pair", colour, f"{side}.png")
     path.write_bytes(path.read_bytes()[:40_000])
     with pytest.raises(InputError, match=r"right\.png: found a PNG cut off"):
-        read_stereo_pair(tmp_path / "pair", save(tmp_path / "stereo.yml", STEREO.encode()))
+        read_stereo_pair(tmp_path / "pair", ReadOptions(calibration=save(tmp_path / "stereo.yml", STEREO.encode())))

@@ -131,7 +131,7 @@ def test_names_in_a_folder_may_have_capitals(tmp_path):
         "right": "RIGHT.mcap",
     }
     with pytest.raises(InputError, match=r"DepthAI_Calib\.JSON"):
-        read_depthai_recording(save(streams / "DepthAI_Calib.JSON", b"{").parent)
+        read_depthai_recording(save(streams / "DepthAI_Calib.JSON", b"{").parent, ReadOptions())
 
 
 RIGS = Path(__file__).parents[3] / "scenes" / "rigs"

@@ -67,7 +67,7 @@ def scene(request, tmp_path_factory):
     for view in ("view_0", "view_1"):
         write_view(folder, view, blank, blank, depth, pose.matrix())
     (folder / "list.txt").write_text("view_0\nview_1\n")
-    rig = read_robi(folder, frame=0)[0].rig
+    rig = read_robi(folder, ReadOptions(frame=0))[0].rig
     preset = load_sensor("ensenso-n35")
     assert isinstance(preset.pattern, RandomDots)
     taker = replace(preset, rig=Rig(rig.cameras, preset.rig.projector, rig.rectification))
@@ -87,7 +87,7 @@ def test_disparities_are_those_of_the_toolkits_own_formula(tmp_path):
         folder = root / "Gear" / "Scene_3" / sensor
         write_view(folder, "view_0", blank, blank, np.ones((HEIGHT, WIDTH), np.uint16), np.eye(4))
         (folder / "list.txt").write_text("view_0\n")
-        rig = read_robi(folder)[0].rig
+        rig = read_robi(folder, ReadOptions())[0].rig
         assert rig.rectification is not None
         for depth in (400.0, 900.0):
             wanted = FOCAL * BASELINE / depth - (RIGHT_X - LEFT_X) + shift
@@ -143,9 +143,9 @@ def test_one_command_from_the_scene_to_the_verdict(scene, tmp_path):
 
 def test_several_views_are_asked_about(scene):
     with pytest.raises(InputError, match="choose with --frame 0 to 1"):
-        read_robi(scene)
+        read_robi(scene, ReadOptions())
     with pytest.raises(InputError, match=r"0 to 1: views of list\.txt, in their order"):
-        read_robi(scene, frame=2)
+        read_robi(scene, ReadOptions(frame=2))
 
 
 def test_what_is_missing_is_named_all_at_once(tmp_path):
@@ -153,18 +153,18 @@ def test_what_is_missing_is_named_all_at_once(tmp_path):
     (folder / "StereoPattern").mkdir(parents=True)
     (folder / "list.txt").write_text("view_0\n")
     with pytest.raises(InputError, match="--calibration ROBI_Toolkit/cam"):
-        read_robi(folder)
+        read_robi(folder, ReadOptions())
     write_cameras(tmp_path / "cam", "Ensenso", 0.0)
     with pytest.raises(InputError, match=r"LEFT_view_0\.bmp, .*RIGHT_view_0\.bmp, .*DEPTH_view_0\.png"):
-        read_robi(folder)
+        read_robi(folder, ReadOptions())
     blank = np.zeros((HEIGHT, WIDTH), np.uint8)
     write_view(folder, "view_0", blank, blank, np.ones((HEIGHT, WIDTH), np.uint16), np.diag([1, 1, 2.0, 1]))
     with pytest.raises(InputError, match="not a rigid motion"):
-        read_robi(folder)
+        read_robi(folder, ReadOptions())
     (tmp_path / "cam" / "Ensenso_DEPTH.yml").write_text("width: 400\n")
     (tmp_path / "cam" / "Ensenso_RIGHT.yml").write_text("width: 400\n")
     with pytest.raises(InputError, match=r"RIGHT.yml: height; .*DEPTH.yml: baseline; .*depth_unit"):
-        read_robi(folder)
+        read_robi(folder, ReadOptions())
 
 
 def small_scene(tmp_path: Path, depth) -> Path:
@@ -180,7 +180,7 @@ def test_the_largest_level_is_no_depth(tmp_path):
     """Before, it was the farthest depth."""
     depth = np.full((HEIGHT, WIDTH), round(DISTANCE / UNIT), np.uint16)
     depth[7, 9] = 65535
-    capture, _ = read_robi(small_scene(tmp_path, depth))
+    capture, _ = read_robi(small_scene(tmp_path, depth), ReadOptions())
     np.testing.assert_array_equal(np.isnan(capture.derived["depth"]), depth == 65535)
     assert ["the level 65535" in warning for warning in capture.settings["warnings"]] == [True]
 
@@ -199,7 +199,7 @@ def test_a_pose_that_is_none_is_refused(tmp_path, pose, told):
     folder = small_scene(tmp_path, np.ones((HEIGHT, WIDTH), np.uint16))
     (folder / "Depth" / "DEPTH_view_0.json").write_text(pose)
     with pytest.raises(InputError, match=f"DEPTH_view_0.json: {told}"):
-        read_robi(folder)
+        read_robi(folder, ReadOptions())
 
 
 @pytest.mark.parametrize("number", ["nan", "inf", "-inf"])
@@ -210,7 +210,7 @@ def test_numbers_of_cameras_are_finite(tmp_path, key, number):
     table = tmp_path / "cam" / f"Ensenso_{'DEPTH' if key == 'disparity_shift' else 'LEFT'}.yml"
     table.write_text(f"{table.read_text()}\n{key}: {number}\n")
     with pytest.raises(InputError, match=f"{table.name}: {key}: found {float(number):g}; allowed: a number up to"):
-        read_robi(folder)
+        read_robi(folder, ReadOptions())
 
 
 @pytest.mark.parametrize(
@@ -229,7 +229,7 @@ def test_the_data_sets_own_camera_files(sensor, focal, baseline, shift, tmp_path
     folder, blank = tmp_path / "Scene_1" / sensor, np.zeros(size, np.uint8)
     write_view(folder, "view_0", blank, blank, np.ones(size, np.uint16), np.eye(4))
     (folder / "list.txt").write_text("view_0\n")
-    capture, _ = read_robi(folder, root)
+    capture, _ = read_robi(folder, ReadOptions(calibration=root))
     pair = capture.rig.rectification
     assert pair is not None
     assert (pair.matrix_left[0, 0], pair.baseline) == pytest.approx((focal, baseline), abs=1e-3)

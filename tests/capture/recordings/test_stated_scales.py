@@ -10,6 +10,7 @@ import pytest
 
 from characterisation.files.errors import InputError
 from mitsim.capture.recordings.depth_image import read_depth_image
+from mitsim.capture.recordings.read_options import ReadOptions
 
 WIDTH, HEIGHT = 64, 48
 K = [150.0, 0, 31.5, 0, 150.0, 23.5, 0, 0, 1]
@@ -37,9 +38,9 @@ def test_a_stated_scale_is_asked_for_and_not_passed_over(tmp_path, name):
     (tmp_path / name).write_text(text)
     cv2.imwrite(str(tmp_path / "depth.png"), np.full((HEIGHT, WIDTH), level, np.uint16))
     with pytest.raises(InputError, match=f"--scale {scale},") as error:
-        read_depth_image(tmp_path / "depth.png", tmp_path / name)
+        read_depth_image(tmp_path / "depth.png", ReadOptions(calibration=tmp_path / name))
     assert name in str(error.value)
-    capture = read_depth_image(tmp_path / "depth.png", tmp_path / name, scale_mm=float(scale))
+    capture = read_depth_image(tmp_path / "depth.png", ReadOptions(calibration=tmp_path / name, scale_mm=float(scale)))
     np.testing.assert_allclose(capture.derived["depth"], 600, rtol=2e-4)
 
 
@@ -47,7 +48,7 @@ def test_a_stated_scale_is_asked_for_and_not_passed_over(tmp_path, name):
 def test_a_scale_of_one_millimetre_needs_no_option(tmp_path, number):
     (tmp_path / "a.json").write_text(json.dumps(FLAT | {"depth_scale": number}))
     cv2.imwrite(str(tmp_path / "depth.png"), np.full((HEIGHT, WIDTH), 600, np.uint16))
-    capture = read_depth_image(tmp_path / "depth.png", tmp_path / "a.json")
+    capture = read_depth_image(tmp_path / "depth.png", ReadOptions(calibration=tmp_path / "a.json"))
     np.testing.assert_allclose(capture.derived["depth"], 600)
 
 
@@ -55,7 +56,7 @@ def test_a_scale_beside_the_levels_in_an_archive(tmp_path):
     (tmp_path / "a.json").write_text(json.dumps(FLAT))
     np.savez(tmp_path / "a.npz", depth=np.full((HEIGHT, WIDTH), 6000, np.uint16), depth_scale=0.0001)
     with pytest.raises(InputError, match=r"depth_scale: found 0\.0001.*--scale 0\.1,"):
-        read_depth_image(tmp_path / "a.npz", tmp_path / "a.json")
+        read_depth_image(tmp_path / "a.npz", ReadOptions(calibration=tmp_path / "a.json"))
 
 
 def test_depths_of_floating_point_are_no_levels(tmp_path):
@@ -63,4 +64,6 @@ def test_depths_of_floating_point_are_no_levels(tmp_path):
     (tmp_path / "b.json").write_text(json.dumps(FLAT | {"depth_scale": 5000}))
     np.save(tmp_path / "a.npy", np.full((HEIGHT, WIDTH), 0.6, np.float32))
     for name in ("a.json", "b.json"):
-        np.testing.assert_allclose(read_depth_image(tmp_path / "a.npy", tmp_path / name).derived["depth"], 600)
+        np.testing.assert_allclose(
+            read_depth_image(tmp_path / "a.npy", ReadOptions(calibration=tmp_path / name)).derived["depth"], 600
+        )

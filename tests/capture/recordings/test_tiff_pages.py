@@ -16,6 +16,7 @@ from characterisation.files.errors import InputError
 from mitsim.capture.grey_image import page_count, read_grey, read_pages
 from mitsim.capture.recordings.depth_image import read_depth_image
 from mitsim.capture.recordings.image_folder import at_size_of_images, read_image_folder
+from mitsim.capture.recordings.read_options import ReadOptions
 from mitsim.capture.recordings.stereo_pair import read_stereo_pair
 from tests.capture.recordings.test_image_folder import rig, save, see_plane
 
@@ -78,12 +79,12 @@ def test_one_image_of_several_pages_is_refused_where_one_is_meant(tmp_path):
     with pytest.raises(InputError, match=r"depth.tif: pages: found 3 pages; allowed: one image"):
         read_grey(path)
     with pytest.raises(InputError, match=r"depth.tif: pages: found 3 pages; allowed: one image"):
-        read_depth_image(path, tmp_path / "a.json")
+        read_depth_image(path, ReadOptions(calibration=tmp_path / "a.json"))
     (tmp_path / "pair").mkdir()
     for name in ("left", "right"):
         stacked(tmp_path / f"pair/{name}.tif", pages_of(2, np.uint8))
     with pytest.raises(InputError, match=r"left.tif: pages: found 2 pages; allowed: one image"):
-        read_stereo_pair(tmp_path / "pair", tmp_path / "a.json")
+        read_stereo_pair(tmp_path / "pair", ReadOptions(calibration=tmp_path / "a.json"))
 
 
 @pytest.mark.parametrize(("kind", "place"), [(1, 0), (1, 1), (4, 1)])

@@ -43,9 +43,9 @@ def test_depths_of_an_unknown_quantity_are_refused(tmp_path, name, depth, messag
     """They were 66 mm, 1.7 mm, 600 m and 30 m."""
     cv2.imwrite(str(tmp_path / name), depth)
     with pytest.raises(InputError, match=message):
-        read_depth_image(tmp_path / name, pinhole(tmp_path))
+        read_depth_image(tmp_path / name, ReadOptions(calibration=pinhole(tmp_path)))
     if "unit" in message:
-        capture = read_depth_image(tmp_path / name, pinhole(tmp_path), scale_mm=0.01)
+        capture = read_depth_image(tmp_path / name, ReadOptions(calibration=pinhole(tmp_path), scale_mm=0.01))
         assert capture.derived["depth"].max() == pytest.approx(depth[0, 0] / 100)
 
 
@@ -56,9 +56,12 @@ def test_disparities_are_told_by_the_folder(tmp_path):
         cv2.imwrite(str(tmp_path / name), np.full((48, 64), 12800, np.uint16))
         if refused:
             with pytest.raises(InputError, match="found disparities, by the name"):
-                read_depth_image(tmp_path / name, pinhole(tmp_path))
+                read_depth_image(tmp_path / name, ReadOptions(calibration=pinhole(tmp_path)))
         else:
-            assert read_depth_image(tmp_path / name, pinhole(tmp_path)).derived["depth"].max() == 12800
+            assert (
+                read_depth_image(tmp_path / name, ReadOptions(calibration=pinhole(tmp_path))).derived["depth"].max()
+                == 12800
+            )
 
 
 @pytest.mark.parametrize(
@@ -68,7 +71,7 @@ def test_disparities_are_told_by_the_folder(tmp_path):
 def test_the_unit_in_the_name_of_an_array(tmp_path, name, depth, millimetres):
     """60 cm were 60 mm, 25 m were 25 mm, and 12 mm were 12 m."""
     np.savez(tmp_path / "a.npz", **{name: np.full((48, 64), depth, np.float32)})
-    capture = read_depth_image(tmp_path / "a.npz", pinhole(tmp_path))
+    capture = read_depth_image(tmp_path / "a.npz", ReadOptions(calibration=pinhole(tmp_path)))
     assert capture.derived["depth"].max() == pytest.approx(millimetres)
     assert capture.settings["depth_scale_mm"] == pytest.approx(millimetres / depth)
 
@@ -76,9 +79,11 @@ def test_the_unit_in_the_name_of_an_array(tmp_path, name, depth, millimetres):
 def test_disparities_beside_depths_are_left_out(tmp_path):
     np.savez(tmp_path / "a.npz", disparity=np.full((48, 64), 66.0))
     with pytest.raises(InputError, match="found disparities, by the name"):
-        read_depth_image(tmp_path / "a.npz", pinhole(tmp_path))
+        read_depth_image(tmp_path / "a.npz", ReadOptions(calibration=pinhole(tmp_path)))
     np.savez(tmp_path / "a.npz", disparity=np.full((48, 64), 66.0), z=np.full((48, 64), 700.0))
-    assert read_depth_image(tmp_path / "a.npz", pinhole(tmp_path)).derived["depth"].max() == 700
+    assert (
+        read_depth_image(tmp_path / "a.npz", ReadOptions(calibration=pinhole(tmp_path))).derived["depth"].max() == 700
+    )
 
 
 @pytest.mark.parametrize("other", ["rgb", "normals", "image"])
@@ -164,7 +169,9 @@ def test_a_map_is_of_the_camera_of_its_size(tmp_path):
     }
     (tmp_path / "eyes.json").write_text(json.dumps(eyes))
     np.save(tmp_path / "a.npy", np.random.default_rng(0).uniform(600, 700, (48, 64)))
-    assert set(read_depth_image(tmp_path / "a.npy", tmp_path / "eyes.json").rig.cameras) == {"depth"}
+    assert set(read_depth_image(tmp_path / "a.npy", ReadOptions(calibration=tmp_path / "eyes.json")).rig.cameras) == {
+        "depth"
+    }
     rows, columns = np.mgrid[:48, :64]
     z = 700 + 20 * np.sin(columns / 9)
     np.save(tmp_path / "b.npy", np.stack([(columns - 32) / 60 * z, (rows - 24) / 60 * z, z], axis=-1))
