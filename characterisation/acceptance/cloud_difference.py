@@ -111,14 +111,10 @@ def difference_to_surface(
 
     Parameters
     ----------
-    cloud
-        Organised cloud to judge.
-    reference
-        Organised cloud of the surface, in the frame of ``cloud``. It needs no shared grid.
-    window
-        Rows and columns (h, w) of the cloud's grid; by default all.
-    progress
-        Iterates over the starts of the blocks of points, and may report them.
+    cloud, reference
+        The cloud to judge, and that of the surface in the same frame; they need no common grid.
+    window, progress
+        Rows and columns (h, w), by default all; iterates over the starts of the blocks of points, and may report them.
     """
     surface = reference.points[reference.valid].astype(np.float64)
     if len(surface) < NEIGHBOURS:

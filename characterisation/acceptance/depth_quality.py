@@ -107,14 +107,11 @@ def plane_quality(
 
     Parameters
     ----------
-    cloud
-        Points are relative to the grid's origin.
-    region
-        (H, W) mask of the region of interest; the whole grid if None. All of it must show the target.
-    ground_truth
-        True pose of the target; without it, Z accuracy is NaN.
-    baseline_mm
-        b of a stereo sensor.
+    cloud, region
+        Points relative to the grid's origin, and a (H, W) mask all of which must show the target; the whole grid if
+        None.
+    ground_truth, baseline_mm
+        True pose of the target; without it, Z accuracy is NaN. b of a stereo sensor.
     trimmed_share
         Share of the points excluded at either end of the depths.
     """

@@ -93,10 +93,8 @@ def sphere_spacing_error(
 
     Parameters
     ----------
-    first, second
-        (n, 3) points [mm] of the two spheres of a ball bar.
-    calibrated_distance
-        [mm].
+    first, second, calibrated_distance
+        (n, 3) points [mm] of the two spheres of a ball bar, and its length [mm].
     rejected_share
         As in :func:`probing_error`.
     """

@@ -249,10 +249,8 @@ def reference_fraction(
 
     Parameters
     ----------
-    count, reference_count
-        Points of the coupon, and of the matt-white one.
-    possible
-        Pixels of the patch.
+    count, reference_count, possible
+        Points of the coupon, and of the matt-white one; pixels of the patch.
     confidence
         Of the interval.
 

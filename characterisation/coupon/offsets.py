@@ -55,10 +55,8 @@ def known_offset(points: Floats, inlier: NDArray[np.bool_], normal: Floats, reac
 
     Parameters
     ----------
-    points
-        (p, n, 3) [mm] relative to the optical centre of the sensor.
-    inlier
-        (p, n) mask of the points used.
+    points, inlier
+        (p, n, 3) [mm] relative to the optical centre of the sensor, and (p, n) mask of those used.
     normal, reach
         The plane q . normal = reach, normal (3,) and reach [mm].
     """

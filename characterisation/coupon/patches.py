@@ -92,14 +92,10 @@ def patch_centres(
 
     Parameters
     ----------
-    grid
-        Pixels of the cloud.
-    coupon
-        Pose and size of the coupon, sensor frame.
-    radius_px, margin_px
-        Radius of the discs, and their least distance from the edge of the coupon.
-    step_px
-        Distance between neighbouring centres.
+    grid, coupon
+        Pixels of the cloud; pose and size of the coupon, sensor frame.
+    radius_px, margin_px, step_px
+        Radius of the discs, their least distance from the edge of the coupon, and distance of neighbouring centres.
     """
     corners, middle = outline(grid, coupon), grid.project(coupon.centre)
     if not len(corners) or not (np.isfinite(corners).all() and np.isfinite(middle).all()):
@@ -140,15 +136,11 @@ def measure_patches(
 
     Parameters
     ----------
-    cloud
-        Organised cloud of the coupon.
-    coupon
-        Pose and size of the coupon, sensor frame.
-    radius_px
-        Radius of the disc [px]; 6 px hold 113 possible points.
-    margin_px
-        Distance from the disc to the edge of the coupon [px]: about one matching block, within which the background
-        affects the result.
+    cloud, coupon
+        Organised cloud of the coupon; its pose and size, sensor frame.
+    radius_px, margin_px
+        Radius of the disc; 6 px hold 113 possible points. Distance from the disc to the edge of the coupon: about one
+        matching block, within which the background affects the result.
     step_px
         Distance between neighbouring centres [px]. The default, 2 x radius, keeps patches apart and so independent.
     angular_pitch

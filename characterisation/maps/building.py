@@ -78,11 +78,9 @@ def build_map(
     attributes
         Written into the map: ``sensor``, ``source``, ``exposure_rule`` and everything else that makes it reproducible.
         The exposure policy is part of a map's identity.
-    largest_incidence
-        Largest incidence [rad] of the campaign. Nodes beyond it are NaN, and so are those outside the hull of the
-        patches.
-    nodes
-        Number of nodes along each axis of the equal-area grid.
+    largest_incidence, nodes
+        Largest incidence [rad] of the campaign, beyond which nodes are NaN, as outside the hull of the patches; number
+        of nodes along each axis of the equal-area grid.
     """
     samples = sorted({(t.finish, t.roughness if not math.isnan(t.roughness) else -1.0) for t in tables})
     distances = sorted({t.distance for t in tables})

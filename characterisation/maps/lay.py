@@ -103,10 +103,8 @@ def between_directions(
 
     Parameters
     ----------
-    surface
-        Fields of the surface in each direction.
-    distance
-        |V| (n,) [mm].
+    surface, distance
+        Fields of the surface in each direction, and |V| (n,) [mm].
     normals, tangents
         (n, 3) in the view frame; tangents lie along u.
     """

@@ -131,12 +131,10 @@ def local_fit(
 
     Parameters
     ----------
-    data
-        Places and values to fit.
+    data, slopes
+        Places and values to fit; prior of the slopes and bends.
     at, radii
         (q, 3) places; (q, r) radii of the kernel.
-    slopes
-        Prior of the slopes and bends.
     link
         Whether the line is that of the value or of its logarithm.
     clusters, keep

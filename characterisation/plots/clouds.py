@@ -73,16 +73,10 @@ def draw_cloud(
     ----------
     axes
         To draw into; x is the column and y the row of a pixel.
-    values
-        (H, W) [mm], NaN where a pixel has no point.
-    status
-        (H, W) number of each pixel's status.
-    names
-        Name of each status by its number, as in :data:`REASONS`.
-    label
-        Of the colour scale.
-    residual
-        Whether the values are signed: the scale is then symmetric about 0.
+    values, label, residual
+        (H, W) [mm], NaN where a pixel has no point; label of their scale, which is symmetric about 0 for a residual.
+    status, names
+        (H, W) number of each pixel's status, and names by number, as in :data:`REASONS`.
     """
     missing = ~np.isfinite(values)
     numbers = sorted(names)

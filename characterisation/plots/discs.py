@@ -52,14 +52,10 @@ def disc_image(axes: Axes, values: NDArray[np.floating], axis: NDArray[np.floati
 
     Parameters
     ----------
-    axes
-        Axes to draw into.
-    values
-        Values (b, a) at the nodes; NaN is left empty.
-    axis
-        Nodes (n,) of both coordinates [1], equidistant, Lambert's equal-area projection.
-    largest
-        Largest incidence angle of the disc [rad].
+    axes, values
+        Axes to draw into, and values (b, a) at the nodes; NaN is left empty.
+    axis, largest
+        Nodes (n,) of both coordinates [1], equidistant, Lambert's equal-area projection; largest incidence [rad].
     """
     rim = disc(axes, 2 * math.sin(largest / 2))
     reach = float(axis[-1]) + float(axis[1] - axis[0]) / 2
@@ -123,14 +119,10 @@ def draw_performance(
 
     Parameters
     ----------
-    pair
-        Axes (2,) of F and of sigma.
-    fraction, sigma
-        F [1] and sigma [mm] (b, a) at the nodes.
-    axis
-        Nodes (n,) of both coordinates [1], equidistant, Lambert's equal-area projection.
-    largest
-        Largest incidence angle of the discs [rad].
+    pair, fraction, sigma
+        Axes (2,) of F and of sigma; F [1] and sigma [mm] (b, a) at the nodes.
+    axis, largest
+        As in :func:`disc_image`.
     limits
         Ends of the logarithmic scale of sigma [mm].
     """

@@ -29,14 +29,11 @@ def label_columns(
     ----------
     axes
         To draw into. Its limits are set to hold the picture and the names.
-    positions
-        Place (2,) of each name, the most important names first.
-    low, high
-        Corners (2,) of the picture.
-    most
-        Largest number of names on a side; the least important others are left out.
-    longest
-        Largest number of characters of a name; longer ones lack their middle.
+    positions, low, high
+        Place (2,) of each name, the most important names first; corners (2,) of the picture.
+    most, longest
+        Largest number of names on a side: the least important others are left out; largest number of characters of a
+        name: longer ones lack their middle.
     """
     span = high - low
     step = float(max(span[1], 0.62 * span[0])) / _ROWS
@@ -93,16 +90,10 @@ def scale_bar(axes: Axes, left_end: tuple[float, float], length: float, label: s
 
     Parameters
     ----------
-    axes
-        Axes to draw into.
-    left_end
-        Left end (x, y) of the bar, in the axes' data units.
-    length
-        Length of the bar, in data units.
-    label
-        Text above the bar.
-    rise
-        Distance of the label above the bar, in data units.
+    axes, left_end, length
+        Axes to draw into; left end (x, y) and length of the bar, in data units.
+    label, rise
+        Text above the bar, and its distance from it in data units.
     """
     x, y = left_end
     axes.plot([x, x + length], [y, y], color=INK, lw=2.2, solid_capstyle="butt", zorder=6)

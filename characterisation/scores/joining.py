@@ -133,10 +133,8 @@ def joined_covariance(
 
     Parameters
     ----------
-    views
-        What each view contributes to the features.
-    rigid
-        J (p, 6) of each feature.
+    views, rigid
+        What each view contributes to the features; J (p, 6) of each feature.
     motion_covariance
         K (6, 6) of each pose, before the fit if there is one; then not singular.
     best_fit

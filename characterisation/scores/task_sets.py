@@ -57,10 +57,8 @@ def choose_set(
 
     Parameters
     ----------
-    task
-        Features and measurements.
-    inputs
-        For every view, the expected input quantities of the task's measurements.
+    task, inputs
+        Features and measurements; for every view, the expected input quantities of the measurements.
     limits
         By measurement, in its unit; the other measurements are ignored.
     least_chance

@@ -129,10 +129,8 @@ def fewest_views(
 
     Parameters
     ----------
-    features
-        Information about each feature from every view.
-    limits
-        l_m (measurements,) in their units.
+    features, limits
+        Information about each feature from every view; l_m (measurements,) in their units.
     seconds
         Time limit of the proof; after it, the greedy set is returned, marked as not exact.
     joined

@@ -154,14 +154,10 @@ def least_motion(
 
     Parameters
     ----------
-    axes
-        Axes of the stage, with their limits.
-    candidates
-        Angles (n, axes) [rad] that may be solutions, NaN where there is none.
-    error
-        Returns the error (n,) of angles (n, axes) [rad].
-    count
-        Number n of views.
+    axes, count
+        Axes of the stage, with their limits, and number n of views.
+    candidates, error
+        Angles (n, axes) [rad] that may be solutions, NaN where there is none; returns the error (n,) of such angles.
     """
     best = np.full((count, len(axes)), np.nan)
     least, beyond = np.full(count, np.inf), np.full(count, np.inf)

@@ -48,14 +48,10 @@ def draw_images(
 
     Parameters
     ----------
-    stacks
-        By camera name, (frames, H, W) [DN].
-    full_scale
-        Value of a saturated pixel [DN].
-    caption
-        Sensor and source, for the titles.
-    ax
-        Axes to draw into, one for each camera; None for those of a new figure.
+    stacks, full_scale
+        By camera name, (frames, H, W) [DN]; value of a saturated pixel [DN].
+    caption, ax
+        Sensor and source, for the titles; axes, one for each camera, None for those of a new figure.
     image
         Number of the image, from 0; negative numbers count from the last.
     """
@@ -99,10 +95,8 @@ def draw_maps(
     ----------
     maps, units
         By name, (H, W), NaN where a value is missing, and their units.
-    caption
-        Sensor and source, for the titles.
-    ax
-        Axes to draw into, one for each map; None for those of a new figure.
+    caption, ax
+        As of :func:`draw_images`.
     """
     rows, columns = next(iter(maps.values())).shape
     size = ((_WIDTH_IN + _SCALE_IN) * len(maps), _WIDTH_IN * rows / columns + _LABELS_IN)

@@ -44,16 +44,12 @@ def read_journey(
 
     Parameters
     ----------
-    study
-        Study file; its sensor and map are replaced.
-    campaign
-        Campaign of the map; by default the one that the study names.
+    study, campaign
+        Study file, whose sensor and map are replaced; campaign of the map, by default the one that the study names.
     output
         The sensor file; map and report go to a folder of its name, beside it.
-    minutes
-        Time of the run of the study [min]; None: until it ends by its rules.
-    ask
-        See :class:`Journey`.
+    minutes, ask
+        Time of the run of the study [min], None until it ends by its rules; see :class:`Journey`.
     """
     from mitsim.maps.campaign.campaign_file import CampaignFile
     from mitsim.study import StudyFile

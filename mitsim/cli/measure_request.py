@@ -135,20 +135,14 @@ def read_request(
 
     Parameters
     ----------
-    features
-        Texts ``NAME=COLUMN,ROW,WIDTH,HEIGHT`` [px], or ``NAME``, by shape.
-    between
-        Texts ``NAME,NAME`` by kind of measurement.
-    plates
-        Texts ``NAME=COLUMN,ROW,WIDTH,HEIGHT,PITCH`` [px, mm], or ``NAME=PITCH``.
-    bright
-        Whether the dots are brighter than the plate.
-    against
-        Path of the reference cloud of a difference, None without one.
-    by
-        Direction of the difference, one of :data:`DIRECTIONS`.
-    window
-        Window of the difference [px], None for the whole grid.
+    features, between
+        Texts ``NAME=COLUMN,ROW,WIDTH,HEIGHT`` [px], or ``NAME``, by shape; ``NAME,NAME`` by kind of measurement.
+    plates, bright
+        Texts ``NAME=COLUMN,ROW,WIDTH,HEIGHT,PITCH`` [px, mm], or ``NAME=PITCH``; whether dots are brighter than the
+        plate.
+    against, by, window
+        Path of the reference cloud of a difference, None without one; its direction, one of :data:`DIRECTIONS`; its
+        window [px], None for the whole grid.
     """
     named: dict[str, tuple[Shape, Roi | None]] = {}
     for shape, texts in features.items():
@@ -206,12 +200,10 @@ def parse_window(
 
     Parameters
     ----------
-    option, text
-        The option and its text.
+    option, text, allowed
+        The option, its text, and its form for the error.
     counts
         How many numbers are allowed: four are the window [px], one more or one alone is the length.
-    allowed
-        Form of the text, for the error.
     used_names
         Names that are in use.
 

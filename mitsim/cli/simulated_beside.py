@@ -52,10 +52,8 @@ def beside_simulated(
     ----------
     input_cloud, targets, sensor
         The recorded cloud, planes and spheres by name, and preset or sensor file to simulate.
-    figures
-        Function that states the figures of a target.
-    seed
-        Of the noise.
+    figures, seed
+        Function that states the figures of a target; seed of the noise.
     """
     from mitsim.sensor.preset import load_sensor
     from mitsim.twin.compare.target_twin import seen_target, simulated_target

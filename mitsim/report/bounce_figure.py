@@ -58,10 +58,8 @@ def bounced_light(scene: Scene, sensor: Sensor, pose: Transform, visible: Visibl
 
     Parameters
     ----------
-    scene, sensor
-        The scene, and the sensor.
-    pose
-        world_from_sensor.
+    scene, sensor, pose
+        The scene, the sensor, and world_from_sensor.
     visible
         Surfaces that the reference camera sees from there.
     """

@@ -36,10 +36,8 @@ def write_capture_page(folder: Path, preamble: str, table: str, real: Shown, sim
 
     Parameters
     ----------
-    folder
-        Folder to write, which exists.
-    preamble, table
-        Texts of the page, in Markdown.
+    folder, preamble, table
+        Folder to write, which exists, and texts of the page, in Markdown.
     real, simulated
         Data of the specimen in the two captures.
     """

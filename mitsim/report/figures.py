@@ -96,14 +96,10 @@ def colour_bar(
 
     Parameters
     ----------
-    figure, grid
-        The figure, and its axes.
-    norm, colours
-        Scale of the values, and name of the colours.
-    label
-        Quantity and unit.
-    extend
-        Ends beyond which values lie: ``neither``, ``both`` or ``max``.
+    figure, grid, label
+        The figure, its axes, and quantity with unit.
+    norm, colours, extend
+        Scale of the values, name of the colours, and ends beyond which values lie: ``neither``, ``both`` or ``max``.
     """
     mappable, below = ScalarMappable(norm=norm, cmap=colours), {"location": "bottom", "aspect": 45, "shrink": 0.75}
     bar = colour_scale(figure, mappable, grid.ravel().tolist(), label, extend=extend, pad=0.03, **below)

@@ -46,14 +46,10 @@ def difference_figure(
 
     Parameters
     ----------
-    difference
-        (H, W) [mm], NaN where a pixel has no counterpart.
-    distribution
-        Distribution of the difference.
-    windows
-        Windows to outline [px], by name.
-    part
-        Part of the image that is shown [px]; None for all of it.
+    difference, distribution
+        (H, W) [mm], NaN where a pixel has no counterpart, and its distribution.
+    windows, part
+        Windows to outline [px], by name; part of the image that is shown [px], None for all of it.
     """
     part = part or Roi.whole(difference.shape[1], difference.shape[0])
     values = difference[np.isfinite(difference)]

@@ -120,16 +120,13 @@ def draw_placement(
 
     Parameters
     ----------
-    figure
-        Figure or subfigure, about 1.9 times as wide as high; if ``stacked``, 0.7 times.
-    geometry
-        Triangles of the part, and eyes of the sensor [mm].
+    figure, stacked
+        Figure or subfigure, about 1.9 times as wide as high; if ``stacked``, 0.7 times: the enlarged part is then
+        below, not on the right.
+    geometry, verdicts
+        Triangles of the part, and eyes of the sensor [mm]; verdict of each feature, a key of :data:`VERDICTS`.
     poses
         Label and part_from_sensor (4, 4) [mm] of each pose; the first sensor is drawn in full.
-    verdicts
-        Verdict of each feature, a key of :data:`VERDICTS`.
-    stacked
-        Whether the enlarged part is below, not on the right.
     """
     matrices = [np.asarray(pose, float) for _, pose in poses]
     with drawing():

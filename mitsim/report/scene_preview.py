@@ -82,12 +82,10 @@ def preview_figure(
 
     Parameters
     ----------
-    scene, facts
-        The loaded scene, and its shapes.
+    scene, facts, visible
+        The loaded scene, its shapes, and the surfaces that the reference camera's pixels see.
     sensor, pose
         The sensor, and world_from_sensor [mm].
-    visible
-        Surfaces that the reference camera's pixels see.
     first
         Names of the shapes that get the first colours; the largest of the others follow.
     measured

@@ -146,10 +146,8 @@ class Page:
 
         Parameters
         ----------
-        text
-            The text.
-        size, colour, weight
-            Of the font; the size in pt.
+        text, size, colour, weight
+            The text, and its font; the size in pt.
         left, across
             Distance from the margin, and largest width of a line [in].
         """
@@ -175,10 +173,9 @@ class Columns:
     ----------
     rows, heads
         Texts of the cells; of the heads, in lines.
-    largest
-        Largest size of text [pt].
-    first
-        Least width of the first column at the size that is chosen, unless no size leaves it [in].
+    largest, first
+        Largest size of text [pt]; least width of the first column at the size that is chosen, unless no size leaves it
+        [in].
     """
 
     def __init__(

@@ -78,10 +78,8 @@ def write_png(figure: Figure, path: Path, dpi: int = _DPI, colours: int | None =
 
     Parameters
     ----------
-    figure, path
-        The figure, and the file to write.
-    dpi
-        Pixels per inch of the figure.
+    figure, path, dpi
+        The figure, the file to write, and pixels per inch.
     colours
         Number of colours of a palette, which halves the size of a noisy image; None for all colours.
     """

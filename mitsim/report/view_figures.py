@@ -55,10 +55,8 @@ def uncertainty_figure(scores: xr.Dataset, measurement: str, unit: str, checked:
 
     Parameters
     ----------
-    scores
-        Scores of a run, over ``view`` and ``measurement``.
-    measurement, unit
-        Name of the measurement, and its unit: mm or deg.
+    scores, measurement, unit
+        Scores of a run, over ``view`` and ``measurement``; name of the measurement, and its unit: mm or deg.
     checked, best
         Numbers of the views that were rendered, and of the best one; None if no view can make the measurement.
     """

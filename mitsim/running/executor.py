@@ -298,14 +298,10 @@ def results_of(
 
     Parameters
     ----------
-    orders
-        Plain values.
-    work
-        Module-level function of an order.
-    workers
-        None for this process.
-    label
-        Of the progress on stderr.
+    orders, work
+        Plain values, and a module-level function of one.
+    workers, label
+        None for this process; label of the progress on stderr.
     """
     if workers is None:
         return [work(order) for order in track(orders, label)]

@@ -40,12 +40,10 @@ def judged_of(talk: Talk, results: Results, measured: dict[str, xr.Dataset], sli
 
     Parameters
     ----------
-    talk, results
-        The talk, and the results that there are.
+    talk, results, slide
+        The talk, and the results that there are; takes the names of missing ones.
     measured
         Errors of real captures by the key of their sample, in place of virtual ones.
-    slide
-        Takes the names of missing results.
     """
     names = {sample.name: sample.key for sample in talk.file.samples}
     scores = collected(results, {name: f"scores_{key}" for name, key in names.items()}, slide)

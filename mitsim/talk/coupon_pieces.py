@@ -96,14 +96,10 @@ def characterised(folder: str, coupon_place: CouponPlace, subdivisions: int, ref
 
     Parameters
     ----------
-    folder
-        Folder of the talk.
-    coupon_place
-        The coupon and its distance.
+    folder, coupon_place, seed
+        Folder of the talk, the coupon and its distance, and seed of the choice of patches.
     subdivisions, refined
         Density of the planned orientations, and the largest one of those added.
-    seed
-        Of the choice of patches.
     """
     bands = [Band(up_to_deg=20, subdivisions=subdivisions), Band(up_to_deg=80, subdivisions=max(subdivisions - 1, 0))]
     plan = campaign_of(folder, coupon_place, orientations=bands)
@@ -206,16 +202,10 @@ def hold_out(folder: str, coupon_place: CouponPlace, map_name: str, count: int, 
 
     Parameters
     ----------
-    folder
-        Folder of the talk.
-    coupon_place
-        The coupon and its distance.
-    map_name
-        Map that predicts.
-    count
-        Number of poses.
-    seed
-        Of poses and noise.
+    folder, coupon_place, map_name
+        Folder of the talk, the coupon and its distance, and the map that predicts.
+    count, seed
+        Number of poses; seed of poses and noise.
     """
     prepared, plan = prepared_sensor(sensor_in(folder, coupon_place.sensor)), campaign_of(folder, coupon_place)
     series = replace(plan.series[0], seed=plan.series[0].seed ^ (seed + 1))
@@ -240,16 +230,10 @@ def clouds_of_coupon(folder: str, coupon_place: CouponPlace, map_name: str, angl
 
     Parameters
     ----------
-    folder
-        Folder of the talk.
-    coupon_place
-        The coupon and its distance.
-    map_name
-        Map from which the second cloud is drawn.
-    angle
-        Tilt of the coupon [deg].
-    seed
-        Of the drawn cloud.
+    folder, coupon_place, angle
+        Folder of the talk, the coupon and its distance, and tilt [deg].
+    map_name, seed
+        Map from which the second cloud is drawn, and its seed.
     """
     prepared = prepared_sensor(sensor_in(folder, coupon_place.sensor))
     plan = campaign_of(folder, coupon_place, coupon_px=5000.0)  # as large as the field of view

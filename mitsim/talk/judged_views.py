@@ -56,10 +56,8 @@ def score_of(scores: xr.Dataset, task: Task, measurement: str, kind: str) -> Flo
 
     Parameters
     ----------
-    scores
-        Scores of the views for the measurement.
-    task, measurement
-        The task, and the measurement in it.
+    scores, task, measurement
+        Scores of the views for the measurement, the task, and the measurement in it.
     kind
         A key of :data:`SCORES`.
     """

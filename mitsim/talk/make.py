@@ -77,16 +77,11 @@ def make(
 
     Parameters
     ----------
-    talk
-        The talk.
-    results
-        Those that are kept; new ones are added.
-    folder
-        Output folder, where single virtual measurements are kept.
-    workers
-        Processes or cluster; None for this process.
-    limit
-        Time; None for no limit.
+    talk, results
+        The talk, and the results that are kept; new ones are added.
+    folder, workers, limit
+        Output folder, where single virtual measurements are kept; processes or cluster, None for this process; time,
+        None for no limit.
     measured
         Keys of samples that were captured, and need no virtual measurements.
     """

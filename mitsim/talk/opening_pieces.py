@@ -43,12 +43,10 @@ def projected_frames(folder: str, scene: str, parameters: tuple[tuple[str, str],
 
     Parameters
     ----------
-    folder
-        Folder of the talk.
+    folder, sensor
+        Folder of the talk, and preset, or path of a sensor file.
     scene, parameters
         Path of the artefact's scene, and values of its parameters.
-    sensor
-        Preset, or path of a sensor file.
     """
     chosen = sensor_in(folder, sensor)
     loaded = load_scene(Path(folder) / scene, chosen.wavelength_nm, dict(parameters))

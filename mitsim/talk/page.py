@@ -91,14 +91,10 @@ def write_talk(
 
     Parameters
     ----------
-    talk, results
-        The talk, and the results that there are.
-    folder
-        Output folder.
-    missing
-        Names of results that were not made.
-    measured
-        Errors of real captures, by the key of their sample.
+    talk, results, missing
+        The talk, the results that there are, and names of those that were not made.
+    folder, measured
+        Output folder; errors of real captures, by the key of their sample.
     """
     measured = {} if measured is None else measured
     slides = slides_of(talk, results, measured)

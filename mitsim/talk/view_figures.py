@@ -25,16 +25,12 @@ def sphere(axes: Axes, scores: xr.Dataset, values: Floats, title: str, label: st
 
     Parameters
     ----------
-    axes
-        Where to draw.
+    axes, values, error
+        Where to draw, and values (view,), of an ``error`` the small ones bright, on a logarithmic scale.
     scores
         Scores of the views, with their directions and those left out.
-    values
-        (view,).
     title, label
         Title of the picture, and label of the colour bar with the unit.
-    error
-        Draw small values bright, on a logarithmic scale.
     """
     positions = view_places(scores)
     outside = scores["left_out"].values

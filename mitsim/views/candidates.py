@@ -121,23 +121,19 @@ def candidate_views(
 
     Parameters
     ----------
-    table
-        Table ``[views]``.
+    table, where
+        Table ``[views]``, and its file, for error messages.
     sensor
         Sensor with its working range and its body.
     standoffs
         [mm], ascending: distance of the target from the reference camera along its axis. On a stage it is the distance
         of the stage's origin.
-    centre
-        (3,) [mm] target if the table has none.
-    triangles
-        (n, 3, 3) [mm], part frame: surfaces that the sensor's body must not touch
-        (:func:`mitsim.scene.ray_casting.triangles.triangles`).
+    centre, triangles
+        (3,) [mm] target if the table has none; (n, 3, 3) [mm], part frame: surfaces that the sensor's body must not
+        touch (:func:`mitsim.scene.ray_casting.triangles.triangles`).
     range_mm
         Range in which the target must lie; default the sensor's working range. A view is moved out neither beyond it
         nor as far as the next standoff, which is a separate view.
-    where
-        File of the table, for error messages.
     """
     target = np.asarray(table.target_mm if table.target_mm is not None else centre, float)
     near, far = range_mm or sensor.working_range_mm

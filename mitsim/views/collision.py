@@ -148,14 +148,10 @@ def is_near(part: Obstacle, box: BodyBox, part_from_sensor: Transform, clearance
 
     Parameters
     ----------
-    part
-        From :func:`obstacle`.
-    box
-        In the sensor frame.
-    part_from_sensor
-        Pose of the sensor.
-    clearance
-        [mm].
+    part, part_from_sensor
+        From :func:`obstacle`; pose of the sensor.
+    box, clearance
+        In the sensor frame; [mm].
     """
     centre = part_from_sensor.points(box.centre)
     reach = float(np.linalg.norm(box.half)) + clearance

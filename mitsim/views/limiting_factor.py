@@ -34,16 +34,12 @@ def limiting_factors(
 
     Parameters
     ----------
-    task
-        Features and measurements.
-    measured
-        Of each view, the expected measurements in the order of the task.
-    inputs
-        Of each view, the expected input quantities of its measurements.
-    share
-        R_f (view, feature): share of a feature's points that the rest of the part leaves.
-    possible
-        (measurement, view) Whether the measurement is possible.
+    task, measured, inputs
+        Features and measurements; of each view, the expected measurements in the order of the task, and their expected
+        input quantities.
+    share, possible
+        R_f (view, feature), share of a feature's points that the rest of the part leaves; whether the measurement is
+        possible (measurement, view).
 
     See Also
     --------

@@ -45,14 +45,10 @@ def write_views(folder: str | Path, candidates: Candidates, table: ViewsTable, s
 
     Parameters
     ----------
-    folder
-        Folder to write.
-    candidates
-        The views, and those that were excluded.
-    table
-        Names the axes of the stage and defines the robot's flange.
-    sensor
-        Name of the sensor.
+    folder, candidates
+        Folder to write; the views, and those that were excluded.
+    table, sensor
+        Names the axes of the stage and defines the robot's flange; name of the sensor.
     """
     views, left_out = candidates.views, candidates.left_out
     files = {"poses.csv": _poses_csv(views, table), "poses.json": _poses_json(candidates, table, sensor)}

@@ -19,14 +19,10 @@ def chosen_standoffs(where: str | Path, table: ViewsTable, sensor: Sensor, radiu
 
     Parameters
     ----------
-    where
-        File of the table, for the error.
-    table
-        Table ``[views]``.
-    sensor
-        Sensor with its working range.
-    radius_mm
-        Radius of a ball around the part.
+    where, table
+        Table ``[views]``, and its file, for the error.
+    sensor, radius_mm
+        Sensor with its working range; radius of a ball around the part.
     """
     near, far = sensor.working_range_mm
     for standoff in table.standoffs:
@@ -45,16 +41,10 @@ def characterised_range(
 
     Parameters
     ----------
-    where
-        File of the table, for the error.
-    table
-        Table ``[views]``.
-    sensor
-        Sensor with its working range.
-    standoffs
-        [mm] of the views.
-    distances
-        Characterised distances [mm].
+    where, table
+        Table ``[views]``, and its file, for the error.
+    sensor, standoffs, distances
+        Sensor with its working range; |V| of the views, and characterised ones [mm].
     """
     for standoff in standoffs:
         if not min(distances) <= standoff <= max(distances):

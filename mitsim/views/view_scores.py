@@ -108,16 +108,10 @@ def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above 
 
     Parameters
     ----------
-    scene
-        Scene with the part.
-    task
-        Features and measurements.
-    views
-        Candidate views.
-    predictor
-        Casts the rays of the sensor's full grid.
-    performance_map
-        Map of the sensor.
+    scene, task, views
+        Scene with the part; features and measurements; candidate views.
+    predictor, performance_map
+        Casts the rays of the sensor's full grid; map of the sensor.
     minimum_points
         Least number of points of a shape.
     effects

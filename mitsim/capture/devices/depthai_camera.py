@@ -248,10 +248,8 @@ def fault_of(error: BaseException, dai: Any, where: str, operation: str) -> Base
 
     Parameters
     ----------
-    error
-        Caught error.
-    dai
-        The package ``depthai``.
+    error, dai
+        Caught error, and the package ``depthai``.
     where, operation
         Name of the camera in messages, and operation that failed.
     """

@@ -12,14 +12,10 @@ class DeviceError(MissingEnvironmentError):
 
     Parameters
     ----------
-    where
-        The device, its port and, if it applies, the axis.
-    operation
-        The request to the device.
-    found
-        The reaction of the device.
-    expected
-        The correct reaction.
+    where, operation
+        The device, its port and, if it applies, the axis; the request to it.
+    found, expected
+        Its reaction, and the correct one.
     hint
         What to do about it.
     """
@@ -42,12 +38,8 @@ def check_open(where: str, operation: str, closed: bool, fault: str, again: str 
     ----------
     where, operation
         Name of the device in messages, and operation that is requested.
-    closed
-        Whether the device was closed.
-    fault
-        Operation at which the device failed, "" for no failure.
-    again
-        What to do.
+    closed, fault, again
+        Whether it was closed; operation at which it failed, "" for no failure; what to do.
     """
     if closed or fault:
         found = f"a device that has failed, at {fault}" if fault else "a device that was closed"

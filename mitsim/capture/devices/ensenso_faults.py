@@ -88,14 +88,10 @@ def fault_of(error: BaseException, nxlib: Any, where: str, operation: str, seria
 
     Parameters
     ----------
-    error
-        Caught error.
-    nxlib
-        The package ``ensenso_nxlib``.
+    error, nxlib, serials
+        Caught error, the package ``ensenso_nxlib``, and serial numbers of the cameras that NxLib lists.
     where, operation
         Name of the camera in messages, and operation that failed.
-    serials
-        Serial numbers of the cameras that NxLib lists.
     """
     if isinstance(error, nxlib.NxLibException):
         words, detail = (

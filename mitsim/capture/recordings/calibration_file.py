@@ -139,14 +139,10 @@ def camera_of(calibrated: Calibrated, name: str | None, size: tuple[int, int], w
 
     Parameters
     ----------
-    calibrated
-        Cameras of a calibration.
-    name
-        Name of the camera; None for no choice.
-    size
-        (width, height) [px] of the images; that of the camera must be the same.
-    where
-        File of the images, for messages.
+    calibrated, name
+        Cameras of a calibration, and the name of one of them, None for no choice.
+    size, where
+        (width, height) [px] of the images, which must be that of the camera; their file, for messages.
     """
     cameras = calibrated.rig.cameras
     if name is not None and name not in cameras:

@@ -168,10 +168,8 @@ def scale_to_mm(points: NDArray[np.floating], path: Path, unit: str | None = Non
 
     Parameters
     ----------
-    points
-        As in the file.
-    path
-        The file, for messages.
+    points, path
+        As in the file; the file, for messages.
     unit
         One of :data:`~mitsim.sensor.calibration_qualifiers.LENGTHS_MM`; by default metres if the median distance is
         under :data:`METRES_UNDER`, else millimetres.

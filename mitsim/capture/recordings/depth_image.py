@@ -159,18 +159,13 @@ def depth_capture(
 
     Parameters
     ----------
-    depth
-        (H, W) along the axis of the camera [mm], NaN where missing.
-    calibrated
-        The cameras.
-    where
-        File of the map, for messages.
-    settings
-        Records of the import.
-    camera
-        Name of the camera; by default the first.
-    sensor
-        Name of the sensor; by default that of the calibration, or ``depth-camera``.
+    depth, where
+        (H, W) along the axis of the camera [mm], NaN where missing; file of the map, for messages.
+    calibrated, settings
+        The cameras, and records of the import.
+    camera, sensor
+        Name of the camera, by default the first; that of the sensor, by default of the calibration, or
+        ``depth-camera``.
     """
     height, width = depth.shape
     name, eye = camera_of(calibrated, camera, (width, height), where)

@@ -222,14 +222,10 @@ def advice(files: list[Path], camera: str, count: int, ambient_image: bool) -> s
 
     Parameters
     ----------
-    files
-        Files of the images.
-    camera
-        Name of the camera, as in the sensor file.
-    count
-        Number of images that the pattern needs.
-    ambient_image
-        Whether the last of these is without the projector.
+    files, camera
+        Files of the images, and name of the camera, as in the sensor file.
+    count, ambient_image
+        Number of images that the pattern needs, and whether the last of these is without the projector.
     """
     if gap := gap_in(files):
         return gap

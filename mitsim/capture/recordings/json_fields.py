@@ -24,10 +24,8 @@ def parsed_json(
 
     Parameters
     ----------
-    data, where
-        The text, and file that messages name.
-    expected
-        What it should be, for messages.
+    data, where, expected
+        The text; for messages its file, and what it should be.
     constant
         Returns the value of ``NaN`` and of the infinities, which JSON does not have; by default null.
     """

@@ -156,12 +156,10 @@ def chosen_frame(frame: int | None, count: int, where: Path, label: str) -> int:
 
     Parameters
     ----------
-    frame
-        Number of the frame, None if none was chosen.
-    count, where
-        Number of frames, and file that messages name.
-    label
-        Name of the frames in messages, in the plural.
+    frame, count
+        Number of the frame, None if none was chosen, and number of frames.
+    where, label
+        For messages: the file, and the name of the frames in the plural.
     """
     if frame is None and count > 1:
         allowed, hint = "one in a capture", f"choose with --frame 0 to {count - 1}"

@@ -109,10 +109,8 @@ def pair_capture(
 
     Parameters
     ----------
-    levels
-        Images (H, W) [DN] by name of their camera, the left one first.
-    places
-        File or topic of each, for messages.
+    levels, places
+        Images (H, W) [DN] by name of their camera, the left one first; file or topic of each, for messages.
     calibrated, settings
         The cameras, and records of the import.
     sensor

@@ -123,14 +123,10 @@ def measured(capture: Capture, shot: Shot, geometry: Geometry, sensor: Sensor, k
 
     Parameters
     ----------
-    capture
-        Capture of the coupon.
-    shot
-        The shot that the capture belongs to.
-    geometry
-        That of the rig of ``sensor``.
-    sensor
-        Sensor of the campaign; pose and calibration are those of the capture, if it has them.
+    capture, shot
+        Capture of the coupon, and its shot.
+    sensor, geometry
+        Sensor of the campaign, and geometry of its rig; pose and calibration are those of the capture, if it has them.
     keep_images
         Whether the result contains the capture.
     """
@@ -194,12 +190,8 @@ def coupon_cloud(capture: Capture, coupon: Coupon, geometry: Geometry, sensor: S
 
     Parameters
     ----------
-    capture
-        Capture of the coupon.
-    coupon
-        At its pose in the sensor frame.
-    geometry
-        That of the capture.
+    capture, coupon, geometry
+        Capture of the coupon, the coupon at its pose in the sensor frame, and geometry of the capture.
     sensor
         Gives the decoder, and the imager if the capture does not state its own.
     """

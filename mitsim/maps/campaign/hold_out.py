@@ -161,14 +161,10 @@ def compare(
 
     Parameters
     ----------
-    campaign
-        The campaign of the map.
-    performance_map
-        The map that predicts.
-    shots
-        Shots that the map was not made from.
-    take
-        Takes a shot.
+    campaign, performance_map
+        The campaign of the map, and the map that predicts.
+    shots, take
+        Shots that the map was not made from, and the function that takes one.
     repeats
         Captures of each shot, as in :func:`compared`.
     """
@@ -188,16 +184,10 @@ def compared(
 
     Parameters
     ----------
-    shot
-        The shot to take and to predict.
-    prepared
-        The sensor, prepared once.
-    performance_map
-        The map that predicts.
-    take
-        Takes a shot.
-    repeats
-        Number of captures with fresh noise.
+    shot, repeats
+        The shot to take and to predict, and the number of captures with fresh noise.
+    prepared, performance_map, take
+        The sensor, prepared once; the map that predicts; takes a shot.
     """
     sensor = prepared.sensor
     seeds = (shot.series.seed + 2**32 * number for number in range(MOST_REPEATS * repeats))
@@ -256,14 +246,10 @@ def held_out_orders(campaign: Campaign, shots: list[Shot], map_path: Path, repea
 
     Parameters
     ----------
-    campaign
-        The campaign of the map.
-    shots
-        Shots that the map was not made from.
+    campaign, shots, repeats
+        The campaign of the map, shots that the map was not made from, and captures of each.
     map_path
         Path of the map, the same on every machine.
-    repeats
-        Captures of each shot.
     """
     path, digest = str(map_path.absolute()), _digest(map_path)
     return [HeldOutOrder(order_of(shot, campaign), path, digest, repeats) for shot in shots]

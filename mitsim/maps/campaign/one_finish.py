@@ -157,14 +157,10 @@ def one_finish_campaign(finish: OneFinish, distance: float, file: CampaignFile, 
 
     Parameters
     ----------
-    finish
-        The finish, and the sensor that characterises it.
-    distance
-        [mm].
-    file
-        The plan, from :func:`plan_of`.
-    lay_deg
-        Angle of u [deg], if the finish has a lay.
+    finish, distance
+        The finish with the sensor that characterises it, and |V| [mm].
+    file, lay_deg
+        The plan, from :func:`plan_of`; angle of u [deg], if the finish has a lay.
     """
     half = half_size(finish.sensor, distance, COUPON_PX if file.coupon_px is None else file.coupon_px)
     recipe = CouponRecipe(finish.finish.name, (), finish.sensor.wavelength_nm)
@@ -183,12 +179,8 @@ def characterise_finish(finish: OneFinish, simulated: SimulatedSensor, distance:
 
     Parameters
     ----------
-    finish
-        The finish, and the sensor that characterises it.
-    simulated
-        The sensor on the device.
-    distance
-        [mm].
+    finish, simulated, distance
+        The finish with the sensor that characterises it, that sensor on the device, and |V| [mm].
     folder
         Empty folder for the captures.
     """

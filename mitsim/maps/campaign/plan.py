@@ -138,14 +138,11 @@ def plan_campaign(
 
     Parameters
     ----------
-    path, file
-        The campaign file, and its content.
-    sensor
-        Sensor to characterise.
-    distances_mm
-        Distances if the file has none.
-    stage_tables
-        Live stage as calibrated at each distance, for captures with the file's ``device``.
+    path, file, sensor
+        The campaign file, its content, and the sensor to characterise.
+    distances_mm, stage_tables
+        Distances if the file has none; live stage as calibrated at each distance, for captures with the file's
+        ``device``.
     """
     if file.device is not None and stage_tables is None:
         hint = "only campaigns and validations of maps take captures with a device"
@@ -203,14 +200,10 @@ def coupon_pose(
 
     Parameters
     ----------
-    normal
-        (3,) in the view frame (z toward the sensor, x toward the second eye).
-    distance
-        |V| [mm].
-    axis
-        (3,) unit view direction in the sensor frame.
-    eye
-        (3,) position of the camera [mm]; default the origin.
+    normal, distance
+        (3,) in the view frame (z toward the sensor, x toward the second eye), and |V| [mm].
+    axis, eye
+        (3,) unit view direction and (3,) position of the camera [mm], by default the origin, in the sensor frame.
     """
     z = view_axes(axis) @ normal
     x = np.cross([0.0, 1.0, 0.0], z)

@@ -58,10 +58,8 @@ def pose_doubt(cloud: PointCloud, decode: Decode, sample: Sample, sensor_from_co
 
     Parameters
     ----------
-    cloud
-        Of the coupon at its pose, sensor frame.
-    decode
-        Gives the cloud of the same capture about a coupon at another place.
+    cloud, decode
+        Cloud of the coupon at its pose, sensor frame; gives that of the same capture about a coupon at another place.
     sample, sensor_from_coupon
         The coupon, and its pose [mm].
     """

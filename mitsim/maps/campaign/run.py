@@ -72,14 +72,10 @@ def measure_captures(campaign: Campaign, shots: Sequence[Shot], source: Source, 
 
     Parameters
     ----------
-    campaign
-        The planned campaign.
-    shots
-        From :func:`~mitsim.maps.campaign.acquire.found_shots`.
-    source
-        Returns their results.
-    folder
-        For the map and the measured shots.
+    campaign, folder
+        The planned campaign, and the folder for the map and the measured shots.
+    shots, source
+        From :func:`~mitsim.maps.campaign.acquire.found_shots`; returns their results.
     """
     captures = Path(folder) / KEPT
     captures.mkdir(parents=True, exist_ok=True)

@@ -138,12 +138,8 @@ def write_stage_calibration(
 
     Parameters
     ----------
-    path
-        File to write.
-    fit
-        Calibrated axes.
-    names
-        Names of the axes, as in the campaign's ``[stage]``.
+    path, fit, names
+        File to write, the calibrated axes, and their names, as in the campaign's ``[stage]``.
     board_from_coupon
         The coupon's middle and axes on the board, z out of the face toward the sensor. Default: the coupon's frame is
         that of the board.

@@ -125,14 +125,10 @@ def phase_bias(
 
     Parameters
     ----------
-    direct
-        A_1 (H, W).
-    indirect
-        Two renders of A_2 (H, W).
-    shape
-        (H, W) shape that each pixel shows, -1 for none.
-    step
-        Number of sensor pixels per pixel along an axis.
+    direct, indirect
+        A_1 (H, W), and two renders of A_2 (H, W).
+    shape, step
+        (H, W) shape that each pixel shows, -1 for none; number of sensor pixels per pixel along an axis.
     """
     size = np.abs(direct)
     # scale first: squares of radiances are too small for single precision

@@ -57,10 +57,8 @@ def path_bias(
         Complex amplitudes A_1 and A_2 (F, H, W) [DN].
     code, settings, imager
         Of the sensor.
-    shape
-        (H, W) shape that a pixel shows, -1 for none.
-    step
-        Number of sensor pixels per pixel along an axis.
+    shape, step
+        (H, W) shape that a pixel shows, -1 for none; number of sensor pixels per pixel along an axis.
     """
     size, direct_phase = np.abs(direct), np.angle(direct)
     turned = other * np.exp(-1j * direct_phase)

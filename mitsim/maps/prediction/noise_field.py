@@ -75,14 +75,10 @@ def correlated_noise(
 
     Parameters
     ----------
-    scene
-        Scene with the finishes of the shapes.
-    performance_map
-        Gives noise areas and persistent noise.
-    mapped
-        The view, with normals.
-    rng
-        Random generator.
+    scene, performance_map
+        Scene with the finishes of the shapes; map with noise areas and persistent noise.
+    mapped, rng
+        The view, with normals, and the random generator.
     """
     assert mapped.normal is not None
     predicted = np.isfinite(mapped.sigma)

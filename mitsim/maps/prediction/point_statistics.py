@@ -29,12 +29,8 @@ def performance(
 
     Parameters
     ----------
-    ideal
-        Points of the view.
-    scene
-        Scene with the finishes of the shapes.
-    performance_map
-        Map of the sensor.
+    ideal, scene, performance_map
+        Points of the view, scene with the finishes of the shapes, and map of the sensor.
     finish
         Replaces the finishes of the scene: matt white, to normalise the view score.
     """
@@ -124,18 +120,12 @@ def expected_points(
 
     Parameters
     ----------
-    view
-        Ideal points of the view.
-    scene
-        Scene with the shapes.
-    shape
-        Index into the scene's names.
-    performance_map
-        Gives noise areas and persistent noise.
+    view, scene, shape
+        Ideal points of the view, the scene, and the index of the shape into its names.
+    performance_map, answers
+        Map with noise areas and persistent noise, and what it answers for all points of the view, if that is known.
     perturbation
         Effects that flat coupons cannot show (:mod:`mitsim.maps.prediction.perturbation`).
-    answers
-        Of the map for all points of the view, if they are known.
     """
     ideal, labels, world_from_sensor = view.ideal, view.labels, view.world_from_sensor
     finish = scene.finishes[shape]

@@ -250,10 +250,8 @@ class Predictor:
 
         Parameters
         ----------
-        scene
-            Scene with the shapes.
-        ideal, labels
-            Points of the view, and the shapes (H, W) that the pixels show.
+        scene, ideal, labels
+            Scene with the shapes, points of the view, and the shapes (H, W) that the pixels show.
         fraction, sigma
             F and sigma [mm] (n,); NaN where the map has no answer. Such points are lost.
         rng

@@ -103,14 +103,10 @@ def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train
 
     Parameters
     ----------
-    sources
-        Captures, as :func:`find_sources` returns them.
-    output
-        Folder to write.
-    split
-        Name of the split: train, val or test.
-    patterns
-        Patterns of the shapes of each object (:func:`objects_of`).
+    sources, patterns
+        Captures, as :func:`find_sources` returns them; patterns of the shapes of each object (:func:`objects_of`).
+    output, split
+        Folder to write, and name of the split: train, val or test.
     """
     output = Path(output).absolute()
     if output.exists():

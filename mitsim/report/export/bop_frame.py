@@ -58,10 +58,8 @@ def bop_frame(capture: Capture, scene: Scene, objects: Sequence[Scene], where: s
     ----------
     capture, where
         The capture, and its folder for errors.
-    scene
-        The scene that was rendered.
-    objects
-        Parts of the scene (:meth:`mitsim.scene.load.Scene.only`).
+    scene, objects
+        The scene that was rendered, and parts of it (:meth:`mitsim.scene.load.Scene.only`).
     """
     if capture.world_from_sensor is None:
         raise InputError(where, "pose.json", "no pose", "a capture whose pose in the part frame is known")

@@ -50,6 +50,10 @@ class SensorMap:
             (3, 3), pixel centres at integers.
         finish, roughness
             Material and finish, and Ra [um].
+
+        See Also
+        --------
+        draw : a depth image with such errors
         """
         rays, length = self._rays(np.shape(depth), K)
         return self.look_up(np.asarray(depth) * length, self._in_view_frame(normals, rays), finish, roughness)
@@ -63,6 +67,10 @@ class SensorMap:
             As for :meth:`image`.
         rng
             Generator of the draws.
+
+        See Also
+        --------
+        image : F and sigma of the view
         """
         fraction, sigma = self.image(depth, normals, K, finish, roughness)
         _, length = self._rays(np.shape(depth), K)
@@ -82,6 +90,10 @@ class SensorMap:
             N (..., 3) unit, view frame.
         finish, roughness
             Material and finish, and Ra [um].
+
+        See Also
+        --------
+        image : of all pixels of a view
         """
         probit, log_sigma = self._surface(finish, roughness)
         n = np.asarray(normals, float)

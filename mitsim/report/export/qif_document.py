@@ -192,12 +192,10 @@ def zone(name: str, task: Task, asked: Measurement, frame: str | None) -> dict[s
 
     Parameters
     ----------
-    name
-        Of the characteristic, one of :data:`GEOMETRIC`.
+    name, frame
+        One of :data:`GEOMETRIC`, and id of the datum reference frame, None without datums.
     task, asked
         The task, and its measurement with a tolerance [mm].
-    frame
-        Id of the datum reference frame, None without datums.
     """
     shape = _zone_shape(name, *(task.features[feature].kind for feature in asked.features))
     return {

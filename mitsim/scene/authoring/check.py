@@ -78,10 +78,8 @@ def findings(
 
     Parameters
     ----------
-    facts
-        About the scene.
-    sensor, pose, visible
-        The sensor, its pose, and what it sees from there.
+    facts, sensor, pose, visible
+        About the scene; the sensor, its pose, and what it sees from there.
     posed
         Whether the author chose the pose; then shapes outside the working volume are reported.
     task

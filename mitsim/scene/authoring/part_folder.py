@@ -104,10 +104,9 @@ def read_part(
     ----------
     path, units
         The file, and its unit of length if it states none.
-    angle_deg
-        Of a mesh: neighbouring triangles with a smaller angle between them belong to one face.
-    fineness
-        Of the mesh of a STEP file.
+    angle_deg, fineness
+        Of a mesh: neighbouring triangles with a smaller angle between them belong to one face; of the mesh of a STEP
+        file.
     """
     path = Path(path)
     check_part_file(path, units)
@@ -140,10 +139,8 @@ def write_part(
     ----------
     path, units, angle_deg, fineness
         As for :func:`read_part`.
-    folder
-        To be made.
-    finishing
-        Finish of all faces; ground aluminium by default.
+    folder, finishing
+        To be made; finish of all faces, ground aluminium by default.
     """
     path, folder = Path(path), Path(folder).absolute()
     finishing = finishing or Finishing()

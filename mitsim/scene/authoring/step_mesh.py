@@ -46,10 +46,8 @@ def mesh_together(faces: list[Any], chord: float, bend: float, delabella: bool =
 
     Parameters
     ----------
-    faces
-        To be meshed.
-    chord, bend
-        Largest distance from the surface [mm], and angle between facets [rad].
+    faces, chord, bend
+        To be meshed; largest distance from the surface [mm], and angle between facets [rad].
     delabella
         Which of OpenCASCADE's two ways connects the same points. Delabella takes a seventeenth of the time for 146,000
         triangles of a torus.
@@ -101,10 +99,8 @@ def fitted_chords(faces: list[Any], kinds: list[str], chord: float, largest_chor
     ----------
     faces, kinds
         Meshed faces, and the kinds of their surfaces.
-    chord, largest_chord
-        Least and largest chord.
-    fitted
-        Chord of a face whose radius has the standard uncertainty 1, as for :func:`mesh`.
+    chord, largest_chord, fitted
+        Least and largest chord; chord of a face whose radius has the standard uncertainty 1, as for :func:`mesh`.
     """
     out = np.full(len(faces), chord)
     for number, (face, kind) in enumerate(zip(faces, kinds, strict=True)):
@@ -135,10 +131,8 @@ def chords(
     ----------
     kinds, counts, coarse
         Kinds (n,) of the surfaces, and their triangles (n,) at the chord ``coarse``.
-    chord, other_chord
-        Of faces that a task can measure, one or for each face, and of other faces.
-    most
-        Triangles of all faces.
+    chord, other_chord, most
+        Of faces that a task can measure, one or for each face, and of other faces; triangles of all faces.
     """
     measured = np.array([kind in MEASURED for kind in kinds])
     out = np.where(measured, chord, other_chord)

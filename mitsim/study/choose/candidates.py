@@ -88,10 +88,8 @@ def open_candidate(path: Path, file: StudyFile, text: str, ask: Ask | None) -> C
 
     Parameters
     ----------
-    path, file
-        Path of the study file, and its content.
-    text
-        The sensor, as in :func:`read_candidates`.
+    path, file, text
+        Path of the study file, its content, and the sensor, as in :func:`read_candidates`.
     ask
         Answers whether finishes that its map lacks may be characterised now; None if nobody can answer.
     """

@@ -54,15 +54,11 @@ def state_by_screening(result: SensorResult, count: int, limit: TimeLimit, whole
 
     Parameters
     ----------
-    result
-        Results of the sensor so far, which get the statement.
-    count
-        Number of trials.
-    limit
-        Time of the sensor. If it ends before there are a few trials, the sensor gets these within ``whole``: the light
-        paths of its view are traced by then.
-    whole
-        Time of the comparison.
+    result, count
+        Results of the sensor so far, which get the statement, and number of trials.
+    limit, whole
+        Time of the sensor, and of the comparison. If that of the sensor ends before there are a few trials, it gets
+        these within ``whole``: the light paths of its view are traced by then.
     """
     for view in shortlist(result.scores, 1):
         _state(result, view, count, limit)

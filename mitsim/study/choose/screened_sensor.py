@@ -34,15 +34,11 @@ def screen_sensor(candidate: CandidateSensor, session: Session, limit: TimeLimit
 
     Parameters
     ----------
-    candidate
-        The sensor, with the study for it.
-    session
-        Its session, with the folder of the sensor.
-    limit
-        Time of the screening of this sensor.
-    equal
-        The sensor's share [s] of the time for screening, before sensors leave some of theirs. Kept scores of fewer
-        views are used again if it is hardly longer than theirs was.
+    candidate, session
+        The sensor, with the study for it; its session, with the folder of the sensor.
+    limit, equal
+        Time of the screening of this sensor; its share [s] of the time for screening, before sensors leave some of
+        theirs. Kept scores of fewer views are used again if it is hardly longer than theirs was.
     """
     study, path = session.study, session.folder / "scores.nc"
     session.folder.mkdir(parents=True, exist_ok=True)

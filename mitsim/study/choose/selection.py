@@ -64,16 +64,12 @@ def choose_sensor(
 
     Parameters
     ----------
-    candidates
-        Sensors, each with the study for it.
-    folder
-        Finished work is kept in a folder of it for each sensor.
-    limit
-        Time of the whole, shared among the sensors.
+    candidates, folder
+        Sensors, each with the study for it; finished work is kept in a folder of ``folder`` for each.
+    limit, workers
+        Time of the whole, shared among the sensors; processes or cluster that make the trials, by default this process.
     report_results
         Receives the results so far after each sensor, and whether they are final: not where time ended the work.
-    workers
-        Processes or cluster that make the trials; by default this process makes them.
     """
     results = list[SensorResult]()
     screening = limit.part(_SCREENING_SHARE)

@@ -48,16 +48,12 @@ def document(
 
     Parameters
     ----------
-    study
-        Study of any of the sensors.
-    found
-        Results of the compared sensors, in the order of the document.
-    excluded
-        Sensors that cannot be compared; they come last.
-    seconds
-        Duration of the comparison so far [s].
-    finished
-        Whether the comparison is complete, if no sensor lacks views or measurements for want of time.
+    study, found, excluded
+        Study of any of the sensors, results of those that are compared, in order, and those that cannot be, which come
+        last.
+    seconds, finished
+        Duration of the comparison so far [s]; whether it is complete, if no sensor lacks views or measurements for want
+        of time.
     """
     task = study.task
     named_measurements = {

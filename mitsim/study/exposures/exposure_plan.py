@@ -133,18 +133,13 @@ def plan_exposures(
     ----------
     evaluate
         Function of a set of exposures, the number of the noise and the number of its samples, which returns the result.
-    default
-        The sensor's own exposures, from which the search starts.
-    limits_s
-        Shortest and longest exposure of the device [s].
+    default, limits_s
+        The sensor's own exposures, from which the search starts; shortest and longest exposure of the device [s].
     rules
         Largest number of exposures, and the share by which a limit may be missed.
-    dimmable
-        Whether the power may be lowered if the shortest exposure is too bright.
-    view
-        Number of the view, for the plan.
-    over
-        Returns whether time is over.
+    dimmable, view, over
+        Whether the power may be lowered if the shortest exposure is too bright; number of the view, for the plan;
+        returns whether time is over.
     """
     search, decision, report = (_Results(evaluate, noise, over) for noise in (SEARCH, DECISION, REPORT))
     try:

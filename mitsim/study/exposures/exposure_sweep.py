@@ -132,14 +132,12 @@ def feature_result(
 
     Parameters
     ----------
-    cloud
-        Organised cloud in the sensor frame [mm].
+    cloud, surface
+        Organised cloud, and nominal surface, in the sensor frame [mm].
     pixel
         (n,) flat indices of the possible points in the grid.
     derivatives
         (n, p) derivatives at the possible points of the distance along the ray with respect to the parameters.
-    surface
-        Nominal surface in the sensor frame [mm].
     """
     points = cloud.points.reshape(-1, 3)[pixel].astype(float)
     finite = np.isfinite(points).all(axis=1)

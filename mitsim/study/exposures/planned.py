@@ -60,10 +60,8 @@ def kept_plan(
     ----------
     renderer, view, rules, limit
         As of :func:`plan_view`.
-    folder
-        Of the plans of a study.
-    digest
-        Of all that determines a trial: a plan of another digest is made again.
+    folder, digest
+        Of the plans of a study; of all that determines a trial: a plan of another digest is made again.
     """
     path = folder / f"view_{view.number:04d}.json"
     digest_of_plan = with_exposure(digest, None, asdict(rules))

@@ -81,22 +81,16 @@ class Change:
     kind
         ``bias``, ``view``, ``nearer``, ``exposure``, ``repeats``, ``light``, ``calibration``, ``temperature``,
         ``views``, ``spray``, ``decoder`` or ``sensor``.
-    words
-        The change, to follow "it would fit": ``sprayed matt white``.
-    keys
-        Keys of the study's TOML file that make the change; of the task for ``bias``.
-    views
-        Numbers of the views that measure, of the changed study.
-    expected
-        Least standard uncertainty, in its unit, of each measurement that can fit.
-    state
-        Makes the virtual measurements; raises :class:`InputError` if the change is impossible.
-    captures
-        Number of captures whose mean is taken.
-    release
-        Frees the memory of its measurements.
-    needs_trials
-        Whether it takes virtual measurements of its own.
+    words, keys
+        The change, to follow "it would fit": ``sprayed matt white``; keys of the study's TOML file that make it, of the
+        task for ``bias``.
+    views, expected
+        Numbers of the views that measure, of the changed study; least standard uncertainty, in its unit, of each
+        measurement that can fit.
+    state, release
+        Makes the virtual measurements, raises :class:`InputError` if the change is impossible; frees their memory.
+    captures, needs_trials
+        Number of captures whose mean is taken; whether it takes virtual measurements of its own.
     """
 
     kind: str

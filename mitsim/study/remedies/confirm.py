@@ -95,14 +95,11 @@ def find_remedies(
         Statements of the measurements that do not fit, by name.
     proposed
         Changes, the least effort first; each is asked for only when those before it do not suffice.
-    trials
+    trials, trial_s
         Virtual measurements of a change; a quarter of them can exclude it, and four times as many may decide it.
-    limit
-        Time; none by default.
-    before
-        What was tried before. It is not tried again, and is part of the result.
-    trial_s
-        Expected time of a virtual measurement [s]: a change that time does not suffice for the fewest of is not tried.
+        Expected time of one [s]: a change that time does not suffice for the fewest of is not tried.
+    limit, before
+        Time, none by default; what was tried before: it is not tried again, and is part of the result.
     """
     earlier = Remedies(missed) if before is None else before
     remedies, limit = Remedies(missed, list(earlier.tried), list(earlier.failed)), limit or TimeLimit()

@@ -48,14 +48,10 @@ def state_and_mend(
 
     Parameters
     ----------
-    session
-        The study, being measured.
-    now
-        The statement of its best view so far.
+    session, now, clock
+        The study, being measured; the statement of its best view so far; times of the steps of the run.
     limit
         Time of all of it; without a limit the statement is finished, and changes have a time of their own.
-    clock
-        Times of the steps of the run.
     """
     made = _trials(now.stated)
     trial_s = clock.steps.get("state", 0.0) / made if made else 0.0
@@ -93,12 +89,10 @@ def in_turn(stated: StatedView, state: Stating, mend: Mending, limit: TimeLimit)
 
     Parameters
     ----------
-    stated
-        The statement so far.
+    stated, limit
+        The statement so far, and time of all of it.
     state, mend
         Make more virtual measurements of the view, and of changes.
-    limit
-        Time of all of it.
     """
     remedies, all_tried = None, False
     if not _decided(stated):

@@ -29,14 +29,10 @@ def state_mean(session: Session, view: View, captures: int, count: int, limit: T
 
     Parameters
     ----------
-    session, view
-        Of the study, and the view at its exposures.
-    captures
-        Number of captures of a day.
-    count
-        Largest number of days.
-    limit
-        Time.
+    session, view, limit
+        Of the study, the view at its exposures, and the time.
+    captures, count
+        Number of captures of a day, and largest number of days.
     """
     study, source = session.study, session.trials_of(view)
     trials = source.folder

@@ -91,14 +91,10 @@ def confirmed_set(
 
     Parameters
     ----------
-    session
-        The study, with a table ``set``.
-    first
-        Set that is measured first.
-    search
-        Finds a set for other limits.
-    over
-        Returns whether time is over.
+    session, first
+        The study, with a table ``set``, and the set that is measured first.
+    search, over
+        Finds a set for other limits; returns whether time is over.
     """
     table = session.study.file.set
     assert table is not None

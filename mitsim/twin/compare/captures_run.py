@@ -88,20 +88,16 @@ def validate_captures(
 
     Parameters
     ----------
-    real
-        Folder of the real capture, or of one of a maker's virtual camera.
-    simulated
-        Folder of the simulated capture; None rebuilds ``real`` with a sensor.
-    output
-        Folder for ``comparison.json`` and the twin.
-    sensor
-        Preset or sensor file of the twin; None is the preset that ``real`` names.
+    real, simulated
+        Folder of the real capture, or of one of a maker's virtual camera; folder of the simulated one, None rebuilds
+        ``real`` with a sensor.
+    output, seed
+        Folder for ``comparison.json`` and the twin; seed of the twin's noise and of the bootstrap.
+    sensor, projector
+        Preset or sensor file of the twin, None is the preset that ``real`` names; ``on`` or ``off``, None is what the
+        settings of ``real`` say.
     roi
         Region of the reference image [px] that shows only the specimen; None is the plane of most points.
-    projector
-        ``on`` or ``off``; None is what the settings of ``real`` say.
-    seed
-        Of the twin's noise and of the bootstrap.
     """
     recorded = read_capture(real)
     if simulated is None and rendered_here(recorded):

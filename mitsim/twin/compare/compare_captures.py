@@ -129,19 +129,15 @@ def compare_captures(
 
     Parameters
     ----------
-    real, simulated
-        The two captures.
+    real, simulated, settings
+        The two captures, and the settings of the decoder for both.
     specimen
         Pose and extent of the specimen in the real capture's sensor frame; its pixels are evaluated in both captures.
-    settings
-        Settings of the decoder, the same for both.
-    where
-        Name of the simulated capture in messages.
+    where, seed
+        Name of the simulated capture in messages; selects the draws of the bootstrap.
     projector_on
         State of the projector in the real capture. If only one of the captures has a pattern, quantities that need one
         are not comparable.
-    seed
-        Selects the draws of the bootstrap.
     """
     _check(real, simulated, where)
     window = contrast_window(real, specimen)

@@ -88,16 +88,11 @@ def texture_of(specimen: Specimen, camera: Camera, electrons: Floats, light: Lig
 
     Parameters
     ----------
-    specimen
-        Pose and extent of the plate.
-    camera
-        Camera that took the image.
-    electrons
-        Recorded plain image (H, W) [e-].
-    light
-        Light of a white plate on the imagers, of the region of the image that shows the plate.
-    name
-        Name of the camera in ``light``.
+    specimen, camera, electrons
+        Pose and extent of the plate; the camera, and the plain image (H, W) [e-] that it recorded.
+    light, name
+        Light of a white plate on the imagers, of the region of the image that shows the plate, and name of the camera
+        in it.
     """
     roi = light.rois[name]
     inside = roi.slices
@@ -125,16 +120,10 @@ def printed(
 
     Parameters
     ----------
-    light
-        Light of a white specimen on the imager of the only camera.
-    specimen
-        Pose and extent of the specimen.
-    camera
-        Camera that took the image.
-    electrons
-        Recorded plain image (H, W) [e-].
-    name
-        Name of the camera in ``light``.
+    light, name
+        Light of a white specimen on the imager of the only camera, and name of the camera in it.
+    specimen, camera, electrons
+        Pose and extent of the specimen; the camera, and the plain image (H, W) [e-] that it recorded.
     plain
         The images whose largest level is the plain image.
     """

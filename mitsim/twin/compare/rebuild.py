@@ -76,18 +76,14 @@ def rebuild(
 
     Parameters
     ----------
-    real
-        Recorded capture.
+    real, where
+        Recorded capture, and its name in messages.
     sensor
         Supplies projector, pattern and imager in place of those of the device.
     specimen
         Pose and extent of the specimen, from :func:`mitsim.twin.finish.find_specimen.find_specimen`.
-    where
-        Name of the recorded capture in messages.
-    projector_on
-        If false, the plate has the texture that the reference camera recorded, and even light.
-    seed
-        Selects the noise of the simulation.
+    projector_on, seed
+        If false, the plate has the texture that the reference camera recorded, and even light; selects the noise.
     """
     check_technology(real, sensor, where)
     twin_sensor = like(real, sensor, where)

@@ -95,16 +95,10 @@ def specimen_patches(
 
     Parameters
     ----------
-    capture
-        Capture of a flat specimen.
-    settings
-        Settings of its decoder.
-    geometry
-        Geometry of its decoder.
-    specimen
-        Pose and extent of the specimen, in the sensor frame of the capture.
-    window_px
-        Side of the window of local mean and deviation [px].
+    capture, settings, geometry
+        Capture of a flat specimen, and settings and geometry of its decoder.
+    specimen, window_px
+        Pose and extent of the specimen, in the sensor frame; side of the window of local mean and deviation [px].
     """
     camera, image = capture.rig.reference, reference_levels(capture).astype(float)
     on_image = image_mask(specimen, camera, MARGIN_PX)
@@ -161,12 +155,8 @@ def patch_rows(
 
     Parameters
     ----------
-    capture
-        Capture of a flat specimen.
-    settings
-        Settings of its decoder.
-    geometry
-        Rectified geometry of its pair of cameras.
+    capture, settings, geometry
+        Capture of a flat specimen, settings of its decoder, and rectified geometry of its pair of cameras.
     specimen
         Pose and extent of the specimen.
     """

@@ -63,14 +63,10 @@ def seen_target(shape: str, window: Roi | None, cloud: PointCloud, name: str, di
 
     Parameters
     ----------
-    shape
-        ``plane`` or ``sphere``.
-    window
-        Of the recorded grid [px]; None is all.
-    cloud
-        Recorded cloud.
-    name
-        Name of the target in messages.
+    shape, name
+        ``plane`` or ``sphere``, and name of the target in messages.
+    cloud, window
+        Recorded cloud, and the target's window of its grid [px]; None is all.
     distance
         True distance of a plane that is perpendicular to the axis of the grid [mm], in place of the recorded plane.
     """
@@ -94,16 +90,10 @@ def simulated_target(
 
     Parameters
     ----------
-    target
-        The target.
-    recorded
-        Cloud in whose grid its window lies.
-    sensor
-        Sensor to simulate.
-    name
-        Name of the target in messages.
-    seed
-        Of the noise.
+    target, recorded, name
+        The target, the cloud in whose grid its window lies, and its name in messages.
+    sensor, seed
+        Sensor to simulate, and seed of the noise.
     """
     shown = _shown_points(target, recorded.grid)
     near, far = sensor.settings.near_mm, sensor.settings.far_mm

@@ -56,10 +56,8 @@ def pixel_noise(imager: Imager, chip: Imager, count: int, exposure_s: float, amb
 
     Parameters
     ----------
-    imager
-        Source of the noise.
-    chip
-        The imager with the capture's number of bits (:func:`chip_of`).
+    imager, chip
+        Source of the noise, and the imager with the capture's number of bits (:func:`chip_of`).
     count, exposure_s
         Number of images, and their exposure [s].
     ambient
@@ -96,14 +94,10 @@ def sensor_of(capture: Capture, name: str | None, where: str | Path, purpose: Pu
 
     Parameters
     ----------
-    capture
-        It may name its sensor.
-    name
-        Of a preset, or path of a sensor file; None for the capture's.
-    where
-        The capture, for errors.
-    purpose
-        What the sensor is for.
+    capture, where
+        It may name its sensor; name of the capture, for errors.
+    name, purpose
+        Of a preset, or path of a sensor file, None for the capture's; what the sensor is for.
     """
     if name is None and capture.sensor not in presets():
         found = f"none, and {where} comes from {capture.sensor}, which is not a preset"

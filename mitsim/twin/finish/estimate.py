@@ -167,14 +167,10 @@ def refine(problem: Problem, start: Floats, variance: Floats, use: NDArray[np.bo
 
     Parameters
     ----------
-    problem
-        Blocks of all views.
-    start
-        Parameters to start from.
-    variance
-        Of the block means [e-^2], (blocks,).
-    use
-        Which blocks count, (blocks,).
+    problem, start
+        Blocks of all views, and parameters to start from.
+    variance, use
+        Of the block means [e-^2], (blocks,); which blocks count, (blocks,).
     """
     low, high, inner = np.zeros(len(start)), np.full(len(start), np.inf), start.copy()
     first = 0

@@ -131,12 +131,10 @@ def find_coupon(
 
     Parameters
     ----------
-    capture, sensor
-        Capture of the coupon, and the sensor whose decoder and imager it is read with.
+    capture, sensor, where
+        Capture of the coupon, the sensor whose decoder and imager it is read with, and its name in messages.
     size
         Width and height of the coupon [mm].
-    where
-        Name of the capture in messages.
     roi
         Image region that shows the coupon. Without it the coupon follows from the capture's pose, otherwise from the
         plane of its cloud.
@@ -167,14 +165,11 @@ def on_specimen(specimen: Specimen, origin: Floats, rays: Floats, pitch: float, 
 
     Parameters
     ----------
-    specimen
-        Plane and outline of the specimen.
-    origin, rays
-        Common origin (3,) [mm] and unit vectors (..., 3) of the rays, in the sensor frame.
-    pitch
-        Angle between neighbouring rays [rad].
-    margin_px
-        Margin [px].
+    specimen, margin_px
+        Plane and outline of the specimen, and the margin.
+    origin, rays, pitch
+        Common origin (3,) [mm] and unit vectors (..., 3) of the rays, in the sensor frame; angle of neighbouring rays
+        [rad].
     """
     points, reach, cosine = feet_of(specimen.world_from_sensor, origin, rays)
     down = cosine > GRAZING

@@ -132,16 +132,13 @@ def observe(
 
     Parameters
     ----------
-    coupon_capture
-        Capture, and the coupon in it.
-    renderer
-        Renders the white coupon; its sensor has the cameras of the capture.
+    coupon_capture, renderer
+        Capture, and the coupon in it; renders the white coupon, its sensor has the cameras of the capture.
     block_px
         Side of a block [px].
-    pattern
-        ``mean`` if the capture has the sensor's own pattern, otherwise ``level``.
-    lit_room
-        Whether the images contain other light than that of the projector.
+    pattern, lit_room
+        ``mean`` if the capture has the sensor's own pattern, otherwise ``level``; whether the images contain other
+        light than that of the projector.
     """
     sensor, capture, specimen, where = (
         renderer.sensor,

@@ -95,10 +95,8 @@ def finish_posterior(
     views, finish, fit
         Views of the coupon, metal and process, and the fit of these views (:func:`fit_views`), whose jackknife bounds
         the uncertainties at each tail from below.
-    prior
-        Scattering of the coupon at the best estimate, which the scene gives.
-    name
-        Id of the BSDF in the scene.
+    prior, name
+        Scattering of the coupon at the best estimate, which the scene gives; id of the BSDF in the scene.
     """
     assert fit.log_alpha is not None and fit.wide_angle is not None and prior.beckmann_range is not None
     problem = Problem(views, finish)

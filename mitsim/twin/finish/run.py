@@ -167,15 +167,13 @@ def fit_captures(
 
     Parameters
     ----------
-    captures
-        Capture folders of one coupon, taken by one sensor.
-    sensor
-        Name of a preset, or path of a sensor file; by default, the preset that the captures name.
-    scene
+    captures, sensor
+        Capture folders of one coupon, taken by one sensor: a preset, or the path of a sensor file; by default, the
+        preset that the captures name.
+    scene, parameters
         Scene file with size, metal and process of the coupon; its Ra sets only the prior of the finish. By default, the
-        scene that the first capture names, with its parameters.
-    parameters
-        Values for the ``<default>`` elements of the scene, before those of the capture.
+        scene that the first capture names, with its parameters. Values for its ``<default>`` elements come before
+        those.
     block_px
         Side of a block [px]; by default :data:`KNOWN_BLOCK_PX`, or :data:`UNKNOWN_BLOCK_PX` for an unknown pattern.
     roi

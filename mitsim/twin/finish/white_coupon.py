@@ -53,12 +53,8 @@ class WhiteCouponRenderer:
 
         Parameters
         ----------
-        specimen
-            Pose and size of the coupon.
-        camera
-            Name of the camera.
-        roi
-            Region of the camera's image.
+        specimen, camera, roi
+            Pose and size of the coupon, name of the camera, and region of its image.
         pattern
             Image that the projector shows in place of the sensor's patterns.
         """

@@ -95,16 +95,12 @@ def fit_defocus(
 
     Parameters
     ----------
-    source
-        Capture of a code with stripes.
-    chip
-        Imager by which grey levels were made electrons.
+    source, chip
+        Capture of a code with stripes, and the imager by which grey levels were made electrons.
     white, black
         (H, W) images of full light and of no light [e-].
-    pairs
-        (n, 2, H, W) images of stripes and of their inverses [e-].
-    widths
-        (n,) of the stripes [projector px].
+    pairs, widths
+        (n, 2, H, W) images of stripes and of their inverses [e-], and widths (n,) of the stripes [projector px].
     """
     projector = source.capture.rig.projector
     assert projector is not None

@@ -144,16 +144,12 @@ def fit_dots(
 
     Parameters
     ----------
-    capture
-        Capture of a flat sheet.
+    capture, specimen, where
+        Capture of a flat sheet, pose and extent of the sheet, and name of the capture in messages.
     sensor
         With the capture's own cameras and exposure, from :func:`mitsim.twin.compare.rebuild.like`.
-    specimen
-        Pose and extent of the sheet.
     parameters
         Parameters to vary or held, without those of the room unless it is known.
-    where
-        Name of the capture in messages.
     room
         Six terms of the irradiance [W/mm^2] of the room, if known from another capture; otherwise they are fitted too.
     draws

@@ -103,14 +103,10 @@ def field_figures(levels: Floats, field: SpecimenField, window_px: int, black: f
 
     Parameters
     ----------
-    levels
-        Grey levels (h, w) [DN] of the field's window.
-    field
-        Patches of the specimen.
-    window_px
-        Side of the window of local means [px], several run lengths of the pattern wide.
-    black
-        Level that is subtracted first [DN].
+    levels, black
+        Grey levels (h, w) [DN] of the field's window, and the level that is subtracted first [DN].
+    field, window_px
+        Patches of the specimen; side of the window of local means [px], several run lengths of the pattern wide.
     """
     table = patch_figures(np.asarray(levels, float) - black, field, window_px)
     basis = field.basis if len(table) >= _FEWEST_FOR_TERMS else field.basis[:, :1]

@@ -63,12 +63,8 @@ def read_input_captures(
 
     Parameters
     ----------
-    folders
-        Captures whose settings state their kind: projector on, off, or dark.
-    off
-        Captures with the projector off.
-    dark
-        Captures without any light.
+    folders, off, dark
+        Captures whose settings state their kind; captures with the projector off; captures without any light.
     sensor
         Sensor whose technology the captures must have.
     """

@@ -86,12 +86,10 @@ def match_moments(
     ----------
     real, covariance
         Features (n,) of the recording, finite, and their covariance (n, n).
-    simulate
-        The forward model.
+    simulate, draws
+        The forward model, and the number of simulations to average.
     prior
         Start, spread, derivative steps and bounds of the parameters.
-    draws
-        Number of simulations to average.
     label
         Name for progress messages; empty for none. The first message states the time of a round.
     """

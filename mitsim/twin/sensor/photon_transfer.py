@@ -199,10 +199,9 @@ def fixed_variance(
     ----------
     images, mask
         (n, H, W) repeats [DN], and the pixels (H, W) to use.
-    chip
-        Imager by which grey levels are made electrons; the effect of its smoothing is undone.
-    gain
-        Variance of the finest detail after this smoothing over that before it.
+    chip, gain
+        Imager by which grey levels are made electrons; the effect of its smoothing is undone, with the variance of the
+        finest detail after it over that before it.
     """
     electrons = linearised(images, chip)
     mean = electrons.mean(axis=0)

@@ -38,10 +38,8 @@ def row_turns(
 
     Parameters
     ----------
-    capture, settings
-        Capture of a pair of cameras, and the settings of its decoder.
-    specimen
-        Pose and extent of the specimen.
+    capture, settings, specimen
+        Capture of a pair of cameras, settings of its decoder, and pose and extent of the specimen.
     prior
         Standard deviations of rotation and roll before the measurement [mrad].
     """

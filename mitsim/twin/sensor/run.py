@@ -101,18 +101,14 @@ def fit_sensor(
 
     Parameters
     ----------
-    captures
-        Folders; their settings state whether the projector was on.
+    captures, off, dark
+        Folders, whose settings state whether the projector was on; with the projector off; with all light off.
     sensor
         Preset or file that starts the fit.
-    off, dark
-        Folders of captures with the projector off, and with all light off.
     roi
         Region of the first camera's image that shows the specimen, in all of them; all that is flat if left out.
-    seed
-        Selects the noise of the simulations.
-    draws
-        Number of simulations to average.
+    seed, draws
+        Selects the noise of the simulations, and their number.
     """
     chosen = load_sensor(sensor)
     input_captures = read_input_captures(captures, off, dark, chosen)
