@@ -46,18 +46,18 @@ def flatness_uncertainty(points: ArrayLike, rejected_share: float = REJECTED_SHA
     return _range_uncertainty(centred @ axes[:2].T, plane_distances(finite), rejected_share)
 
 
-def form_error_uncertainty(points: ArrayLike, centre: ArrayLike, rejected_share: float = REJECTED_SHARE) -> float:
+def form_error_uncertainty(points: ArrayLike, centre: ArrayLike) -> float:
     """Return the standard uncertainty [mm] of the form error PF of points (n, 3) of a sphere about its centre (3,).
 
     It is conditional on the form that was read, and NaN if fewer than :data:`LEAST_REJECTED` points are rejected.
     """
     away = _finite(points) - np.asarray(centre, float)
-    if _rejected(away, rejected_share) < LEAST_REJECTED:
+    if _rejected(away, REJECTED_SHARE) < LEAST_REJECTED:
         return math.nan
     radii = np.linalg.norm(away, axis=1)
     directions = away / radii[:, None]
     axes = np.linalg.svd(directions - directions.mean(axis=0), full_matrices=False)[2]
-    return _range_uncertainty(directions @ axes[:2].T, radii - radii.mean(), rejected_share)
+    return _range_uncertainty(directions @ axes[:2].T, radii - radii.mean(), REJECTED_SHARE)
 
 
 def _finite(points: ArrayLike) -> Floats:

@@ -84,26 +84,16 @@ def probing_error(
     return ProbingError(form, 2.0 * radius - calibrated_diameter, centre)
 
 
-def sphere_spacing_error(
-    first: ArrayLike, second: ArrayLike, calibrated_distance: float, rejected_share: float = REJECTED_SHARE
-) -> float:
+def sphere_spacing_error(first: ArrayLike, second: ArrayLike, calibrated_distance: float) -> float:
     """Return the sphere-spacing error SD of VDI/VDE 2634-2 [mm]: measured minus calibrated distance of the centres.
 
-    Raises InputError as :func:`probing_error`, or if the calibrated distance is not positive.
-
-    Parameters
-    ----------
-    first, second, calibrated_distance
-        (n, 3) points [mm] of the two spheres of a ball bar, and its length [mm].
-    rejected_share
-        As in :func:`probing_error`.
+    The points (n, 3) [mm] are those of the two spheres of a ball bar, the distance in mm. Raises InputError as
+    :func:`probing_error`, or if the calibrated distance is not positive.
     """
     if not calibrated_distance > 0:
         raise InputError("sphere_spacing_error", "calibrated_distance", calibrated_distance, "a positive length in mm")
     # the diameter does not affect the centre
-    first_centre, second_centre = (
-        probing_error(points, calibrated_distance, rejected_share).centre for points in (first, second)
-    )
+    first_centre, second_centre = (probing_error(points, calibrated_distance).centre for points in (first, second))
     return float(np.linalg.norm(first_centre - second_centre) - calibrated_distance)
 
 

@@ -239,28 +239,17 @@ def density_fraction(
 
 
 def reference_fraction(
-    count: ArrayLike, reference_count: ArrayLike, possible: ArrayLike, confidence: float = 0.95
+    count: ArrayLike, reference_count: ArrayLike, possible: ArrayLike
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return F relative to the points of an ideal, matt-white surface at the same place (the talk's second definition).
 
-    Both counts are random, each out of ``possible`` pixels. The interval of their ratio comes from the Clopper-Pearson
-    intervals of both (Donner and Zou, Stat. Methods Med. Res. 21 (2012) 347-359, *recalled*; the tests check its
-    coverage).
-
-    Parameters
-    ----------
-    count, reference_count, possible
-        Points of the coupon, and of the matt-white one; pixels of the patch.
-    confidence
-        Of the interval.
-
-    Returns
-    -------
-    F, low, high, excess
-        F and its interval, limited to at most 1, and the excess of F over 1. NaN where the reference has no point.
+    Also return the ends of its 95 % interval, limited to at most 1 as F is, and the excess of F over 1. All are NaN
+    where the reference has no point. Both counts are random, each out of ``possible`` pixels. The interval of their
+    ratio comes from the Clopper-Pearson intervals of both (Donner and Zou, Stat. Methods Med. Res. 21 (2012) 347-359,
+    *recalled*; the tests check its coverage).
     """
-    theta, low, high = recovered_fraction(count, possible, confidence)
-    theta_0, low_0, high_0 = recovered_fraction(reference_count, possible, confidence)
+    theta, low, high = recovered_fraction(count, possible)
+    theta_0, low_0, high_0 = recovered_fraction(reference_count, possible)
     product = theta * theta_0
     with np.errstate(divide="ignore", invalid="ignore"):
         below = np.sqrt(np.maximum(product**2 - low * high_0 * (2 * theta - low) * (2 * theta_0 - high_0), 0.0))

@@ -19,11 +19,14 @@ _ASIDE = 0.09
 #: space for the labels, as a share of the picture's longer side
 _ROOM = 0.34
 
+#: largest number of names on a side; chosen
+_MOST = 9
 
-def label_columns(
-    axes: Axes, positions: Mapping[str, Floats], low: Floats, high: Floats, most: int = 9, longest: int = 16
-) -> None:
+
+def label_columns(axes: Axes, positions: Mapping[str, Floats], low: Floats, high: Floats, longest: int = 16) -> None:
     """Draw names in columns left and right of a picture, with lines to their positions that do not cross.
+
+    Of more than :data:`_MOST` names on a side the least important ones are left out.
 
     Parameters
     ----------
@@ -31,9 +34,8 @@ def label_columns(
         To draw into. Its limits are set to hold the picture and the names.
     positions, low, high
         Place (2,) of each name, the most important names first; corners (2,) of the picture.
-    most, longest
-        Largest number of names on a side: the least important others are left out; largest number of characters of a
-        name: longer ones lack their middle.
+    longest
+        Largest number of characters of a name; longer ones lack their middle.
     """
     span = high - low
     step = float(max(span[1], 0.62 * span[0])) / _ROWS
@@ -41,12 +43,12 @@ def label_columns(
     from_left = sorted(positions, key=lambda name: positions[name][0])
     middle = float(low[0] + high[0]) / 2
     first = sum(bool(positions[name][0] < middle) for name in from_left)
-    if max(first, len(from_left) - first) > most:
+    if max(first, len(from_left) - first) > _MOST:
         first = len(from_left) // 2
     left, right = from_left[:first], from_left[first:]
     every = [float(low[1]), float(high[1])]
     for names, x, side, way in ((left, low[0] - aside, "right", -1), (right, high[0] + aside, "left", 1)):
-        kept = [name for name in positions if name in names][:most]
+        kept = [name for name in positions if name in names][:_MOST]
         chosen = sorted(kept, key=lambda name: positions[name][1])
         heights = spread([float(positions[name][1]) for name in chosen], step)
         every += heights
