@@ -1,18 +1,22 @@
-"""Check this machine: find packages, libraries and devices, and say how to install missing ones."""
+"""Check this machine, ``mitsim doctor``: find packages, libraries and devices, and say how to install missing ones."""
 
 from __future__ import annotations
 
 import ctypes.util
 import importlib.metadata
+import json as json_module
 import os
 import platform
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Literal
+
+import typer
 
 from characterisation.files.errors import MissingEnvironmentError
 from characterisation.words.version import __version__
+from mitsim.cli import options
 from mitsim.scene import backend
 
 Verdict = Literal["ok", "missing", "absent"]
@@ -72,6 +76,25 @@ class MachineFinding:
     verdict: Verdict
     detail: str
     fix: str = ""
+
+
+def doctor(json: options.Json = False) -> None:
+    """Check this machine: list what is present, what is missing, and how to fix it.
+
+    Exit code 3 if something that mitsim needs is missing.
+
+    Example: mitsim doctor
+    """
+    findings = examine()
+    if json:
+        print(json_module.dumps([asdict(finding) for finding in findings], indent=2))
+    else:
+        for finding in findings:
+            print(f"{finding.verdict:8} {finding.what:32} {finding.detail}")
+            if finding.fix:
+                print(f"{'':8} {'':32} -> {finding.fix}")
+    if any(finding.verdict == "missing" for finding in findings):
+        raise typer.Exit(3)
 
 
 def examine() -> list[MachineFinding]:

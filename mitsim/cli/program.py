@@ -31,10 +31,10 @@ from mitsim.cli import (
     compare,
     decode,
     devices,
+    doctor,
     export,
     fit,
     import_recording,
-    machine,
     maps,
     measure,
     parts,
@@ -88,7 +88,7 @@ def _common(
 
 
 for command in (
-    machine.doctor,
+    doctor.doctor,
     studies.run,
     export.report,
     parts.part,

@@ -125,7 +125,7 @@ def test_signals_end_a_command_as_ctrl_c_does(tmp_path, number):
     # tests that a shell runs in its background, or under nohup, ignore SIGINT or SIGHUP, and so does what they start
     wait = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
     wait += "signal.signal(signal.SIGHUP, signal.SIG_DFL); "
-    wait += "import mitsim.cli.machine as m, time; import mitsim.cli.program as c; "
+    wait += "import mitsim.cli.doctor as m, time; import mitsim.cli.program as c; "
     wait += "c.app.command(name='wait')(lambda: (print('on', flush=True), time.sleep(60))[1]); c.main()"
     with subprocess.Popen(
         [sys.executable, "-c", wait, "wait"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
