@@ -163,14 +163,12 @@ def outward_normals(surface: Surface, points: Floats) -> Floats:
     """Return the unit normals (..., 3) of a surface, away from its axis or centre."""
     if isinstance(surface, Plane):
         return np.broadcast_to(surface.normal, points.shape).copy()
-    if isinstance(surface, Cylinder):
+    if isinstance(surface, Cylinder | Cone):
         local = points - surface.point
         radial = local - (local @ surface.axis)[..., None] * surface.axis
-    elif isinstance(surface, Cone):
-        local = points - surface.point
-        radial = local - (local @ surface.axis)[..., None] * surface.axis
-        radial /= np.maximum(np.linalg.norm(radial, axis=-1, keepdims=True), 1e-12)
-        radial = np.cos(surface.half_angle) * radial - np.sin(surface.half_angle) * surface.axis
+        if isinstance(surface, Cone):
+            radial /= np.maximum(np.linalg.norm(radial, axis=-1, keepdims=True), 1e-12)
+            radial = np.cos(surface.half_angle) * radial - np.sin(surface.half_angle) * surface.axis
     elif isinstance(surface, Torus):
         radial = surface.from_tube(points)
     else:

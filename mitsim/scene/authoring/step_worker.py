@@ -23,6 +23,8 @@ import json
 import re
 import sys
 import tempfile
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,13 +47,13 @@ def bodies(document: Any) -> list[tuple[str, Any, tuple[float, float, float] | N
     """Return every body of a document in its place, with the name and the colour of its part."""
     from OCP.TDF import TDF_Label, TDF_LabelSequence
     from OCP.TopLoc import TopLoc_Location
-    from OCP.XCAFDoc import XCAFDoc_DocumentTool, XCAFDoc_ShapeTool
+    from OCP.XCAFDoc import XCAFDoc_ColorTool, XCAFDoc_DocumentTool, XCAFDoc_ShapeTool
 
     tool = XCAFDoc_DocumentTool.ShapeTool_s(document.Main())
     shapes: list[tuple[str, Any, tuple[float, float, float] | None]] = []
 
     def walk(label: Any, name: str, location: Any, colour: tuple[float, float, float] | None) -> None:
-        colour = label_colour(label) or colour
+        colour = first_colour(partial(XCAFDoc_ColorTool.GetColor_s, label)) or colour
         if XCAFDoc_ShapeTool.IsReference_s(label):
             location = location.Multiplied(XCAFDoc_ShapeTool.GetLocation_s(label))
             referred = TDF_Label()
@@ -83,28 +85,13 @@ def label_name(label: Any) -> str:
     return str(name.Get().ToExtString()) if label.FindAttribute(TDataStd_Name.GetID_s(), name) else ""
 
 
-def label_colour(label: Any) -> tuple[float, float, float] | None:
-    """Return the colour of a label's surface, as sRGB 0 to 1."""
-    from OCP.Quantity import Quantity_Color
-    from OCP.XCAFDoc import XCAFDoc_ColorGen, XCAFDoc_ColorSurf, XCAFDoc_ColorTool
-
-    colour = Quantity_Color()
-    for kind in (XCAFDoc_ColorSurf, XCAFDoc_ColorGen):
-        if XCAFDoc_ColorTool.GetColor_s(label, kind, colour):
-            return srgb(colour)
-    return None
-
-
-def shape_colour(tool: Any, shape: Any) -> tuple[float, float, float] | None:
-    """Return the colour of a shape itself, as sRGB 0 to 1."""
+def first_colour(written: Callable[[Any, Any], bool]) -> tuple[float, float, float] | None:
+    """Return the colour of a surface, else the general one, as sRGB 0 to 1; ``written`` sets a colour of a kind."""
     from OCP.Quantity import Quantity_Color
     from OCP.XCAFDoc import XCAFDoc_ColorGen, XCAFDoc_ColorSurf
 
     colour = Quantity_Color()
-    for kind in (XCAFDoc_ColorSurf, XCAFDoc_ColorGen):
-        if tool.GetColor(shape, kind, colour):
-            return srgb(colour)
-    return None
+    return srgb(colour) if written(XCAFDoc_ColorSurf, colour) or written(XCAFDoc_ColorGen, colour) else None
 
 
 def srgb(colour: Any) -> tuple[float, float, float]:
@@ -126,17 +113,9 @@ def surface_of(face: Any, tolerance: float) -> dict[str, Any]:
     if BRep_Tool.Surface_s(face) is None:
         return {"kind": "freeform"}
     adaptor = BRepAdaptor_Surface(face)
-    kind = adaptor.GetType()
-    if kind == Kinds.GeomAbs_Plane:
-        return simple("plane", adaptor.Plane())
-    if kind == Kinds.GeomAbs_Cylinder:
-        return simple("cylinder", adaptor.Cylinder())
-    if kind == Kinds.GeomAbs_Cone:
-        return simple("cone", adaptor.Cone())
-    if kind == Kinds.GeomAbs_Sphere:
-        return simple("sphere", adaptor.Sphere())
-    if kind == Kinds.GeomAbs_Torus:
-        return simple("torus", adaptor.Torus())
+    for name in ("Plane", "Cylinder", "Cone", "Sphere", "Torus"):
+        if adaptor.GetType() == getattr(Kinds, f"GeomAbs_{name}"):
+            return simple(name.lower(), getattr(adaptor, name)())
     recognition = ShapeAnalysis_CanonicalRecognition(face)
     for name, surface, asked in (
         ("plane", gp_Pln(), recognition.IsPlane),
@@ -155,12 +134,10 @@ def surface_of(face: Any, tolerance: float) -> dict[str, Any]:
 
 def in_mm(surface: dict[str, Any], unit_mm: float) -> dict[str, Any]:
     """Return the numbers of a surface in mm."""
-    lengths = {key: surface[key] * unit_mm for key in ("radius", "tube") if key in surface}
-    return (
-        surface
-        | lengths
-        | ({"point": [unit_mm * coordinate for coordinate in surface["point"]]} if "point" in surface else {})
-    )
+    lengths: dict[str, Any] = {key: surface[key] * unit_mm for key in ("radius", "tube") if key in surface}
+    if "point" in surface:
+        lengths["point"] = [unit_mm * coordinate for coordinate in surface["point"]]
+    return surface | lengths
 
 
 def simple(kind: str, surface: Any) -> dict[str, Any]:
@@ -288,7 +265,8 @@ def convert(  # noqa: PLR0913 - the arguments of the command
                     lost += 1
                     continue
                 bare = [part.Located(TopLoc_Location()) for part in (face, solid)]
-                colour = shape_colour(colours, bare[0]) or shape_colour(colours, bare[1]) or part_colour
+                own, of_solid = (first_colour(partial(colours.GetColor, part)) for part in bare)
+                colour = own or of_solid or part_colour
                 faces.append(
                     {
                         **in_mm(surfaces.of(face), unit_mm),
