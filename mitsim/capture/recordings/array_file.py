@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 from mitsim.capture.npy import NPY_MAGIC, numbers_of_npy
-from mitsim.capture.recordings.point_columns import check_points_first
+from mitsim.capture.recordings.cloud_numbers import check_points_first
 from mitsim.capture.recordings.recording_files import chosen_frame
 from mitsim.sensor.calibration_qualifiers import UNITS_MM
 

@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
-from mitsim.capture.recordings.cloud_numbers import number_words, unit_in, unit_named
-from mitsim.capture.recordings.point_columns import check_points_first
+from mitsim.capture.recordings.cloud_numbers import check_points_first, number_words, unit_in, unit_named
 from mitsim.sensor.calibration_qualifiers import UNITS_MM
 
 #: largest text [bytes]; reading takes ten times as much memory

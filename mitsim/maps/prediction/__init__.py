@@ -13,8 +13,7 @@ Not included: clusters of lost points, since the map has only their share F, and
 """
 
 from mitsim.maps.prediction.characterised_scene import CharacterisedScene
-from mitsim.maps.prediction.ideal import Ideal
-from mitsim.maps.prediction.perturbation import Effect, Perturbation, SceneView, together
+from mitsim.maps.prediction.perturbation import Effect, Ideal, Perturbation, SceneView, together
 from mitsim.maps.prediction.point_statistics import (
     ViewPoints,
     expected_points,

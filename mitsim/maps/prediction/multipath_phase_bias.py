@@ -42,8 +42,8 @@ from numpy.typing import NDArray
 
 from characterisation.files.arrays import Floats
 from mitsim.capture.simulated.indirect_light import smoothed
-from mitsim.maps.prediction.ideal import Ideal
 from mitsim.maps.prediction.multipath_range_bias import Complex
+from mitsim.maps.prediction.perturbation import Ideal
 from mitsim.sensor.light_code import GrayCodePhaseShift, PhaseShift, patterns
 from mitsim.sensor.sensor import Sensor
 

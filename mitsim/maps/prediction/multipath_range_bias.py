@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from characterisation.files.arrays import Floats
 from mitsim.capture.simulated.indirect_light import smoothed
 from mitsim.decoding.time_of_flight import joint_path
-from mitsim.maps.prediction.ideal import Ideal
+from mitsim.maps.prediction.perturbation import Ideal
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings, sample_variance
 

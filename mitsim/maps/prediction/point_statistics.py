@@ -15,8 +15,7 @@ from characterisation.maps.noise_structure import noise_structure
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import Status
 from characterisation.tasks.covariance import ExpectedPoints
-from mitsim.maps.prediction.ideal import Ideal
-from mitsim.maps.prediction.perturbation import Perturbation
+from mitsim.maps.prediction.perturbation import Ideal, Perturbation
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
 from mitsim.sensor.transforms import Transform

@@ -27,8 +27,8 @@ from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.region_of_interest import Roi
 from mitsim.decoding.cloud import Geometry
 from mitsim.maps.prediction.characterised_scene import CharacterisedScene
-from mitsim.maps.prediction.ideal import Ideal
 from mitsim.maps.prediction.noise_field import correlated_noise
+from mitsim.maps.prediction.perturbation import Ideal
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.mapped_scene import MappedView, ViewRays
 from mitsim.scene.ray_casting.raycast import PixelRays, Surfaces, cast_together, shapes_met
