@@ -97,14 +97,6 @@ def _number(key: str, unit: str, transform: str, **about: Any) -> Parameter:
     return Parameter(key, unit, read, lambda sensor: varied(read(sensor)), put, **about)
 
 
-def _with_room_level(room: RoomTable | None, ratio: float) -> RoomTable | None:
-    return None if room is None else room.model_copy(update={"irradiance_w_mm2": room.irradiance_w_mm2 * ratio})
-
-
-def _room_share(sensor: Sensor) -> float:
-    return float(np.log(_read_room(0, sensor) / sensor.imager.full_well))
-
-
 def _with_room_share(sensor: Sensor, x: float) -> Sensor:
     assert sensor.room is not None
     level = float(np.exp(x)) * sensor.imager.full_well
@@ -116,7 +108,10 @@ def _with_full_well(sensor: Sensor, x: float) -> Sensor:
     chip, ratio = sensor.imager, _WELL / max(x, 1e-3) / sensor.imager.full_well
     projector = replace(sensor.projector, flux=sensor.projector.flux * ratio)
     chip = replace(chip, full_well=chip.full_well * ratio, read_noise=chip.read_noise * ratio)
-    return replace(sensor, imager=chip, projector=projector, room=_with_room_level(sensor.room, ratio))
+    room = sensor.room
+    if room is not None:
+        room = room.model_copy(update={"irradiance_w_mm2": room.irradiance_w_mm2 * ratio})
+    return replace(sensor, imager=chip, projector=projector, room=room)
 
 
 def _with_flux(sensor: Sensor, x: float) -> Sensor:
@@ -225,7 +220,7 @@ ROOM_LEVEL = Parameter(
     "room.irradiance_w_mm2",
     "W/mm^2",
     lambda sensor: _read_room(0, sensor),
-    _room_share,
+    lambda sensor: float(np.log(_read_room(0, sensor) / sensor.imager.full_well)),
     _with_room_share,
     spread=1.0,
     step=0.05,
