@@ -24,6 +24,7 @@ from mitsim.capture.simulated.rendering import Rendering
 from mitsim.scene.xml_check import named_digests
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.matcher import MatcherSettings
+from mitsim.sensor.modulation import TimeOfFlightSettings
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.sensor_text import sensor_checksum
 from mitsim.study import Study
@@ -53,10 +54,18 @@ _MOST_PIXELS = 400_000
 #: with 16 times as many paths differ from one another as much as from these
 _KEPT_MATCHER = KeptSettings(49, 4.0, 40, 1.5, _MOST_PIXELS)
 
-#: the same for fringes and time of flight, with more of them: their noise is common to all trials of a view. With a
-#: quarter of them, errors between sprayed pillars (Zivid) changed by twice as much from one set of paths to another,
-#: and u of the angle between these by 82 % in five seeds in place of 22 %: python -m tests.proofs seeds
+#: the same for fringes, with more of them: their noise is common to all trials of a view. With a quarter of them,
+#: errors between sprayed pillars (Zivid) changed by twice as much from one set of paths to another, and u of the angle
+#: between these by 82 % in five seeds in place of 22 %: python -m tests.proofs seeds
 _KEPT = KeptSettings(64, 4.0, 32, 2.5, _MOST_PIXELS)
+
+#: the same for time of flight, whose pixels are few and wide: as many paths over all pixels, and the same noise, with a
+#: narrower filter. One of 2.5 px moved the radius of a white step of the spindle by 0.5 mm, beside a u of 0.3 mm:
+#: tests/study/virtual/test_smoothed_time_of_flight.py
+_KEPT_TIME_OF_FLIGHT = KeptSettings(529, 4.0, 264, 0.85, 25_000)
+
+#: light of time of flight that is rendered separately, likewise
+_TIME_OF_FLIGHT = IndirectLight(49, 0.85)
 
 #: rays per pixel of direct light for fringes. Root mean square error 0.03 (PhoXi), 0.09 (David) and 0.08 (Zivid) of the
 #: sensor's noise, but for the hundredth of the pixels at edges: tests/benchmarks/direct_samples.py
@@ -91,10 +100,11 @@ def rendering_of(study: Study) -> Rendering:
     """
     table = study.file.measure
     samples = _FRINGE_SAMPLES if isinstance(study.sensor.settings, DecoderSettings) else _SAMPLES
-    is_matcher = isinstance(study.sensor.settings, MatcherSettings)
-    indirect, kept = (
-        (IndirectLight(4, _SMOOTHING_PX), _KEPT_MATCHER) if is_matcher else (IndirectLight(16, _SMOOTHING_PX), _KEPT)
-    )
+    indirect, kept = IndirectLight(16, _SMOOTHING_PX), _KEPT
+    if isinstance(study.sensor.settings, MatcherSettings):
+        indirect, kept = IndirectLight(4, _SMOOTHING_PX), _KEPT_MATCHER
+    elif isinstance(study.sensor.settings, TimeOfFlightSettings):
+        indirect, kept = _TIME_OF_FLIGHT, _KEPT_TIME_OF_FLIGHT
     return Rendering(table.samples_per_pixel or samples, table.light_path_depth, indirect, kept)
 
 
