@@ -7,7 +7,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from characterisation.files.checked_files import read_text_bounded
+from characterisation.files.checked_files import is_file, read_text_bounded
 from characterisation.files.errors import InputError, nearest
 
 #: largest TOML file [bytes]; chosen
@@ -35,7 +35,7 @@ def read_toml_table(path: str | Path) -> dict[str, Any]:
         If the file is missing or is not TOML.
     """
     path = Path(path)
-    near = "" if path.exists() else _neighbours(path)
+    near = "" if is_file(path) else _neighbours(path)
     text = read_text_bounded(path, "a TOML file", near, LARGEST_TOML).replace("\r\n", "\n")
     _check_nesting(path, text)
     try:

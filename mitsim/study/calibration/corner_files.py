@@ -49,9 +49,11 @@ _LEAST_CORNERS = 12
 #: fewest poses of two cameras whose corners tell whether one of them stands upside down: two planes leave it open
 _LEAST_PAIRS = 3
 
-#: least distance [px] of corners from their epipolar lines from which one camera may stand upside down, and its least
-#: ratio to that of the reverse order; chosen: in the right order it is 0.4 px at 0.3 px of noise, in the wrong one 16
-_OFF_LINES_PX, _TIMES_NEARER = 3.0, 3.0
+#: least distance [px] of corners from epipolar lines in a wrong order; chosen: 0.4 in the right one, 16 in a wrong one
+_OFF_LINES_PX = 3.0
+
+#: least ratio of this distance to that of the reverse order; chosen likewise
+_TIMES_NEARER = 3.0
 
 #: names of a pair's arrays, of the first and of the second camera
 _PAIRS = (("image_points1", "image_points2"), ("imgpoints_l", "imgpoints_r"), ("imgpointsL", "imgpointsR"))
@@ -194,13 +196,11 @@ def found_corners(image: NDArray[np.generic], board: Board) -> Floats | None:
 def turned_alike(pairs: Sequence[Sequence[Floats]]) -> list[Floats]:
     """Return the corners (n, 2) [px] of a second camera at each pose in the order of those of a first.
 
-    A board whose numbers of rows and columns are both even or both odd looks the same after half a turn. Of the two
-    orders, the one is chosen in which the diagonals of the board have the same sense in both images; or the opposite
-    one at all poses, for a camera that stands upside down, if the corners then lie nearer to their epipolar lines.
+    A board whose rows and columns are both even or both odd in number looks the same after half a turn. The diagonals
+    of the board get the same sense in both images; or the opposite one at all poses, if the corners then lie nearer to
+    their epipolar lines, as of a camera that stands upside down.
     """
-    alike = [
-        second if (first[-1] - first[0]) @ (second[-1] - second[0]) > 0 else second[::-1] for first, second in pairs
-    ]
+    alike = [two[:: 1 if (one[-1] - one[0]) @ (two[-1] - two[0]) > 0 else -1] for one, two in pairs]
     opposite = [second[::-1] for second in alike]
     if len(pairs) < _LEAST_PAIRS:
         return alike
