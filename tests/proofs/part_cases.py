@@ -56,6 +56,7 @@ class PartCasesFile(Document):
       own,
     - ``stated_worlds`` for the ``stated`` views whose statements are judged.
 
+    Statements have ``trials`` virtual measurements, by default as many as a study makes without a time limit.
     ``measured`` is a folder with files of an earlier run, whose measurements are reused.
     """
 
@@ -67,6 +68,7 @@ class PartCasesFile(Document):
     raced_worlds: Annotated[int, Field(ge=4, le=1000, multiple_of=2)] = 30
     stated: Annotated[int, Field(ge=1, le=100)] = 2
     stated_worlds: Annotated[int, Field(ge=2, le=1000)] = 45
+    trials: Annotated[int, Field(ge=2, le=100_000)] | None = None
     seed: Annotated[int, Field(ge=0)] = 1
     measured: str | None = None
     cases: Annotated[list[CaseTable], Field(min_length=1)]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from characterisation.statements.statement import Statement
 from characterisation.words.progress import say
 from mitsim.running.executor import Executor
-from mitsim.study import Study
+from mitsim.study import StatementTable, Study
 from mitsim.study.session import Session
 from mitsim.study.virtual.race import ALL, Raced
 from mitsim.views import View
@@ -117,7 +117,8 @@ def _to_state(case: PartCase, study: Study, scores: xr.Dataset, chosen: int | No
 
 def _stated(case: PartCase, trials_of_kind: dict[str, Session], view: View, why: str) -> JudgedView:
     tool, apart, count = trials_of_kind["tool"], trials_of_kind["apart"], case.file.stated_worlds
-    stated = tool.state(view)
+    named = case.file.trials
+    stated = tool.state(view, None if named is None else StatementTable(trials=named))
     measure_worlds(case, "apart", apart, [view], {view.number: days(count)})
     errors = errors_of(apart.trials, view.number, days(count))
     return JudgedView(view.number, why, tuple(stated.statements), errors)
