@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import io
+import multiprocessing
 import os
 import signal
 import sys
@@ -210,6 +211,8 @@ def run_application(app: typer.Typer) -> None:
             code = _bug()
     except Exception:
         code = _bug()
+    if code:
+        _kill_workers()
     sys.exit(_flushed(code))
 
 
@@ -218,6 +221,12 @@ def _end(code: int, text: str) -> int:
     with suppress(OSError, ValueError):
         print(f"mitsim: {printable(text)}", file=sys.stderr, flush=True)
     return code
+
+
+def _kill_workers() -> None:
+    """End the worker processes of a command without a result: the interpreter would wait for their orders."""
+    for process in multiprocessing.active_children():
+        process.kill()
 
 
 def _bug() -> int:

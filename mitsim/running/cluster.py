@@ -24,7 +24,8 @@ from characterisation.files.checked_files import is_file
 from characterisation.files.errors import InputError, MissingEnvironmentError
 from characterisation.words.progress import say
 from mitsim.running.build import differences, own_build
-from mitsim.running.executor import Item, Plain, Result, finished_orders, never
+from mitsim.running.executor import Item, Plain, Result, finished_orders
+from mitsim.running.time_limit import stopped_by_user
 
 #: orders that wait at each worker: enough to keep it busy, few enough to lose little at a stop
 AHEAD = 3
@@ -53,7 +54,7 @@ class Cluster:
 
     def __init__(self, address: str) -> None:
         self.address, self.client = address, connected(address)
-        self.given_up: Callable[[], bool] = never
+        self.given_up: Callable[[], bool] = stopped_by_user
         # an unclosed client looks for its scheduler forever, in its own thread
         weakref.finalize(self, self.client.close).atexit = False  # Dask closes it at the end of the process
 

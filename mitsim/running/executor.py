@@ -28,6 +28,7 @@ from typing import Protocol, TypeVar
 from characterisation.files.errors import InputError, MissingEnvironmentError
 from characterisation.files.threads import keep_blas_to_one_thread, usable_cores
 from characterisation.words.progress import say, track
+from mitsim.running.time_limit import stopped_by_user
 
 Item = TypeVar("Item")
 Plain = TypeVar("Plain")
@@ -56,7 +57,8 @@ _GROUP_FILES = (
 class Executor(Protocol):
     """Distributes work: :class:`Pool`, or :class:`mitsim.running.cluster.Cluster`.
 
-    ``given_up`` says whether to give up the orders in work, whose results are then lost; see :func:`giving_up`.
+    ``given_up`` says whether to give up the orders in work, whose results are then lost: by default after the first
+    Ctrl-C of a command that ends in order; see :func:`giving_up`.
     """
 
     given_up: Callable[[], bool]
@@ -84,11 +86,6 @@ class Executor(Protocol):
         """
 
 
-def never() -> bool:
-    """Return that work is not given up."""
-    return False
-
-
 @contextlib.contextmanager
 def giving_up(workers: Executor | None, over: Callable[[], bool]) -> Iterator[None]:
     """Let workers give up orders in work as soon as ``over``; this process finishes what it has begun."""
@@ -99,7 +96,7 @@ def giving_up(workers: Executor | None, over: Callable[[], bool]) -> Iterator[No
     try:
         yield
     finally:
-        workers.given_up = never
+        workers.given_up = stopped_by_user
 
 
 def fitting_processes() -> int:
@@ -167,7 +164,7 @@ class Pool:
 
     def __init__(self, processes: int) -> None:
         self.processes = processes
-        self.given_up: Callable[[], bool] = never
+        self.given_up: Callable[[], bool] = stopped_by_user
         self._workers: dict[int, ProcessPoolExecutor] = {}
         self._prepared: dict[int, set[tuple[Hashable, Hashable]]] = {}
 
@@ -197,7 +194,9 @@ class Pool:
             return index
 
         def submit(item: Item) -> Future[Result]:
-            future = self._ready(chosen).submit(work, order(item))
+            worker, value = self._ready(chosen), order(item)
+            with _signals_held():
+                future = worker.submit(work, value)
             name = name_of(item)
             self._prepared[chosen] = {entry for entry in self._prepared[chosen] if entry[0] == name[0]} | {name}
             worker_of[future] = chosen
@@ -220,6 +219,9 @@ class Pool:
                             "finished work is kept: use fewer, and run the same command again"
                         ) from None
                     say("a worker process died; its work is repeated")
+        except KeyboardInterrupt:
+            self._end()
+            raise
         finally:
             if self.given_up() and any(not future.done() for future in running):
                 self._end()
@@ -267,6 +269,19 @@ class Pool:
             self._workers[worker] = ProcessPoolExecutor(1, context, _start_worker, (threads, os.getpid()))
             self._prepared[worker] = set()
         return self._workers[worker]
+
+
+@contextlib.contextmanager
+def _signals_held() -> Iterator[None]:
+    """Hold Ctrl-C back while a process starts, which then never gets one: its imports would end in a traceback."""
+    if sys.platform == "win32":
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _start_worker(threads: int, parent: int) -> None:
