@@ -162,7 +162,7 @@ def write_record(
         "machine": platform.machine(),
         "cores": os.cpu_count(),
     }
-    names = ["map.nc", "scores.csv", "scores.nc", "checks.nc", "part.ply", "stand.npz", TASK]
+    names = ["map.nc", "scores.csv", "scores.nc", "checks.nc", "part.ply", "stand.npz", TASK, "poses/poses.json"]
     names += ["samples.nc"] if study.campaign is not None else []
     names += ["statement.json"] if stated else []
     names += [f"clouds/predicted_{view:04d}.ply" for view in drawn]

@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,19 +25,17 @@ from characterisation.tasks import evaluation
 from characterisation.tasks.result import Result
 from characterisation.tasks.task_file import LINE_ANGLES, Task
 from characterisation.tasks.task_reading import check_features
-from mitsim.capture.calibration import EXACT
 from mitsim.capture.recordings.cloud_numbers import METRES_UNDER
 from mitsim.capture.recordings.pose_file import read_pose as read_pose_file
-from mitsim.capture.recordings.pose_file import with_exact_rotation
 from mitsim.decoding.input_clouds import margin_of
 from mitsim.maps.prediction.predictor import EDGE_MARGIN_PX, Predictor
 from mitsim.scene.load import Scene
-from mitsim.sensor.calibration_poses import is_motion
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.poses import as_pose
 from mitsim.sensor.sensor import Sensor
-from mitsim.sensor.transforms import Transform, is_rotation
+from mitsim.sensor.transforms import Transform
 from mitsim.study.statement_file import PartialDocument
+from mitsim.views.written_poses import rigid_pose, written_poses
 
 #: largest distance between the sensor's place and that of a statement [mm]; chosen
 SAME_PLACE_MM = 10.0
@@ -165,7 +162,7 @@ class ViewStatement(PartialDocument):
         """
         if sensor != self.sensor:
             raise InputError(self.path, "sensor", self.sensor, f"{sensor}, the sensor of the cloud")
-        difference = _pose(self.path, "world_from_sensor", self.world_from_sensor).inverse() @ pose
+        difference = rigid_pose(self.path, "world_from_sensor", self.world_from_sensor).inverse() @ pose
         distance_mm = float(np.linalg.norm(difference.translation))
         rotation_deg = math.degrees(math.acos(min(max((float(np.trace(difference.rotation)) - 1) / 2, -1.0), 1.0)))
         if distance_mm > SAME_PLACE_MM or rotation_deg > SAME_ANGLE_DEG:
@@ -285,21 +282,15 @@ def read_pose(path: Path, view: int | None = None) -> Transform:
     if path.suffix.lower() != ".json":
         return read_pose_file(path)
     table = read_json_object(path, "pose.json of a capture, poses.json of a run, or statement.json")
-    key, matrix = "world_from_sensor", table.get("world_from_sensor")
     if "views" in table:
-        try:
-            poses = {int(entry["view"]): entry["part_from_sensor"] for entry in table["views"]}
-        except (KeyError, OverflowError, TypeError, ValueError) as error:
-            raise InputError(
-                path, "views", f"entries that cannot be read ({error!r})", "a list as mitsim run writes it"
-            ) from None
+        poses = written_poses(path, table)
         if not poses:
             raise InputError(path, "views", "no view", "a list as mitsim run writes it")
         if view not in poses:
             allowed = f"a view of {path}: {min(poses)} to {max(poses)}"
             raise InputError("--view", "", "none" if view is None else view, allowed)
-        key, matrix = f"views.part_from_sensor of view {view}", poses[view]
-    return _pose(path, key, matrix)
+        return poses[view]["part_from_sensor"]
+    return rigid_pose(path, "world_from_sensor", table.get("world_from_sensor"))
 
 
 def unit_doubt(cloud: PointCloud, scene: Scene, pose: Transform) -> str:
@@ -314,17 +305,6 @@ def unit_doubt(cloud: PointCloud, scene: Scene, pose: Transform) -> str:
         f"by the pose the sensor is {away:.3g} mm from the middle of the part, by the cloud its points are {near:.3g} "
         f"to {far:.3g} mm away: write the position of the pose in mm"
     )
-
-
-def _pose(path: Path, key: str, matrix: Any) -> Transform:
-    try:
-        rows = np.array(matrix, float).reshape(4, 4)
-    except (OverflowError, TypeError, ValueError):
-        raise InputError(path, key, repr(matrix)[:60], "a 4 x 4 matrix, rows first [mm]") from None
-    rows = with_exact_rotation(rows)
-    if not is_motion(rows) or not is_rotation(rows[:3, :3], EXACT) or not np.isfinite(rows).all():
-        raise InputError(path, key, "a matrix that is not a rigid motion", "a rotation, and a translation in mm")
-    return Transform(rows[:3, :3], rows[:3, 3])
 
 
 def _predictor_of_grid(cloud: PointCloud, margin_px: int) -> Predictor:

@@ -36,6 +36,7 @@ from characterisation.files.errors import InputError
 from mitsim.report.export.run_scene import numbers_of, quaternion
 from mitsim.sensor.transforms import Transform
 from mitsim.study.run_folder import read_run
+from mitsim.views.written_poses import written_poses
 
 #: |sin B| from here on counts as 1
 _GIMBAL = 1 - 1e-12
@@ -62,25 +63,23 @@ def read_targets(folder: str | Path, views: str = "best") -> tuple[list[RobotTar
     """Return the targets of a run's views, or of a folder of ``mitsim study score``; and the name of their tool.
 
     ``views``: ``best``, the run's set of views, or the best of every measurement, with the view of the statement first;
-    ``all``; or numbers, ``3,12``. Raises InputError if there are no poses, ``best`` is used for a folder without a
-    race, or a view does not exist.
+    ``all``; or numbers, ``3,12``. Raises InputError if there are no poses, a pose was changed after it was written,
+    ``best`` is used for a folder without a race, or a view does not exist.
     """
     path = Path(folder) / "poses" / "poses.json"
     document = read_json_object(path, "a folder made by mitsim run or mitsim study score")
-    try:
-        entries = {int(entry["view"]): entry for entry in document["views"]}
-        tool = "flange" if "flange_from_sensor" in document else "sensor"
-        poses = {number: Transform.from_matrix(entry[f"part_from_{tool}"]) for number, entry in entries.items()}
-    except (OverflowError, ValueError, KeyError, TypeError, IndexError) as error:
-        raise InputError(path, "", f"a file that cannot be read ({error})", "poses.json of mitsim") from None
-    if views == "best":
-        run = read_run(folder)
+    tool = "sensor" if document.get("flange_from_sensor") is None else "flange"
+    poses = {number: forms[f"part_from_{tool}"] for number, forms in written_poses(path, document).items()}
+    run = read_run(folder) if views == "best" or (Path(folder) / "run.json").exists() else None
+    if run is not None:
+        run.check("poses/poses.json")
+    if run is not None and views == "best":
         about, stated = run.about, run.statement
         chosen = sorted({*(about.view_sets[0].views if about.view_sets else about.leaders.values())})
         if stated is not None:
             chosen.sort(key=lambda number: number != stated.view)  # stable: the others stay ascending
     else:
-        chosen = numbers_of(views, list(entries))
+        chosen = numbers_of(views, list(poses))
     missing = [number for number in chosen if number not in poses]
     if missing or not chosen:
         allowed = "the poses.json of this run, with every view that it names"

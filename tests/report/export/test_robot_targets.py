@@ -13,6 +13,11 @@ from scipy.spatial.transform import Rotation
 from characterisation.files.errors import InputError
 from mitsim.report.export.robot_targets import ROBOT_FORMATS, RobotTarget, kuka_numbers, read_targets
 from mitsim.sensor.transforms import Transform
+from mitsim.study.run_files import digests_of
+from mitsim.study.task_measurement import read_pose
+from mitsim.views.candidates import Candidates, View
+from mitsim.views.poses import write_views
+from mitsim.views.table import FlangeFromSensor, ViewsTable
 from tests.report.export.known_cloud import POSE
 from tests.report.export.test_export_command import export
 from tests.report.view_sphere_run import write_expecting_run
@@ -123,7 +128,7 @@ def test_targets_of_a_run_are_its_set_of_views(tmp_path):
     assert "1 pose of" in export("targets", folder, "--robot", "ur", "--views", "3", "-o", tmp_path / "view.script")
     document["flange_from_sensor"] = np.eye(4).tolist()
     for one in document["views"]:
-        one["part_from_flange"] = POSE.matrix().tolist()
+        one["part_from_flange"] = one["part_from_sensor"]
     (folder / "poses/poses.json").write_text(json.dumps(document))
     assert "of the flange" in export("targets", folder, "--robot", "abb", "--views", "all", "-o", tmp_path / "v.mod")
     assert (tmp_path / "v.mod").read_text().count("CONST robtarget") == 12
@@ -139,10 +144,58 @@ def test_targets_of_a_run_are_its_set_of_views(tmp_path):
         ([], "best", r"poses\.json: views: found no entry of view"),
         ([], "all", r"poses\.json: views: found no view; "),
         ([], "3", "--views: found '3'; allowed: best or all: there are no views"),
-        ([{"view": float("inf")}], "all", r"poses\.json: found a file that cannot be read"),
+        ([{"view": float("inf")}], "all", r"poses\.json: views: found entries that cannot be read"),
     ):
         (folder / "poses/poses.json").write_text(json.dumps({"views": entries}))
         with pytest.raises(InputError, match=message):
             read_targets(folder, views)
     with pytest.raises(InputError, match=r"poses\.json: found no such file"):
         export("targets", tmp_path, "--robot", "abb", "-o", tmp_path / "w.mod")
+
+
+def changed(document, key, value, number=3):
+    """The poses with one number of a view's matrix replaced, as an editor does it."""
+    out = json.loads(json.dumps(document))
+    out["views"][number][key][1][3] = value
+    return out
+
+
+@pytest.mark.parametrize("flange", [False, True])
+def test_a_changed_pose_is_neither_exported_nor_read(tmp_path, flange):
+    """Before, the robot went where the editor had sent it, and the report showed the pose that was scored."""
+    hand_eye = FlangeFromSensor(position_mm=(0, 0, 50), quaternion_xyzw=(0, 0, 0.6, 0.8)) if flange else None
+    poses = [POSE @ Transform(np.eye(3), np.arange(3.0) * n) for n in range(5)]
+    views = [View(n, np.array([0.0, 0.0, 1.0]), 0.0, 500.0, pose) for n, pose in enumerate(poses)]
+    table = ViewsTable(flange_from_sensor=hand_eye)
+    path = tmp_path / "poses" / "poses.json"
+    write_views(path.parent, Candidates(views, [], 0, np.zeros(3)), table, "ensenso-n10")
+    written = path.read_text(encoding="utf-8")
+    tool = "flange" if flange else "sensor"
+    assert read_targets(tmp_path, "all")[1] == tool
+    np.testing.assert_array_equal(read_pose(path, 3).matrix(), views[3].world_from_sensor.matrix())
+    for key in ("part_from_sensor", "sensor_from_part", *(["part_from_flange"] if flange else [])):
+        path.write_text(json.dumps(changed(json.loads(written), key, 123.0)), encoding="utf-8")
+        with pytest.raises(InputError, match=r"poses\.json: views\.\w+ of view 3: found a pose that is off by .* mm"):
+            read_targets(tmp_path, "all")
+        with pytest.raises(InputError, match="of view 3: found a pose that is off"):
+            read_pose(path, 3)
+    path.write_text(json.dumps(changed(json.loads(written), "part_from_sensor", float("nan"))), encoding="utf-8")
+    with pytest.raises(InputError, match=r"part_from_sensor of view 3: found a matrix that is not a rigid motion"):
+        read_targets(tmp_path, "all")
+
+
+def test_poses_of_another_run_are_not_exported(tmp_path):
+    """``run.json`` has the digest of the poses of its run."""
+    folder = write_expecting_run(tmp_path / "run")
+    path = folder / "poses" / "poses.json"
+    path.parent.mkdir()
+    text = json.dumps({"views": [{"view": n, "part_from_sensor": POSE.matrix().tolist()} for n in range(12)]})
+    path.write_text(text, encoding="utf-8")
+    about = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    about["files"] = digests_of(folder, [*about.get("files", {}), "poses/poses.json"])
+    (folder / "run.json").write_text(json.dumps(about), encoding="utf-8")
+    assert len(read_targets(folder, "all")[0]) == 12
+    path.write_text(text.replace("500", "501") + " ", encoding="utf-8")
+    for views in ("best", "all", "3"):
+        with pytest.raises(InputError, match=r"poses\.json: sha256: found a file of another run, or a changed one"):
+            read_targets(folder, views)
