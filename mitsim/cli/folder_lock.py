@@ -34,7 +34,10 @@ _LEFT_OVER = re.compile(
 _STALE_S = 24 * 3600.0
 
 #: folders of a run in which files are written one by one
-_WITHIN = ("", "captures", "clouds", "coupons")
+_WITHIN = ("", "captures", "clouds", "coupons", "trials")
+
+#: folders that are runs, in that of a command: its own, those of the sensors of ``choose`` and of the samples of a talk
+_RUNS = ("", "*", "views/*")
 
 
 def lock_folder(folder: Path) -> Callable[[], None]:
@@ -61,7 +64,8 @@ def lock_folder(folder: Path) -> Callable[[], None]:
 
 def remove_partial(folder: Path) -> list[Path]:
     """Remove partial files of dead processes; return the paths removed or restored."""
-    return [path for name in _WITHIN for path in _swept(folder / name)]
+    runs = [path for pattern in _RUNS for path in (folder.glob(pattern) if pattern else [folder]) if path.is_dir()]
+    return [path for run in runs for name in _WITHIN for path in _swept(run / name)]
 
 
 def remove_partial_beside(path: Path) -> list[Path]:

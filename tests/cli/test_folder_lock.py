@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,6 +17,8 @@ from characterisation.files.errors import InputError
 from mitsim.cli.folder_lock import LOCK, _holder, lock_folder, remove_partial, remove_partial_beside
 from mitsim.cli.options import check_folder, release_folders
 from mitsim.study.scoring import score_study
+from mitsim.study.virtual.trials import Outcome, TrialFolder
+from mitsim.study.virtual.world import Trial
 from tests.shell import mitsim_here
 from tests.small_study import small_study
 from tests.smaller_sensors import coarse_sensor
@@ -89,6 +92,27 @@ def test_only_left_overs_of_the_dead_are_swept(tmp_path):
     day_old = time.time() - 25 * 3600
     os.utime(tmp_path / ".k.partial-999999999-0000000f", (day_old, day_old))
     assert [path.name for path in remove_partial(tmp_path)] == [".k.partial-999999999-0000000f"]
+
+
+def test_a_repaired_file_of_trials_leaves_nothing_that_is_not_swept(tmp_path, monkeypatch):
+    """Killed before the rename, the repair leaves a file; before, no command recognised its name and its folder."""
+    trials = TrialFolder(tmp_path / "david-sls-3" / "trials", "digest", ["radius"])
+    trials.add(3, Trial(0), Outcome({"radius": 0.5}))
+    file = trials.folder / "view_0003.jsonl"
+    file.write_bytes(file.read_bytes() + b'{"day": 1, "cap')
+    left = []
+
+    def killed(partial, _target):
+        dead = partial.with_name(partial.name.replace(str(os.getpid()), "999999999"))
+        left.append(Path(shutil.copy(partial, dead)))
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(Path, "replace", killed)
+        TrialFolder(trials.folder, "digest", ["radius"]).known(3)
+    assert remove_partial(tmp_path) == left and len(left) == 1
+    assert list(trials.folder.iterdir()) == [file]
+    assert TrialFolder(trials.folder, "digest", ["radius"]).known(3) == trials.known(3)
 
 
 def test_beside_a_file_only_its_own_left_overs_are_swept(tmp_path):

@@ -24,7 +24,7 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from characterisation.files.arrays import Floats
-from characterisation.files.atomic_io import json_values
+from characterisation.files.atomic_io import json_values, write_text
 from characterisation.files.documents import Document
 from characterisation.files.errors import InputError
 from characterisation.statements.one_sided import OneSidedErrors
@@ -186,9 +186,7 @@ class TrialFolder:
             outcomes[entry[0]] = entry[1]
             kept.append(line)
         if "\n".join([*kept, ""]) != text:
-            partial = path.with_suffix(f".{os.getpid()}.partial")
-            partial.write_text("\n".join([*kept, ""]), encoding="utf-8")
-            partial.replace(path)
+            write_text(path, "\n".join([*kept, ""]))
         return outcomes
 
     def _entry(self, line: str) -> tuple[Trial, Outcome] | None:
