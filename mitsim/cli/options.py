@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Callable
@@ -9,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from characterisation.files.atomic_io import pointed_to
 from characterisation.files.errors import InputError
@@ -128,6 +129,20 @@ def print_reasons(cloud: PointCloud) -> None:
         print(f"{reason}\t{count}")
 
 
+class Command(TyperCommand):
+    """A command that refuses numbers that are not finite, which pass options without limits."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the arguments, and check their numbers."""
+        remaining = list(super().parse_args(ctx, args))
+        for parameter in self.params:
+            value = ctx.params.get(parameter.name)
+            for number in value if isinstance(value, (list, tuple)) else (value,):
+                if isinstance(number, float) and not math.isfinite(number):
+                    raise InputError(max(parameter.opts, key=len), "", f"{number}", "a finite number")
+        return remaining
+
+
 class Group(TyperGroup):
     """A group that lists the whole first sentence of each command in ``--help``. Click would cut it to one line."""
 
@@ -166,7 +181,7 @@ def command_group(words: str, *commands: Callable[..., None], default: bool = Fa
         cls=DefaultCommandGroup if default else Group, no_args_is_help=True, rich_markup_mode=None, help=words
     )
     for command in commands:
-        group.command(name=command.__name__.rstrip("_"))(command)
+        group.command(name=command.__name__.rstrip("_"), cls=Command)(command)
     return group
 
 

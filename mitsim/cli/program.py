@@ -44,7 +44,7 @@ from mitsim.cli import (
     talk,
 )
 from mitsim.cli.kept_files import note_arguments
-from mitsim.cli.options import Group, command_group, release_folders
+from mitsim.cli.options import Command, Group, command_group, release_folders
 
 
 class Commands(Group):
@@ -100,7 +100,7 @@ for command in (
     decode.decode,
     compare.compare,
 ):
-    app.command(name=command.__name__.rstrip("_"))(command)
+    app.command(name=command.__name__.rstrip("_"), cls=Command)(command)
 for name, group in {
     "study": command_group(
         "Take single steps of a study: predict, compare sensors, state a view, plan exposures; make the talk again.",
