@@ -37,6 +37,9 @@ from mitsim.study.statement_file import InfluenceEntry, StatedMeasurement, State
 #: how the software was verified (ISO/TS 15530-4), in words; docs/explanation/validity.md, criteria 10 and 11
 VERIFIED = "closed forms, examples of JCGM 101 and 106, another renderer; not by a metal part with calibrated values"
 
+#: names of the facts about influences
+INFLUENCES = VARIED, SIZES, FIXED, LEFT_OUT = "Varied", "Sizes (σ or range)", "Fixed", "Left out"
+
 #: hexadecimal digits of a digest that are printed
 _DIGITS = 16
 
@@ -276,11 +279,11 @@ def _influences(document: StatementDocument, lay_open: bool) -> list[tuple[str, 
     idle |= set() if _is_sprayed(document) else {"coat"}
     drawn = {group: table for group, table in document.unknowns.items() if group not in idle}
     out = [
-        ("Varied", "; ".join(_names(varied) + marks * document.draws_lay)),
-        ("Sizes (σ or range)", unknowns_in_words(drawn)),
+        (VARIED, "; ".join(_names(varied) + marks * document.draws_lay)),
+        (SIZES, unknowns_in_words(drawn)),
     ]
-    out += [("Fixed", "; ".join(_names(fixed)))] if fixed else []
-    return [*out, ("Left out", "; ".join(missing))]
+    out += [(FIXED, "; ".join(_names(fixed)))] if fixed else []
+    return [*out, (LEFT_OUT, "; ".join(missing))]
 
 
 def _names(influences: Sequence[InfluenceEntry]) -> list[str]:

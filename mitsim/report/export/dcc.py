@@ -1,10 +1,11 @@
 """Write the statement of a run as a digital calibration certificate: DCC 3.2.1 of PTB, numbers after D-SI 2.1.0.
 
-Signal chain: results of a run, who issues them -> administrative data, then for each measurement its nominal value,
-error of the stated part with u and 95 % interval, its expected reading with U and k, accepted readings, number of
-virtual measurements, verdict -> one document.
+Signal chain: results of a run, who issues them -> administrative data, influences, then for each measurement its
+nominal value, error of the stated part with u and 95 % interval, its expected reading with U and k, accepted readings,
+number of virtual measurements, verdict -> one document.
 
-The elements are those of PTB's schema (https://ptb.de/dcc/v3.2.1/dcc.xsd), which is LGPL-3.0 and no part of mitsim. The
+The elements are those of PTB's schema (https://ptb.de/dcc/v3.2.1/dcc.xsd), which is LGPL-3.0 and no part of mitsim.
+PTB's Schematron rules, in its package dcclib, also ask for conditions of influence and a letter before a version. The
 document calls itself simulated and not traceable: it is the statement of a virtual experiment in the form that programs
 for certificates read, and no calibration. The laboratory signs it, mitsim does not.
 """
@@ -20,8 +21,9 @@ from characterisation.files.atomic_io import atomic_write
 from characterisation.files.errors import InputError
 from characterisation.statements.statement import ANY_PART
 from characterisation.tasks.task_file import effective_deviations
+from characterisation.words.numbers import NONE
 from characterisation.words.version import __version__
-from mitsim.report.declaration import Declaration
+from mitsim.report.declaration import INFLUENCES, VARIED, Declaration
 from mitsim.report.export.results import ExpectedResult, RunResults
 from mitsim.report.export.xml_text import xml_text
 
@@ -98,6 +100,11 @@ def dcc_document(run_results: RunResults, declared: Declaration, issuer: Issuer)
     equipment = _add(_add(result, "measuringEquipments"), "measuringEquipment")
     _text(equipment, "name", f"3D vision sensor {run_results.sensor}, simulated")
     _identified(_add(equipment, "identifications"), "owner", issuer.serial, "serial number")
+    conditions = _add(result, "influenceConditions")
+    for name, text in [fact for fact in declared.facts if fact[0] in INFLUENCES and fact[1]] or [(VARIED, NONE)]:
+        condition = _add(conditions, "influenceCondition")
+        _text(condition, "name", name)
+        _text(_add(condition, "data"), "text", text)
     results = _add(result, "results")
     for expected_result in run_results.results:
         _result(results, expected_result)
@@ -139,7 +146,7 @@ def _administrative(to: Element, run_results: RunResults, declared: Declaration,
     _add(simulated, "traceable", "false")
     _text(simulated, "declaration", _NOT_TRACEABLE)
     for name, text in declared.facts:
-        if text:
+        if text and name not in INFLUENCES:
             statement = _add(statements, "statement")
             _text(statement, "name", name)
             _text(statement, "declaration", text)
@@ -159,7 +166,7 @@ def _methods(to: Element, run_results: RunResults, declared: Declaration) -> Non
 def _software(to: Element) -> None:
     software = _add(to, "software")
     _text(software, "name", "mitsim")
-    _add(software, "release", __version__)
+    _add(software, "release", f"v{__version__}")
 
 
 def _result(to: Element, expected_result: ExpectedResult) -> None:

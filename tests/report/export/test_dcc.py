@@ -48,14 +48,17 @@ GRAMMAR = {
     "noQuantity": "content+",
     "name": "content+",
     "measurementResults": "measurementResult+",
-    "measurementResult": "name usedMethods? usedSoftware? measuringEquipments? results",
+    "measurementResult": "name usedMethods? usedSoftware? measuringEquipments? influenceConditions? results",
     "usedMethods": "usedMethod+",
     "usedMethod": "name description? norm*",
     "measuringEquipments": "measuringEquipment+",
     "measuringEquipment": "name identifications?",
     "results": "result+",
     "result": "name description? data",
-    "data": "list+",
+    "influenceConditions": "influenceCondition+",
+    "influenceCondition": "name description? data",
+    "text": "content+",
+    "data": "text* list*",
     "list": "quantity+",
     "real": "value unit expandedUnc? coverageInterval?",
     "expandedUnc": "uncertainty coverageFactor coverageProbability",
@@ -67,6 +70,7 @@ NUMBER = r"[-+]?(\d*\.\d+|\d+\.\d*|\d+)([Ee][-+]?\d+)?"
 FORMS = {
     "beginPerformanceDate": r"\d{4}-\d\d-\d\d",
     "endPerformanceDate": r"\d{4}-\d\d-\d\d",
+    "release": r"[A-Za-z] ?(\d{1,3}\.){0,3}\d{1,3}",
     "performanceLocation": "laboratory|customer|laboratoryBranch|customerBranch|other",
     "issuer": "manufacturer|calibrationLaboratory|customer|owner|other",
     "countryCode": "[A-Z]{2}",
@@ -83,7 +87,7 @@ FORMS = {
 
 def declared():
     first = FirstScreen([Reason("fits")], "good", [], None, [], {})
-    facts = [("Left out", "coatings"), ("Exposure", "")]
+    facts = [("Varied", "pose"), ("Left out", "coatings"), ("Exposure", ""), ("Decision rule", "simple acceptance")]
     return Declaration(
         "sensor measures part", "2026-11-27", "0123456789abcdef", first, [], facts, [Note("Error = a − b.")]
     )
@@ -199,7 +203,19 @@ def test_the_country_is_the_laboratorys_alone(document):
 def test_the_document_says_that_it_is_no_calibration(document):
     statements = document.findall(f".//{{{DCC}}}statement")
     assert statements[0].find("{*}traceable").text == "false" and "no calibration" in statements[0][1][0].text
-    assert [one.find("{*}name/{*}content").text for one in statements[1:]] == ["Left out"]
+    assert [one.find("{*}name/{*}content").text for one in statements[1:]] == ["Decision rule"]
+
+
+@pytest.mark.parametrize("influences", [[("Varied", "pose"), ("Left out", "coatings")], []])
+def test_every_result_has_methods_and_conditions(every_kind, tmp_path, influences):  # noqa: F811
+    """PTB's rules: a result without either is *unacceptable*. Before, influences were statements, and no conditions."""
+    facts = [("Decision rule", "simple acceptance"), *influences]
+    write_dcc(every_kind, replace(declared(), facts=facts), ISSUER, tmp_path / "dcc.xml")
+    (result,) = etree.parse(tmp_path / "dcc.xml").findall(f".//{{{DCC}}}measurementResult")
+    assert result.find("{*}usedMethods/{*}usedMethod") is not None
+    conditions = result.findall("{*}influenceConditions/{*}influenceCondition")
+    found = [(one.find("{*}name/{*}content").text, one.find("{*}data/{*}text/{*}content").text) for one in conditions]
+    assert found == (influences or [("Varied", "\N{EN DASH}")])
 
 
 @pytest.mark.parametrize(
