@@ -317,7 +317,8 @@ class Rig:
 def stereo_rectification(left: Camera, right: Camera) -> Rectification:
     """Rectify a pair as OpenCV does (Bouguet's method): equal rotation of both cameras, focal length kept in scale.
 
-    OpenCV finds the centre of the rectified image by undistorting its corners. That iteration can diverge for strong
+    Where OpenCV has the second camera above, below or to the left, both are rolled until it is to the right (+x).
+    OpenCV finds the centre of the rectified image by undistorting its corners, an iteration that can diverge for strong
     distortion. Rotations and focal length do not depend on it; a diverged centre is replaced.
 
     Raises
@@ -332,14 +333,18 @@ def stereo_rectification(left: Camera, right: Camera) -> Rectification:
     eyes = (left.matrix, left.distortion, right.matrix, right.distortion, (left.width, left.height))
     rotation, shift = right_from_left.rotation, right_from_left.translation.reshape(3, 1)
     r1, r2, p1, p2, *_ = cv2.stereoRectify(*eyes, rotation, shift, flags=0, alpha=-1)
-    baseline = float(np.linalg.norm(right_from_left.translation))
     k1, k2, turn1, turn2 = (np.array(matrix, np.float64)[:, :3] for matrix in (p1, p2, r1, r2))
-    f, middle = k1[0, 0], np.array([(left.width - 1) / 2, (left.height - 1) / 2])
-    centres = []
+    baseline = float(np.linalg.norm(shift))
+    x, y, _ = np.round(-turn2 @ right_from_left.translation / baseline)  # one is 1 or -1
+    roll = np.array([[x, y, 0.0], [-y, x, 0.0], [0.0, 0.0, 1.0]])
+    turn1, turn2 = (turn1, turn2) if x == 1 else (roll @ turn1, roll @ turn2)
+    upright = abs(turn1[0, 0]) > abs(turn1[0, 1])
+    width, height = (left.width, left.height) if upright else (left.height, left.width)
+    f, middle, centres = k1[0, 0], np.array([(width - 1) / 2, (height - 1) / 2]), []
     for camera, rotation in ((left, turn1), (right, turn2)):
         ray = rotation @ camera.rays(np.array([(camera.width - 1) / 2, (camera.height - 1) / 2]))
         centres.append(middle - f * ray[:2] / ray[2])
-    if np.abs(np.subtract([k1[:2, 2], k2[:2, 2]], centres)).max() >= LOST_SHARE * left.width:
+    if x != 1 or not upright or np.abs(np.subtract([k1[:2, 2], k2[:2, 2]], centres)).max() >= LOST_SHARE * left.width:
         row = float(np.mean([centre[1] for centre in centres]))
         k1, k2 = (np.array([[f, 0, column], [0, f, row], [0, 0, 1]]) for column, _ in centres)
-    return Rectification(k1, k2, turn1, turn2, baseline, left.width, left.height)
+    return Rectification(k1, k2, turn1, turn2, baseline, width, height)

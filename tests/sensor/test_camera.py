@@ -114,6 +114,32 @@ def test_rectification_aligns_rows_and_gives_depth(n10):
     assert np.isclose(rectified.baseline, 101.04, atol=0.01)
 
 
+@pytest.mark.parametrize("roll", [0, 45, 89.9, 90, 135, 180, -179.9, -90, -45])
+@pytest.mark.parametrize("shift", [(100, 0, 0), (0, 100, 0), (0, -100, 0), (-100, 0, 0), (70, 70, 0)], ids=str)
+def test_a_pair_is_rectified_at_any_roll_and_baseline(roll, shift):
+    """OpenCV rectifies along columns if half the roll makes the baseline steep: depths were NaN in most pairs."""
+    left = Camera(
+        np.array([[800.0, 0, 330], [0, 810, 250], [0, 0, 1]]), np.array([-0.1, 0.02, 1e-3, -1e-3, 0]), 640, 480
+    )
+    right = replace(left, sensor_from_camera=Transform.from_degrees([4.0, -6.0, roll], shift))
+    points = np.random.default_rng(1).uniform([-80, -60, 450], [80, 60, 650], (50, 3))
+    pair = stereo_rectification(left, right)
+    turned = {}
+    for eye, rotation, matrix in (
+        (left, pair.rotation_left, pair.matrix_left),
+        (right, pair.rotation_right, pair.matrix_right),
+    ):
+        local = eye.rays(eye.project(points)) @ rotation.T
+        turned[eye] = (local / local[:, 2:]) @ matrix.T
+    assert np.abs(turned[left][:, 1] - turned[right][:, 1]).max() < 1e-6
+    depth = pair.depth(turned[left][:, 0] - turned[right][:, 0])
+    found = depth[:, None] * (turned[left] @ np.linalg.inv(pair.matrix_left).T) @ pair.rotation_left
+    np.testing.assert_allclose(found, points, atol=1e-8)
+    middle = np.array([(left.width - 1) / 2, (left.height - 1) / 2, 1.0])
+    shown = pair.matrix_left @ pair.rotation_left @ np.linalg.inv(left.matrix) @ middle
+    assert (np.abs(shown[:2] / shown[2] / [pair.width, pair.height] - 0.5) < 0.3).all()
+
+
 @given(st.floats(100, 5000))
 def test_disparity_and_depth_are_inverse(depth):
     matrix = np.array([[600.0, 0, 300], [0, 600, 240], [0, 0, 1]])

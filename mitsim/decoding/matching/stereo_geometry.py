@@ -46,19 +46,22 @@ def stereo_geometry(rig: Rig) -> StereoGeometry:
     Raises
     ------
     InputError
-        If the rig has fewer than two cameras, or its second camera is not to the right of the first.
+        If the rig has fewer than two cameras, or its second camera is to the left of the first.
     """
     if len(rig.cameras) < 2:
         raise InputError("rig", "cameras", f"{len(rig.cameras)}", "two or more for stereo")
     left, right = list(rig.cameras.values())[:2]
-    rectification = rig.rectification or stereo_rectification(left, right)
-    to_right = rectification.rotation_left @ left.sensor_from_camera.inverse().points(right.centre)
-    if to_right[0] < 0.9 * np.linalg.norm(to_right) or rectification.baseline <= 0:
+    rectification, to_right = rig.rectification, left.sensor_from_camera.inverse().points(right.centre)
+    least = -0.7  # stereo_rectification rolls a pair whose second camera is above or below
+    if rectification is not None:
+        to_right, least = rectification.rotation_left @ to_right, 0.9
+    rectification = rectification or stereo_rectification(left, right)
+    if to_right[0] < least * np.linalg.norm(to_right) or rectification.baseline <= 0:
         raise InputError(
             "rig",
             "cameras",
-            f"the second camera at {np.round(to_right, 1).tolist()} mm from the first, rectified",
-            "a second camera to the right (+x) of the first",
+            f"the second camera at {np.round(to_right, 1).tolist()} mm from the first",
+            "a second camera to the right (+x) of the first, above or below",
             "name the left camera first; or R and T are inverted: they take points of the first camera to the second",
         )
     map_left, seen_left = _rectifying_map(left, rectification.matrix_left, rectification.rotation_left, rectification)

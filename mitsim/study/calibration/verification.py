@@ -30,7 +30,7 @@ from mitsim.sensor.rig_parameters import PATH_NAMES, moved, parameter_names, pat
 from mitsim.sensor.sensor import Sensor
 from mitsim.study.calibration.accuracy import measured_points, triangulated
 from mitsim.study.calibration.board import Board
-from mitsim.study.calibration.corner_files import found_corners, turned_alike
+from mitsim.study.calibration.corner_files import found_corners
 
 #: number of rigs drawn: a standard deviation follows to 5 %; chosen
 _DRAWS = 200
@@ -152,8 +152,9 @@ def corners_of_board(capture: Capture, board: Board, cloud: PointCloud | None) -
     names = list(capture.rig.cameras)
     if len(names) > 1 and all(name in pixels for name in names[:2]):
         first, second = (capture.rig.cameras[name] for name in names[:2])
-        (second_pixels,) = turned_alike([(pixels[names[0]], pixels[names[1]])])
-        points, rows = triangulated(first, pixels[names[0]], second, second.rays(second_pixels))
+        rays = second.rays(pixels[names[1]])
+        orders = [triangulated(first, pixels[names[0]], second, order) for order in (rays, rays[::-1])]
+        points, rows = min(orders, key=lambda order: float(np.mean(order[1] ** 2)))  # as a board after half a turn
     elif cloud is not None and names[0] in pixels:
         points, rows = _on_plane(capture, pixels[names[0]], cloud), np.empty(0)
     else:

@@ -121,6 +121,25 @@ def test_plane_comes_back_where_it_is(make_rig, normal):
     assert abs(error.mean()) < 0.05
 
 
+@pytest.mark.parametrize("shift", [(BASELINE, 0, 0), (0, BASELINE, 0), (0, -BASELINE, 0)], ids=str)
+@pytest.mark.parametrize("roll", [0, 90, 180])
+def test_a_pair_one_above_the_other_or_upside_down_is_matched(roll, shift):
+    """Before, a roll of 180 deg or a vertical baseline was refused as a second camera that is not to the right."""
+    rig, surface = real_rig(), plane([0.2, 0.1, 1], 487.3)
+    place = Transform.from_degrees([0, 0, roll], shift)
+    rig = replace(rig, cameras=rig.cameras | {"right": replace(rig.cameras["right"], sensor_from_camera=place)})
+    cloud = decode(rig, pair(rig, surface))
+    error = disparity_error(cloud, rig, surface)
+    assert cloud.valid.mean() > 0.5
+    assert np.abs(error).mean() < 0.1 and abs(error.mean()) < 0.05
+
+
+def test_a_second_camera_to_the_left_is_refused():
+    rig = real_rig()
+    with pytest.raises(InputError, match="name the left camera first"):
+        stereo_geometry(replace(rig, cameras=dict(reversed(rig.cameras.items()))))
+
+
 @pytest.mark.parametrize("mode", ["hh", "sgbm", "3way"])
 def test_no_part_of_a_pixel_is_lost(mode):
     """The matcher draws disparities toward whole pixels; over all fractions of a pixel that must cancel."""

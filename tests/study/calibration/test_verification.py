@@ -76,6 +76,20 @@ def test_a_rig_that_did_not_move_is_usable_and_its_board_is_where_it_is(n10, goo
     assert found.distance_mm == pytest.approx(np.linalg.norm(PLACE.points(BOARD.corners), axis=1).mean(), rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("tilt_deg", "centre", "roll"),
+    [((0, -8, 0), (100, 0, 0), 180), ((-8, 0, 0), (0, -90, 0), 0), ((0, 8, 0), (-80, 0, 0), -90)],
+    ids=["upside down", "above", "left and on its side"],
+)
+def test_a_second_camera_anywhere_is_verified(n10, tilt_deg, centre, roll):
+    """Before, its points were NaN, and the corners of an upside-down camera in the reverse order."""
+    place = Transform.from_degrees(tilt_deg, centre) @ Transform.from_degrees((0, 0, roll), (0, 0, 0))
+    right = replace(n10.rig.cameras["right"], sensor_from_camera=place)
+    sensor = replace(n10, rig=replace(n10.rig, cameras=n10.rig.cameras | {"right": right}, rectification=None))
+    known = corners_of_board(capture_by(sensor, sensor.rig), BOARD, None)
+    assert abs(known.scale - 1) < 4 * known.scatter < 2e-3 and np.std(known.rows_px) < 0.2
+
+
 def test_a_camera_that_turned_about_its_row_is_to_be_calibrated_again(n10, turned):
     found = verify(corners_of_board(turned, BOARD, None), n10, n10.rig, preset_covariance(n10))
     assert abs(found.row_error_px) == pytest.approx(4e-3 * 626, rel=0.1)
