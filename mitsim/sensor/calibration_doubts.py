@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 from mitsim.sensor.calibration_qualifiers import LENGTHS_MM
+from mitsim.sensor.camera import Camera
 
 #: longest baseline [mm] that is plausible in a unit that the file does not state. Chosen: the 1.8 cm of a RealSense
 #: D405, read in metres, are longer
@@ -24,6 +27,21 @@ _SHORTEST_PROPOSED_MM = 10.0
 
 #: tangential coefficients of a lens are smaller
 _LARGEST_TANGENTIAL = 0.02
+
+#: tangential coefficients of most lenses are smaller; chosen
+_USUAL_TANGENTIAL = 0.005
+
+#: k1 of a lens with a barrel distortion that k1 of cv2.fisheye seldom has; chosen: 0.03 describe a k1 of -0.3
+_STRONG_BARREL = 0.15
+
+#: widest horizontal field of view of a perspective lens that raises no doubt [deg]; chosen
+_WIDEST_DEG = 100.0
+
+#: least distance at the image's corner between two lens models that matters [px]
+_LEAST_APART_PX = 0.5
+
+#: words that name a fisheye lens in the names of files and values
+_FISHEYE_WORD = re.compile(r"fish_?eye|equidist\w*|kannala", re.IGNORECASE)
 
 #: principal points farther from the middle, in both axes, raise doubt [share of the sides]
 _FAR_FROM_MIDDLE = 0.2
@@ -74,20 +92,61 @@ def board_unit_note(name: str, baseline_mm: float) -> str:
     )
 
 
-def lens_note(name: str, distortion: NDArray[np.float64]) -> str:
-    """Return a warning about coefficients without a model that suggest another lens or order; empty without doubt."""
-    if len(distortion) < 4 or np.abs(distortion[2:4]).max() <= _LARGEST_TANGENTIAL:
-        return ""
-    p1, p2 = distortion[2:4]
-    if len(distortion) > 4:
-        return (
+def unnamed_lens(name: str, camera: Camera, words: str, where: str | Path) -> tuple[str, str]:
+    """Return the model of a lens whose model no file states, and a warning; empty without doubt.
+
+    Four coefficients are k1, k2, p1, p2 of a perspective lens, or k1 to k4 of a fisheye lens (``cv2.fisheye``). What
+    tells, in this order: ``words``, the names of the file and of its values; a tangential distortion or a field of view
+    that few perspective lenses have, which is refused; a strong barrel distortion, which few fisheye lenses have in k1.
+
+    Parameters
+    ----------
+    name, camera
+        The camera; a size that is not known may be twice its principal point.
+    words
+        Names that may state the model.
+    where
+        The file, for messages.
+
+    Raises
+    ------
+    InputError
+        If the numbers contradict a perspective lens.
+
+    See Also
+    --------
+    mitsim.sensor.lens_models.lens_model : the model that a file states
+    """
+    distortion = camera.distortion
+    p1, p2 = distortion[2:4] if len(distortion) > 3 else (0.0, 0.0)
+    tangential = max(abs(p1), abs(p2))
+    if len(distortion) != 4:
+        if tangential <= _LARGEST_TANGENTIAL:
+            return "perspective", ""
+        return "perspective", (
             f"{name} has p1 and p2 of {p1:g} and {p2:g}, larger than those of lenses: OpenCV's order is k1, k2, p1, "
             "p2, k3; is that of the file another, such as k1, k2, k3, p1, p2?"
         )
-    return (
-        f"{name} has four coefficients, of which p1 and p2 would be {p1:g} and {p2:g}: if they are k1 to k4 of a "
-        'fisheye lens, say so in a sensor file: [calibration] with model = "fisheye"'
-    )
+    corner = np.array([camera.width - 1.0, camera.height - 1.0])
+    ray = np.array([*((corner - camera.matrix[:2, 2]) / np.diag(camera.matrix)[:2]), 1.0])
+    seen = [replace(camera, model=model).project(ray) for model in ("perspective", "fisheye")]
+    apart = float(np.linalg.norm(seen[0] - seen[1]))
+    if not distortion.any() or apart < _LEAST_APART_PX:
+        return "perspective", ""
+    if (word := _FISHEYE_WORD.search(words)) is not None:
+        return "fisheye", f"{name} is taken as a fisheye lens of k1 to k4, since {word[0]!r} is in the file's names"
+    field_deg = 2 * math.degrees(math.atan(camera.width / 2 / camera.matrix[0, 0]))
+    four = f"{name} has four coefficients without a lens model"
+    key = 'write distortion_model: "equidistant" (k1 to k4, fisheye) or "plumb_bob" (k1, k2, p1, p2) beside them, or'
+    key += ' model = "fisheye" or "perspective" in [calibration] of a sensor file'
+    if tangential > _LARGEST_TANGENTIAL or field_deg > _WIDEST_DEG:
+        found = f"{four}: {distortion.tolist()}, and a field of view of {field_deg:.0f} deg"
+        allowed = f"p1 and p2 up to {_LARGEST_TANGENTIAL:g} and up to {_WIDEST_DEG:g} deg, or a stated model"
+        raise InputError(where, f"distortion of {name}", found, allowed, key)
+    if distortion[0] < -_STRONG_BARREL and tangential <= _USUAL_TANGENTIAL:
+        return "perspective", ""
+    by = f"moves by {apart:.0f} px" if math.isfinite(apart) else "is beyond one of the lenses"
+    return "perspective", f"{four}, taken as k1, k2, p1, p2; as k1 to k4 the image's corner {by}: {key}"
 
 
 def matrix_notes(name: str, matrix: NDArray[np.float64], size: tuple[int, int] | None) -> list[str]:

@@ -310,10 +310,10 @@ def in_opencvs_order(value: Any, table: Mapping[str, Any], fisheye: bool, where:
 
 
 def _ordered(named: Mapping[str, float], fisheye: bool) -> NDArray[np.float64]:
-    """Return coefficients by name in OpenCV's order, 0 for those that are missing."""
-    order = _FISHEYE if fisheye else _BENT
+    """Return coefficients by name in OpenCV's order, 0 for those that are missing: four for a fisheye lens alone."""
+    order, lengths = (_FISHEYE, (4,)) if fisheye else (_BENT, (5, 8, 12, 14))
     last = max(order.index(name) for name in named)
-    count = next(length for length in (4, 5, 8, 12, 14) if length > last)
+    count = next(length for length in lengths if length > last)
     return np.array([named.get(name, 0.0) for name in order[:count]])
 
 

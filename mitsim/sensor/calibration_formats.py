@@ -93,10 +93,11 @@ def read_documents(file: Path) -> list[dict[str, Any]]:
 
 
 def _numbers_of(arrays: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the arrays of an ``.npz``, without those of Python's objects, which only their program can read."""
+    """Yield the arrays and words of an ``.npz``, without Python's objects, which only their program can read."""
     for name in arrays.files:
         try:
-            yield name, arrays[name]
+            value = arrays[name]
+            yield name, value.item() if value.shape == () and value.dtype.kind in "US" else value
         except ValueError as error:
             if "Object arrays" not in str(error):
                 raise

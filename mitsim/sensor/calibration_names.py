@@ -24,7 +24,8 @@ _WRITTEN: dict[str, tuple[str, str, str]] = {
     ),
     "distortion": (
         """
-        distortion_coefficients distortion_coeffs distortion_coeff dist_coeffs dist_coeff dist_coefs distCoeff
+        distortion_coefficients distortionCoefficients distortion_coeffs distortionCoeffs distortion_coeff
+        distortion_params distortion_parameters dist_coeffs dist_coeff dist_coefs distCoeff
         distortion camera_distortion cam_kc cam_dist kc Dc D D1 distCoeffs distCoeffs1 distCoeffsL
         distortion_coefficients_1 distortion_coefficients_left D_left left_distortion
         left_distortion_coefficients kc_left kc_cam DL dist dist1 distL distortion_vector +D1

@@ -28,8 +28,8 @@ _DERIVED = re.compile(
     re.IGNORECASE,
 )
 
-#: names of the first single coefficient of a lens: k1, dist_k1, kc1, radial_1
-_FIRST = re.compile(r"(?:.*_)?(?:k[cr]?|kappa)_?1(?:_.*)?|(?:.*_)?(?:radial|dist|distortion)_?1")
+#: names of the first single coefficient of a lens: k1, dist_k1, kc1, radial_1, kappa of HALCON
+_FIRST = re.compile(r"(?:.*_)?(?:k[cr]?|kappa)_?1(?:_.*)?|kappa|(?:.*_)?(?:radial|dist|distortion)_?1")
 
 #: letters of a name from which its capital letters do not matter
 _SHORTEST = 5

@@ -177,8 +177,8 @@ def check_fourth(names: Sequence[str], values: Sequence[float], fisheye: bool, w
 def _stated(table: dict[str, Any], straight: bool) -> Iterator[tuple[str, Any, str]]:
     """Yield the names, texts and models of what a table states: ``perspective``, ``fisheye`` or ``other``."""
     for name, value in table.items():
-        if name.lower().replace("_", "") in _MARKS and isinstance(value, bool | int | float) and value == 1:
-            yield name, value, "fisheye"
+        if name.lower().replace("_", "") in _MARKS and isinstance(value, bool | int | float) and value in (0, 1):
+            yield name, value, "fisheye" if value else "perspective"
         if _MIRROR.fullmatch(name) and (mirror := vector(value, 1)) is not None and mirror[0]:
             yield name, float(mirror[0]), "other"
     for name in LENS_MODELS:

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.files.documents import Document, validate
 from characterisation.files.errors import InputError, nearest
-from mitsim.sensor.calibration_doubts import board_unit_note, check_unit, facing_note, lens_note, matrix_notes
+from mitsim.sensor.calibration_doubts import board_unit_note, check_unit, facing_note, matrix_notes, unnamed_lens
 from mitsim.sensor.calibration_eyes import in_opencvs_order, lens_in, size_of
 from mitsim.sensor.calibration_formats import beside
 from mitsim.sensor.calibration_names import USUAL_NAMES, Names
@@ -31,6 +31,7 @@ from mitsim.sensor.calibration_qualifiers import OF_FORMAT, of_images, read_out_
 from mitsim.sensor.calibration_quaternions import ORDERED
 from mitsim.sensor.calibration_table import CalibrationTable, EyeKeys
 from mitsim.sensor.calibration_tree import CalibrationTree, Found, read_tree
+from mitsim.sensor.camera import Camera
 from mitsim.sensor.lens_models import is_fisheye, lens_model, of_single_numbers
 
 
@@ -246,9 +247,7 @@ def _eye(values: _Values, name: str, index: int, sensor_keys: dict[str, Any]) ->
     if index < 2:
         stating = file if matrix is None else matrix.file
         model = lens_model(table, stating, calibration_table.model, not distortion.any()) or calibration_table.model
-    if index < 2 and model is None and (note := lens_note(name, distortion)):
-        values.notes.append(f"calibration {file}: {note}")
-    model = model or "perspective"
+    unnamed, model = match is not None and index < 2 and model is None, model or "perspective"
     if model == "fisheye" and not distortion[4:].any():
         distortion = distortion[:4]  # librealsense has five numbers of any lens
     if model == "fisheye" and len(distortion) not in (0, 4):
@@ -271,6 +270,13 @@ def _eye(values: _Values, name: str, index: int, sensor_keys: dict[str, Any]) ->
         if index < 2:
             seen = None if read_out is not None else stated or size or values.size
             values.notes += [f"calibration {matrix.file.name}: {note}" for note in matrix_notes(name, K, seen)]
+        if match is not None and unnamed:
+            side = size or stated or values.size or 2 * K[:2, 2]
+            words = f"{matrix.file.stem} {matrix.name} {match.file.stem} {match.name}"
+            out["model"], note = unnamed_lens(
+                name, Camera(K, distortion, int(side[0]), int(side[1])), words, match.file
+            )
+            values.notes += [f"calibration {matrix.file.name}: {note}"] if note else []
         out |= {"focal_px": [float(K[0, 0]), float(K[1, 1])], "principal_px": [float(K[0, 2]), float(K[1, 2])]}
     if size is not None:
         out |= {"width": size[0], "height": size[1]}

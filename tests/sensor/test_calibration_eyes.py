@@ -187,8 +187,17 @@ def test_coefficients_are_read_by_the_names_beside_them(tmp_path):
             read_calibration(saved(tmp_path / "a.json", table | {"distortion_names": wrong}), SIZE)
 
 
+@pytest.mark.parametrize("name", ["distortionCoefficients", "DistortionCoefficients", "distortion_params"])
+def test_a_lens_is_read_by_more_spellings(tmp_path, name):
+    """Before, the camera was straight, with a note that a list was not read: 20 px off at the corner."""
+    for table in ({"camera_matrix": K.tolist()}, {"intrinsics": NUMBERS}):
+        read = read_calibration(saved(tmp_path / "a.json", table | {name: D}), SIZE)
+        sees(read.rig.reference, K, D)
+        assert read.notes == ()
+
+
 DOUBTS = {
-    "has four coefficients, of which p1 and p2": {"K": K.tolist(), "D": [-0.05, 0.03, 0.06, -0.04]},
+    "has four coefficients without a lens model": {"K": K.tolist(), "D": [-0.05, 0.03, 0.001, -0.004]},
     "has p1 and p2 of 0.08 and 0.001": {"K": K.tolist(), "D": [-0.2, 0.1, 0.08, 0.001, -0.0005]},
     "the principal point 100, 70 is far from the middle": NUMBERS | {"cx": 100.0, "cy": 70.0},
     "the principal point 2, -3 is far from the middle": NUMBERS | {"cx": 2.0, "cy": -3.0},

@@ -151,3 +151,53 @@ def test_coefficients_are_read_with_underscores_in_their_names(tmp_path):
         camera = read_calibration(single(tmp_path / "a.json", **dict(zip(names[:count], bent, strict=False))), SIZE)
         seen, _ = cv2.projectPoints(POINTS, np.zeros(3), np.zeros(3), K, np.array(bent[:count]))
         np.testing.assert_allclose(camera.rig.reference.project(POINTS), seen[:, 0], atol=1e-6)
+
+
+def of_fisheye_calibrate(path, focal=600.0, bent=BENT, **more):
+    matrix = K.copy()
+    matrix[[0, 1], [0, 1]] = focal, focal + 2
+    np.savez(path, K=matrix, D=np.reshape(bent, (4, 1)), DIM=SIZE, **more)
+    return path
+
+
+@pytest.mark.parametrize("name", ["fisheye_cam0.npz", "Kannala-Brandt.npz", "equidistant.npz"])
+def test_the_name_of_a_file_tells_a_fisheye_lens(tmp_path, name):
+    """Before, what cv2.fisheye.calibrate gives was k1, k2, p1, p2: 47 px off at the corner."""
+    path = of_fisheye_calibrate(tmp_path / name)
+    is_fisheye(path)
+    assert any("is taken as a fisheye lens" in note for note in read_calibration(path, SIZE).notes)
+
+
+@pytest.mark.parametrize("word", ["equidistant", "plumb_bob"])
+def test_a_word_in_arrays_states_the_model(tmp_path, word):
+    """Before, words in .npz files were no words, and told nothing."""
+    read = read_calibration(of_fisheye_calibrate(tmp_path / "a.npz", 280.0, distortion_model=word), SIZE)
+    assert (read.rig.reference.model, read.notes) == ("fisheye" if word == "equidistant" else "perspective", ())
+
+
+@pytest.mark.parametrize(
+    ("focal", "bent"), [(230.0, BENT), (600.0, [0.08, -0.05, 0.03, -0.01])], ids=["wide", "tangential"]
+)
+def test_four_numbers_that_no_perspective_lens_has_are_refused(tmp_path, focal, bent):
+    with pytest.raises(InputError, match=r"four coefficients without a lens model.*distortion_model"):
+        read_calibration(of_fisheye_calibrate(tmp_path / "a.npz", focal, bent), SIZE)
+
+
+def test_four_numbers_that_may_be_either_are_told_and_barrels_are_not(tmp_path):
+    (note,) = read_calibration(of_fisheye_calibrate(tmp_path / "a.npz"), SIZE).notes
+    ray = np.array([[[(639 - 322) / 600, (479 - 238) / 602, 1.0]]])
+    seen = [
+        project(ray, np.zeros(3), np.zeros(3), K, BENT)[0] for project in (cv2.projectPoints, cv2.fisheye.projectPoints)
+    ]
+    assert (
+        f"taken as k1, k2, p1, p2; as k1 to k4 the image's corner moves by {np.linalg.norm(seen[0] - seen[1]):.0f} px"
+        in note
+    )
+    barrel = [-0.28, 0.09, 1e-3, -5e-4]
+    single(tmp_path / "a.json", distortion=barrel)
+    single(tmp_path / "b.json", **dict(zip(("k1", "k2", "p1", "p2"), BENT.tolist(), strict=True)))
+    single(tmp_path / "c.json", distortion=BENT.tolist(), fisheye=False)
+    single(tmp_path / "d.json", distortion=[0.0] * 4)
+    for name in "abcd":
+        read = read_calibration(tmp_path / f"{name}.json", SIZE)
+        assert (read.rig.reference.model, read.notes) == ("perspective", ())
