@@ -179,7 +179,12 @@ def temporal_noise(clouds: Sequence[PointCloud]) -> Floats:
     clouds, or their grids differ in size.
     """
     _check_clouds("temporal_noise", clouds, 2, "rs-depth-quality takes 40")
-    distance = np.stack([np.linalg.norm(cloud.points - cloud.grid.origin, axis=-1) for cloud in clouds])
+    return _spread([np.linalg.norm(cloud.points - cloud.grid.origin, axis=-1) for cloud in clouds])
+
+
+def _spread(distances: Sequence[Floats]) -> Floats:
+    """Return the standard deviation over captures of distances (...) with NaN."""
+    distance = np.stack(distances)
     seen = np.isfinite(distance)
     count = seen.sum(0)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -195,14 +200,15 @@ def typical_temporal_noise(clouds: Sequence[PointCloud], region: NDArray[np.bool
     rounding, as to whole mm, made the depths of many pixels equal in all captures, the median may be 0 whatever the
     noise; then it is the root mean square. NaN if no pixel has two points.
     """
-    noise = temporal_noise(clouds)
-    used = region & np.isfinite(noise)
+    _check_clouds("temporal_noise", clouds, 2, "rs-depth-quality takes 40")
+    points = np.stack([cloud.points[region] for cloud in clouds])
+    noise = _spread([np.linalg.norm(p - cloud.grid.origin, axis=-1) for p, cloud in zip(points, clouds, strict=True)])
+    used = np.isfinite(noise)
     if not used.any():
         return float("nan")
-    points = np.stack([cloud.points for cloud in clouds])
     if np.mean((points == points[0]).all(axis=(0, -1))[used]) > _ALL_EQUAL:
         return float(np.sqrt(np.mean(noise[used] ** 2)))
-    freedom = np.sum([cloud.valid for cloud in clouds], axis=0)[used] - 1
+    freedom = np.sum([cloud.valid[region] for cloud in clouds], axis=0)[used] - 1
     return float(np.median(noise[used] / np.sqrt(chi2.median(freedom) / freedom)))
 
 

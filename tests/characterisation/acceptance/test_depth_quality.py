@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from characterisation.acceptance.depth_quality import (
     global_planarity_trueness,
@@ -103,6 +104,20 @@ def test_temporal_noise_of_depths_in_whole_mm(rng, sigma, count):
     expected = np.sqrt(np.mean(whole**2 * (1 - part) + (whole + 1) ** 2 * part) / 2)
     found = typical_temporal_noise(clouds, np.ones((150, 200), bool))
     assert found == pytest.approx(expected * np.linalg.norm(rays, axis=-1).mean(), rel=0.03)
+
+
+def test_temporal_noise_of_a_window_needs_its_pixels_alone(rng, monkeypatch):
+    """Before, each of several planes took the distances of the whole grid."""
+    clouds = [seen(wall(), rng.normal(0, 0.3, (150, 200))) for _ in range(3)]
+    region = np.zeros((150, 200), bool)
+    region[20:30, 40:60] = True
+    expected = np.median(temporal_noise(clouds)[region] / np.sqrt(chi2.median(2) / 2))
+    norm, taken = np.linalg.norm, []
+    monkeypatch.setattr(
+        np.linalg, "norm", lambda x, **more: taken.append(len(np.reshape(x, (-1, 3)))) or norm(x, **more)
+    )
+    assert typical_temporal_noise(clouds, region) == expected
+    assert taken == [200] * 3
 
 
 def test_temporal_noise_of_pixels_seen_less_than_twice_is_missing(rng):
