@@ -14,6 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from characterisation.files.errors import InputError
+from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
 from mitsim.capture.recordings.calibration_file import read_calibration
 from tests.shell import mitsim_here
 
@@ -83,6 +84,20 @@ def test_two_files_of_euroc(tmp_path):
 def test_two_files_of_which_one_has_no_pose_are_refused(tmp_path):
     with pytest.raises(InputError, match="the rotation of right"):
         read_calibration(pair_of_files(tmp_path, lambda number: euroc(number, "T_BS" if number else "T_other")))
+
+
+def test_a_folder_of_euroc_is_a_pair_by_its_own_calibration(tmp_path):
+    """Before, it needed a TOML of both files, and images in the folder itself."""
+    pair_of_files(tmp_path, euroc)
+    for number in range(2):
+        (tmp_path / f"cam{number}/data").mkdir()
+        for at in range(2):
+            image = np.full(SIZE[::-1], 20 * number + at, np.uint8)
+            cv2.imwrite(str(tmp_path / f"cam{number}/data/14036365797635555{at}4.png"), image)
+    capture = read_recording(tmp_path, ReadOptions(frame=1)).capture
+    assert {name: images[0, 0, 0] for name, images in capture.images.items()} == {"cam0": 1, "cam1": 21}
+    assert capture.settings["files"]["cam1"] == "cam1/data/1403636579763555514.png"
+    sees_the_points(capture.rig, BENT)
 
 
 def orb_slam(kind, lenses, names, pose):

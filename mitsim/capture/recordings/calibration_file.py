@@ -7,6 +7,7 @@ a small JSON              ``fx fy cx cy width height``, and optionally ``distort
 DepthAI                   JSON with ``cameraData``: its left and right camera
 a capture's               ``calibration.json`` of a capture folder
 an Ensenso's              ``*_calib.json`` of a recording: left and right camera, manufacturer's rectification
+a folder of EuRoC         ``cam0/sensor.yaml`` and ``cam1/sensor.yaml``
 others                    YAML, XML or JSON of OpenCV, ROS, Kalibr; .mat, .npz, under the usual names
 ========================= ============================================================
 """
@@ -40,6 +41,9 @@ from mitsim.sensor.opencv_calibration import has_pair, with_calibration
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.sensor_file import OpticsTable
 from mitsim.sensor.unknowns import UnknownsTable
+
+#: calibrations in a folder of EuRoC
+_OF_EUROC = ("cam0/sensor.yaml", "cam1/sensor.yaml")
 
 
 @dataclass(frozen=True)
@@ -89,6 +93,11 @@ def read_calibration(source: str | Path, size: tuple[int, int] | None = None) ->
 
 def _read(source: str | Path, size: tuple[int, int] | None) -> Calibrated:
     path = Path(source)
+    if is_euroc(path):
+        asked = {"file": list(_OF_EUROC), "projector": False, "cameras": ["cam0", "cam1"]}
+        table, notes = with_calibration(path / "mav0", {"calibration": asked}, size)
+        rig = {name: optics.camera() for name, optics in validate(path, table, RigFile).cameras.items()}
+        return Calibrated(Rig(rig), "", notes=tuple(notes))
     if path.suffix.lower() == ".toml" or str(source) in presets():
         return _of_toml(path, size)
     if path.suffix.lower() in (".yml", ".yaml", ".xml", ".mat", ".npz"):
@@ -107,6 +116,11 @@ def _read(source: str | Path, size: tuple[int, int] | None) -> Calibrated:
     if isinstance(table, dict) and _is_of_capture(table.get("cameras")):
         return Calibrated(rig_of(validate(path, table, CalibrationDocument)), "")
     return _of_opencv(path, size)
+
+
+def is_euroc(path: Path) -> bool:
+    """Return whether a path is a folder as of EuRoC, of two cameras with a calibration each."""
+    return all((path / name).is_file() for name in _OF_EUROC)
 
 
 def _is_of_capture(cameras: Any) -> bool:

@@ -172,7 +172,7 @@ def _kind_of_folder(path: Path, sensor: str | None, calibration: str | None) -> 
         return "ros"
     if recorded or any(name.endswith((".mp4", ".h264", ".h265")) for name in top):
         return "depthai"
-    if calibration is not None:
+    if calibration is not None or {"cam0/sensor.yaml", "cam1/sensor.yaml"} <= set(names):
         return "stereo-pair"
     if sensor is not None:
         return "images" if named_sensor(sensor)[1] == "structured_light" else "stereo-pair"

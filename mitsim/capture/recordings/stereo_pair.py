@@ -26,7 +26,7 @@ from mitsim.capture.grey_image import (
     is_colour,
     read_grey,
 )
-from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
+from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, is_euroc, read_calibration
 from mitsim.capture.recordings.image_folder import at_size_of_images
 from mitsim.capture.recordings.read_options import ReadOptions
 from mitsim.capture.recordings.recording_files import chosen_frame, frame_of
@@ -43,14 +43,17 @@ _POSE = (
 
 
 def read_stereo_pair(folder: str | Path, options: ReadOptions) -> Capture:
-    """Read one pair of a folder of images whose names begin with those of the two cameras: ``left_0.png``.
+    """Read one pair of images whose names begin with those of the two cameras, ``left_0.png``, or lie in their folders.
 
-    The calibration has two cameras, the left one first; ``images`` are patterns of file names for cameras whose images
-    are not named after them. ``frame`` is the number of the pair, counted from 0, or the name of its left image. Raises
-    InputError if an image is missing or does not fit the calibration, or there are several pairs and none was chosen.
+    A folder of EuRoC has its own calibration; any other has two cameras, the left one first. ``images`` are patterns of
+    file names for cameras whose images are not named after them. ``frame`` is the number of the pair, counted from 0,
+    or the name of its left image. Raises InputError if an image is missing or does not fit the calibration, or there
+    are several pairs and none was chosen.
     """
     folder = Path(folder)
-    calibration, frame, sensor = options.cameras_of(folder, "a stereo pair"), options.frame, options.named
+    own = str(folder) if is_euroc(folder) else None
+    calibration, frame = options.cameras or own or options.cameras_of(folder, "a stereo pair"), options.frame
+    sensor = options.named
     channel = channel_of(options.channel)
     calibrated = at_size_of_images(folder, lambda size: read_calibration(calibration, size))  # for the names alone
     names = names_of_pair(calibrated, calibration)
@@ -72,7 +75,7 @@ def read_stereo_pair(folder: str | Path, options: ReadOptions) -> Capture:
     levels = {name: read_grey(file, channel=channel) for name, file in chosen.items()}
     first = levels[names[0]]
     read = read_calibration(calibration, (first.shape[1], first.shape[0]))
-    settings: dict[str, Any] = {"files": {name: file.name for name, file in chosen.items()}}
+    settings: dict[str, Any] = {"files": {name: file.relative_to(folder).as_posix() for name, file in chosen.items()}}
     if is_colour(chosen[names[0]]):
         settings["channel"] = channel_name(channel)
     return pair_capture(levels, chosen, read, settings, sensor)
@@ -141,16 +144,17 @@ def pair_capture(
 
 
 def pair_files(folder: Path, camera: str, pattern: str | None = None) -> list[Path]:
-    """Return the images of a camera in a folder, ordered by number: by a name pattern, else by their beginning."""
+    """Return the images of a camera in a folder, ordered by number: by a name pattern, beginning or folder."""
     if not folder.is_dir():
         raise InputError(folder, "", "no such folder", "a folder of images")
     if pattern is not None:
         if Path(pattern).is_absolute() or ".." in Path(pattern).parts:
             raise InputError("--images", "", repr(pattern), "a pattern inside the folder")
         return sorted((path for path in folder.glob(pattern) if path.is_file()), key=counted)
-    files = [
-        path
-        for path in folder.iterdir()
-        if path.is_file() and path.suffix.lower() in SUFFIXES and path.name.lower().startswith(camera.lower())
-    ]
-    return sorted(files, key=counted)
+    inside = [path for path in folder.iterdir() if path.is_file() and path.name.lower().startswith(camera.lower())]
+    folders = (path for path in folder.iterdir() if path.is_dir() and path.name.lower() == camera.lower())
+    for files in (inside, *(path.rglob("*") for path in folders)):
+        images = sorted((path for path in files if path.suffix.lower() in SUFFIXES and path.is_file()), key=counted)
+        if images:
+            return images
+    return []

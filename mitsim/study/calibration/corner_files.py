@@ -5,9 +5,8 @@ Signal chain: folder of images, table of corners, OpenCV's file or arrays -> pix
 
 Four forms are read:
 
-- **A folder of images.** Camera and pose follow from the names: ``left-0001.png`` and ``right-0001.png``, as ROS's
-  calibrator saves them, or folders ``left`` and ``right`` with images of equal names. Names without a camera belong to
-  one camera. The corners are found by ``cv2.findChessboardCornersSB``.
+- **A folder of images.** Camera and pose follow from the names: ``left-0001.png`` and ``right-0001.png`` of ROS, or
+  folders ``left`` and ``right`` with images of equal names. Names without a camera belong to one camera.
 - **A table**, ``.csv``: columns ``pose, camera, column, row, x_px, y_px``. ``column`` and ``row`` count the inner
   corners from 0. A camera named ``projector`` is a projector. Lines ``# size CAMERA WIDTH HEIGHT`` give the sizes.
 - **OpenCV's file**, ``.yml``, ``.yaml``, ``.xml`` or ``.json`` of its calibration sample: ``image_points`` (poses,
@@ -68,6 +67,9 @@ _OF_ARRAYS = (".npz", ".yml", ".yaml", ".xml", ".json")
 _WITHIN = re.compile(
     r"(?<![a-zA-Z0-9])(?i:left|right|l|r|(?:camera|cam|ir|infra)[-_ ]?\d{1,2})(?![a-zA-Z0-9])|[LR](?=\d*$)"
 )
+
+#: folders within that of a camera: ``cam0/data`` of EuRoC, ``left/images``
+_OF_NO_CAMERA = ("data", "frames", "image", "image_raw", "images", "img", "raw", "rgb")
 
 _COLUMNS = ("pose", "camera", "column", "row", "x_px", "y_px")
 
@@ -220,17 +222,15 @@ def _from_epipolar_lines(first: Floats, second: Floats) -> float:
 
 
 def _named(files: Sequence[Path], path: Path) -> dict[Path, tuple[str, str]]:
-    """Return the camera and the pose of every image below ``path``.
-
-    A folder is a camera, unless the names of its images state several.
-    """
+    """Return camera and pose of the images below ``path``; a folder whose images name several cameras is none."""
     by_name = {file: _by_name(file) for file in files} | _pairs_within(files)
     stated: dict[Path, set[str]] = {}
     for file, (camera, pose) in by_name.items():
         stated.setdefault(file.parent, set()).update({camera} if pose != file.stem else ())
     out = {}
     for file, (camera, pose) in by_name.items():
-        folder = file.parent.name
+        inner = file.parent.name.lower() in _OF_NO_CAMERA and file.parent.parent != path
+        folder = (file.parent.parent if inner or (file.parent.parent / "sensor.yaml").exists() else file.parent).name
         if file.parent == path or len(stated[file.parent]) > 1:
             out[file] = camera, pose
         else:

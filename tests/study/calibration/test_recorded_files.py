@@ -339,6 +339,15 @@ def test_a_folder_whose_images_name_two_cameras_is_no_camera(tmp_path, name, cam
         np.testing.assert_allclose(board.pixels[cameras[1]] - board.pixels[cameras[0]], 30.0, atol=0.05)
 
 
+@pytest.mark.parametrize(("inner", "within"), [("data", ""), ("images", ""), ("data", "left")])
+def test_folders_within_that_of_a_camera_do_not_name_it(tmp_path, inner, within):
+    """Before, the images of EuRoC's cam0/data and cam1/data were refused as two of one camera named data."""
+    write_images(tmp_path, "{camera}/" + inner + "/140363657976355558{pose}.png")
+    (tmp_path / "left" / "sensor.yaml").touch()
+    found = read_corners(tmp_path / within, BOARD)
+    assert list(found.sizes) == (["left"] if within else ["left", "right"]) and len(found.boards) == 2
+
+
 @pytest.mark.parametrize(
     "names, cameras",
     [

@@ -87,7 +87,7 @@ def test_a_second_camera_anywhere_is_verified(n10, tilt_deg, centre, roll):
     right = replace(n10.rig.cameras["right"], sensor_from_camera=place)
     sensor = replace(n10, rig=replace(n10.rig, cameras=n10.rig.cameras | {"right": right}, rectification=None))
     known = corners_of_board(capture_by(sensor, sensor.rig), BOARD, None)
-    assert abs(known.scale - 1) < 4 * known.scatter < 2e-3 and np.std(known.rows_px) < 0.2
+    assert abs(known.scale - 1) < 4 * known.scatter < 4e-3 and np.abs(known.rows_px).max() < 1.0
 
 
 def test_a_camera_that_turned_about_its_row_is_to_be_calibrated_again(n10, turned):
