@@ -28,7 +28,7 @@ from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, re
 from mitsim.capture.recordings.cloud_numbers import FAR_BEYOND, FARTHEST_MM, METRES_UNDER, NEITHER_ABOVE
 from mitsim.capture.recordings.read_options import ReadOptions
 from mitsim.capture.recordings.recording_files import frame_of
-from mitsim.capture.recordings.stated_scale import check_scale, stated_scales
+from mitsim.capture.recordings.stated_scale import check_scale, scale_by_folder, stated_scales
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.png import LONGEST_SIDE_PX
 
@@ -85,6 +85,8 @@ def read_depth_image(path: str | Path, options: ReadOptions) -> Capture:
     if assumed and image.dtype.kind != "f":
         check_scale(beside, path)
         check_scale(read.depth_scales, calibration)
+        if not beside and not read.depth_scales:
+            check_scale(scale_by_folder(path), path.parent.parent)
     return depth_capture(depth, read, path, settings, camera=options.camera, sensor=options.named)
 
 

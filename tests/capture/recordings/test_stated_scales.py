@@ -27,6 +27,10 @@ STATED = {
     "tum.yaml": (f"{ORB_SLAM}DepthMapFactor: 5000.0\n", 3000, "0.2"),  # ORB-SLAM: levels per metre
     "orb3.yaml": (f"{ORB_SLAM}RGBD.DepthMapFactor: 5000.0\n", 3000, "0.2"),
     "replica.yaml": (f"cam: {json.dumps(FLAT | {'png_depth_scale': 6553.5})}\n", 3932, "0.15259"),
+    "cam_params.json": (json.dumps({"camera": FLAT | {"scale": 6553.5}}), 3932, "0.15259"),  # Replica
+    "nerfstudio.json": (json.dumps(FLAT | {"depth_unit_scale_factor": 0.0002}), 3000, "0.2"),
+    "bundlefusion.json": (json.dumps(FLAT | {"depthShift": 5000}), 3000, "0.2"),
+    "divisor.json": (json.dumps(FLAT | {"depth_divisor": 5000}), 3000, "0.2"),
     "d405.json": (json.dumps(FLAT | {"depth_scale": 0.0001}), 6000, "0.1"),  # librealsense: metres per level
 }
 
@@ -42,6 +46,23 @@ def test_a_stated_scale_is_asked_for_and_not_passed_over(tmp_path, name):
     assert name in str(error.value)
     capture = read_depth_image(tmp_path / "depth.png", ReadOptions(calibration=tmp_path / name, scale_mm=float(scale)))
     np.testing.assert_allclose(capture.derived["depth"], 600, rtol=2e-4)
+
+
+@pytest.mark.parametrize("stated", [{}, {"depth_scale": 1000}])
+def test_the_folder_of_tums_data_tells_the_scale(tmp_path, stated):
+    """Their depths were 5 times too large, without a word; a calibration that states another scale knows better."""
+    for name in ("depth.txt", "rgb.txt"):
+        (tmp_path / name).write_text("# timestamp filename\n")
+    (tmp_path / "depth").mkdir()
+    (tmp_path / "a.json").write_text(json.dumps(FLAT | stated))
+    image = tmp_path / "depth/1305031102.160407.png"
+    cv2.imwrite(str(image), np.full((HEIGHT, WIDTH), 3000, np.uint16))
+    options = ReadOptions(calibration=tmp_path / "a.json")
+    if not stated:
+        with pytest.raises(InputError, match=r"depth\.txt: found 5000.*--scale 0\.2,"):
+            read_depth_image(image, options)
+        options = ReadOptions(calibration=tmp_path / "a.json", scale_mm=0.2)
+    np.testing.assert_allclose(read_depth_image(image, options).derived["depth"], 3000 if stated else 600, rtol=1e-6)
 
 
 @pytest.mark.parametrize("number", [1, 1000.0, 0.001, 0.0010000000474974513, 0, "millimetre", None])
