@@ -66,21 +66,15 @@ _ALL_EQUAL = 0.01
 
 @dataclass(frozen=True)
 class PlaneQuality:
-    """Figures of a flat target by the tools of RealSense and Luxonis; NaN where undefined.
+    """Figures of a flat target by the tools of RealSense and Luxonis; NaN where undefined."""
 
-    - ``fill_rate`` [%]: pixels with depth over those of the region.
-    - ``z_accuracy`` [% of the distance]: signed, positive when the plane is measured too far.
-    - ``plane_fit_rms`` [mm] and ``plane_fit_rms_percent`` [% of the distance]: their spatial noise.
-    - ``subpixel_rms`` [px] of disparity, NaN without a baseline.
-    - ``points`` used.
-    """
-
-    fill_rate: float
-    z_accuracy: float
+    fill_rate: float  # [%]: pixels with depth over those of the region
+    z_accuracy: float  # [% of the distance]: signed, positive when the plane is measured too far
+    #: ``plane_fit_rms`` [mm] and ``plane_fit_rms_percent`` [% of the distance]: their spatial noise
     plane_fit_rms: float
     plane_fit_rms_percent: float
-    subpixel_rms: float
-    points: int
+    subpixel_rms: float  # [px] of disparity, NaN without a baseline
+    points: int  # used
 
 
 def plane_quality(

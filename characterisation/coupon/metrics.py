@@ -223,15 +223,12 @@ def density_fraction(
 
     It can exceed 1: see :func:`clipped`.
 
-    Parameters
-    ----------
-    count, area, distance, cos_incidence
-        n [1], patch area A [mm^2], |V| [mm], and N.V [1]: the cosine of incidence, positive.
-    angular_pitch
-        Lambda [rad], the angle between neighbouring pixels on the axis; lambda^2 is the solid angle of a pixel.
-    cos_off_axis
-        cos(phi) of the patch. A pixel of a flat imager covers lambda^2 cos^3(phi): without this factor an ideal sensor
-        would reach 1.21 at 20 deg off its axis.
+    - ``count``, ``area``, ``distance``, ``cos_incidence``: n [1], patch area A [mm^2], |V| [mm], and N.V [1]: the
+      cosine of incidence, positive.
+    - ``angular_pitch``: lambda [rad], the angle between neighbouring pixels on the axis; lambda^2 is the solid angle of
+      a pixel.
+    - ``cos_off_axis``: cos(phi) of the patch. A pixel of a flat imager covers lambda^2 cos^3(phi): without this factor
+      an ideal sensor would reach 1.21 at 20 deg off its axis.
     """
     count, area, distance = np.asarray(count, float), np.asarray(area, float), np.asarray(distance, float)
     solid_angle = angular_pitch**2 * np.asarray(cos_off_axis, float) ** 3

@@ -53,12 +53,9 @@ LEAST_SHARE = 0.3
 def known_offset(points: Floats, inlier: NDArray[np.bool_], normal: Floats, reach: float) -> Floats:
     """Return the mean distance o [mm] (p,) of patches from the known plane, along the rays; NaN with too few inliers.
 
-    Parameters
-    ----------
-    points, inlier
-        (p, n, 3) [mm] relative to the optical centre of the sensor, and (p, n) mask of those used.
-    normal, reach
-        The plane q . normal = reach, normal (3,) and reach [mm].
+    - ``points``, ``inlier``: (p, n, 3) [mm] relative to the optical centre of the sensor, and (p, n) mask of those
+      used.
+    - ``normal``, ``reach``: the plane q . normal = reach, normal (3,) and reach [mm].
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         beyond = np.linalg.norm(points, axis=-1) * (1.0 - reach / (points @ normal))

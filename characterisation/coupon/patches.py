@@ -90,12 +90,9 @@ def patch_centres(
 
     The centres form a hexagonal lattice with ``step_px`` between neighbours, anchored at the centre of the coupon.
 
-    Parameters
-    ----------
-    grid, coupon
-        Pixels of the cloud; pose and size of the coupon, sensor frame.
-    radius_px, margin_px, step_px
-        Radius of the discs, their least distance from the edge of the coupon, and distance of neighbouring centres.
+    ``grid``, ``coupon``: pixels of the cloud; pose and size of the coupon, sensor frame. ``radius_px``, ``margin_px``,
+    ``step_px``: radius of the discs, their least distance from the edge of the coupon, and distance of neighbouring
+    centres.
     """
     corners, middle = outline(grid, coupon), grid.project(coupon.centre)
     if not len(corners) or not (np.isfinite(corners).all() and np.isfinite(middle).all()):

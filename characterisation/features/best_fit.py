@@ -204,16 +204,8 @@ def _choose(
 def counted_as_one(points: Floats, residual: Floats, thinning: float, rng: np.random.Generator) -> float:
     """Return the number a of points whose residuals (n,), at places (n, 3), are as good as one; at least 1.
 
-    Parameters
-    ----------
-    points
-        (n, 3) [mm].
-    residual
-        (n,) [mm].
-    thinning
-        Number of measured points that each of these stands for.
-    rng
-        Chooses the points about which correlation is summed.
+    ``points``: (n, 3) [mm]. ``residual``: (n,) [mm]. ``thinning``: number of measured points that each of these stands
+    for. ``rng``: chooses the points about which correlation is summed.
     """
     middles = rng.choice(len(points), min(_MIDDLES, len(points)), replace=False)
     apart = cdist(points[middles], points)

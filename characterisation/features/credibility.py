@@ -145,12 +145,8 @@ def most_uncertain(shape: Surface | Circle | EdgePoint, limit: float) -> float:
 def check_figure(fit: CircleFit | EdgePointFit, nominal: Circle | EdgePoint, reach: float) -> None:
     """Check that the fit of a circle, or of a point of an edge within its ``reach`` [mm], is credible.
 
-    A circle is compared with nominal all round, and lies within half its radius; its edge is searched there.
-
-    Raises
-    ------
-    UndeterminedError, FitError
-        As :func:`check_surface`.
+    A circle is compared with nominal all round, and lies within half its radius; its edge is searched there. Raises
+    UndeterminedError, FitError as :func:`check_surface`.
     """
     if isinstance(nominal, Circle):
         angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)

@@ -61,20 +61,13 @@ HARMONICS = 30
 
 
 class Crossings(NamedTuple):
-    """Points where an edge crosses rows and columns of the grid.
+    """Points where an edge crosses rows and columns of the grid."""
 
-    - ``points`` (n, 3) [mm] on the plane, sensor frame.
-    - ``spread`` [mm]: expected standard deviation of one point along its row or column.
-    - ``fraction``: F of the face beside the edge.
-    - ``shared`` [mm]: common displacement of all points by one standard error of F.
-    - ``steps`` (n, 3) [mm] on the plane, to the next pixel of its row or column.
-    """
-
-    points: Array
-    spread: float
-    fraction: float
-    shared: float
-    steps: Array
+    points: Array  # (n, 3) [mm] on the plane, sensor frame
+    spread: float  # [mm]: expected standard deviation of one point along its row or column
+    fraction: float  # F of the face beside the edge
+    shared: float  # [mm]: common displacement of all points by one standard error of F
+    steps: Array  # (n, 3) [mm] on the plane, to the next pixel of its row or column
 
 
 _NONE = Crossings(np.empty((0, 3)), 0.0, 0.0, 0.0, np.empty((0, 3)))

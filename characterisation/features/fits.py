@@ -145,14 +145,10 @@ def fit_cone(points: ArrayLike, initial: Cone, viewpoint: ArrayLike | None = Non
     """Fit a cone to points (n, 3) [mm], starting from its nominal geometry; rows with NaN are ignored.
 
     ``viewpoint`` (3,) [mm] is the optical centre of the sensor. The initial geometry may differ by some degrees of axis
-    and half-angle, and about a third of the radius.
-
-    Raises
-    ------
-    FitError
-        If there are fewer than 7 points, or they do not determine a cone, or all are at grazing incidence, or the fit
-        departs from the nominal geometry. It departs with more than 45 deg of axis, with a half-angle below a third of
-        the nominal one or above the middle between it and 90 deg, or with points about the apex.
+    and half-angle, and about a third of the radius. Raises FitError if there are fewer than 7 points, or they do not
+    determine a cone, or all are at grazing incidence, or the fit departs from the nominal geometry. It departs with
+    more than 45 deg of axis, with a half-angle below a third of the nominal one or above the middle between it and 90
+    deg, or with points about the apex.
     """
     points = _usable(points, Cone)
     initial = Cone(np.asarray(initial.point, float), _axis(initial), _radius(initial), float(initial.half_angle))
@@ -234,12 +230,7 @@ def check_radius(shape: Surface | Circle | EdgePoint, covariance: Array, factor:
     """Check that points determine the radius of a fitted cylinder or sphere; other shapes always pass.
 
     Its curvature must differ from that of a plane: :data:`COVERAGE` standard uncertainties of the radius are at most
-    half of it. ``factor`` multiplies the ``covariance`` (p, p) of the fit.
-
-    Raises
-    ------
-    UndeterminedError
-        If they are more.
+    half of it. ``factor`` multiplies the ``covariance`` (p, p) of the fit. Raises UndeterminedError if they are more.
     """
     if not isinstance(shape, Cylinder | Sphere):
         return

@@ -80,22 +80,13 @@ def robust_fit(
 ) -> tuple[Shape, NDArray[np.bool_]]:
     """Return the robust least-squares shape through ``count`` points, and the mask (count,) of the points used.
 
-    Parameters
-    ----------
-    shape
-        Nominal geometry, from which the fit starts.
-    linearised
-        Residuals and derivatives of a changed shape.
-    count
-        Number of points.
-    least_scale
-        Smallest expected standard deviation [mm] of the residuals. Where their distribution has one long tail, the
-        median of their size is far below it.
+    - ``shape``: nominal geometry, from which the fit starts.
+    - ``linearised``: residuals and derivatives of a changed shape.
+    - ``count``: number of points.
+    - ``least_scale``: smallest expected standard deviation [mm] of the residuals. Where their distribution has one long
+      tail, the median of their size is far below it.
 
-    Raises
-    ------
-    FitError
-        If all points are at grazing incidence, or they do not determine the shape.
+    Raises FitError if all points are at grazing incidence, or they do not determine the shape.
     """
     zero = np.zeros(shape.parameter_count)
     # the orthogonal distance converges from far; two passes, since the first scale is that of the starting geometry
@@ -215,10 +206,7 @@ def on_one_side(cosine: Array, near: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def covariance_of(residual: Array, jacobian: Array, kind: str) -> tuple[Array, float, int]:
     """Return the covariance sigma^2 (J^T J)^-1 (p, p), sigma with n - p degrees of freedom [mm], and n.
 
-    Raises
-    ------
-    FitError
-        If the derivatives (n, p) do not determine all parameters.
+    Raises FitError if the derivatives (n, p) do not determine all parameters.
     """
     count, parameters = jacobian.shape
     normal = jacobian.T @ jacobian

@@ -33,19 +33,14 @@ GRAZING_COSINE = float(np.cos(np.deg2rad(80.0)))
 
 
 class Meeting(NamedTuple):
-    """Points where rays meet a surface; without rays, the feet of perpendiculars on it.
+    """Points where rays meet a surface; without rays, the feet of perpendiculars on it."""
 
-    - ``residual`` (n,) [mm] from the foot to the point along the ray.
-    - ``foot`` (n, 3), and ``normal`` (n, 3) there.
-    - ``slope`` (n,): N.V kept away from 0, and 1 without rays.
-    - ``cosine`` (n,): N.V itself, 0 for a ray that misses.
-    """
-
-    residual: Array
+    residual: Array  # (n,) [mm] from the foot to the point along the ray
+    #: ``foot`` (n, 3), and ``normal`` (n, 3) there
     foot: Array
     normal: Array
-    slope: Array
-    cosine: Array
+    slope: Array  # (n,) N.V kept away from 0, and 1 without rays
+    cosine: Array  # (n,) N.V itself, 0 for a ray that misses
 
 
 @dataclass(frozen=True)

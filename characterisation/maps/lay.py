@@ -101,12 +101,8 @@ def between_directions(
     Where the tangent is NaN, or the map has no F in one of the neighbouring directions, the answer is the mean over
     directions. Elsewhere nothing is unknown of the direction, and the spreads are NaN.
 
-    Parameters
-    ----------
-    surface, distance
-        Fields of the surface in each direction, and |V| (n,) [mm].
-    normals, tangents
-        (n, 3) in the view frame; tangents lie along u.
+    ``surface``, ``distance``: fields of the surface in each direction, and |V| (n,) [mm]. ``normals``, ``tangents``:
+    (n, 3) in the view frame; tangents lie along u.
     """
     mean = surface.look_up(distance, normals)
     count, mirror = len(surface.directions), mirror_direction(distance, surface.mirror_mm)

@@ -46,22 +46,14 @@ SMALL_STEP = 0.02
 
 @dataclass(frozen=True)
 class Observations:
-    """Data of the regression, n rows sorted by ``cluster``.
+    """Data of the regression, n rows sorted by ``cluster``."""
 
-    - ``position`` (n, 3): regressors; the first two determine the distance in the kernel.
-    - ``value`` (n, k): the first column is fitted; its weights are applied to the others.
-    - ``weight`` (n,): proportional to the inverse of the variance.
-    - ``share`` (n,): number of independent rows that a row stands for.
-    - ``cluster`` (n,): whole numbers.
-    - ``within`` (n,): variance of the first column among the rows that were joined to one.
-    """
-
-    position: Floats
-    value: Floats
-    weight: Floats
-    share: Floats
-    cluster: NDArray[np.int64]
-    within: Floats
+    position: Floats  # (n, 3) regressors; the first two determine the distance in the kernel
+    value: Floats  # (n, k) the first column is fitted; its weights are applied to the others
+    weight: Floats  # (n,) proportional to the inverse of the variance
+    share: Floats  # (n,) number of independent rows that a row stands for
+    cluster: NDArray[np.int64]  # (n,) whole numbers
+    within: Floats  # (n,) variance of the first column among the rows that were joined to one
 
     def joined(self, cell: float) -> Observations:
         """Return the data with all rows of one cluster and square cell joined to one row at their mean.
@@ -129,17 +121,11 @@ def local_fit(
 ) -> LocalFit:
     """Fit a line about every place, with each of its radii.
 
-    Parameters
-    ----------
-    data, slopes
-        Places and values to fit; prior of the slopes and bends.
-    at, radii
-        (q, 3) places; (q, r) radii of the kernel.
-    link
-        Whether the line is that of the value or of its logarithm.
-    clusters, keep
-        (q,) a cluster for every place, and whether only this cluster (``"own"``) or only the others are used. Without
-        ``clusters``, all are used.
+    - ``data``, ``slopes``: places and values to fit; prior of the slopes and bends.
+    - ``at``, ``radii``: (q, 3) places; (q, r) radii of the kernel.
+    - ``link``: whether the line is that of the value or of its logarithm.
+    - ``clusters``, ``keep``: (q,) a cluster for every place, and whether only this cluster (``"own"``) or only the
+      others are used. Without ``clusters``, all are used.
     """
     estimate = np.full((*radii.shape, data.value.shape[1]), np.nan)
     sums = {name: np.full(radii.shape, np.nan) for name in ("independent", "clustered", "scatter", "rows", "weight")}

@@ -231,19 +231,14 @@ def _binomial(fitted: LocalFit, possible: float) -> Floats:
 
 @dataclass(frozen=True)
 class _Predicted:
-    """Errors of predicting captures from the others, one element per capture that lies among them.
+    """Errors of predicting captures from the others, one element per capture that lies among them."""
 
-    - ``position`` (c, 2).
-    - ``squared`` difference, and ``chance``, its expectation from independent patches.
-    - ``clustered``: factor of the variance common to a capture.
-    - ``gap`` from the centre of the capture to the nearest other patch.
-    """
-
-    position: Floats
+    position: Floats  # (c, 2)
+    #: ``squared`` difference, and ``chance``, its expectation from independent patches
     squared: Floats
     chance: Floats
-    clustered: Floats
-    gap: Floats
+    clustered: Floats  # factor of the variance common to a capture
+    gap: Floats  # from the centre of the capture to the nearest other patch
 
 
 def _predicted(data: Observations, slopes: Slopes, link: Literal["identity", "log"]) -> _Predicted:

@@ -131,14 +131,9 @@ def joined_covariance(
 ) -> Floats:
     """Return the covariance (P, P) of all features fitted to the joined points of views; very large for unseen ones.
 
-    Parameters
-    ----------
-    views, rigid
-        What each view contributes to the features; J (p, 6) of each feature.
-    motion_covariance
-        K (6, 6) of each pose, before the fit if there is one; then not singular.
-    best_fit
-        Whether the poses are estimated together with the features; otherwise the points are merged as they are.
+    ``views``, ``rigid``: what each view contributes to the features; J (p, 6) of each feature. ``motion_covariance``: K
+    (6, 6) of each pose, before the fit if there is one; then not singular. ``best_fit``: whether the poses are
+    estimated together with the features; otherwise the points are merged as they are.
     """
     ends = np.cumsum([len(jacobian) for jacobian in rigid])
     out = np.eye(ends[-1]) / NOTHING

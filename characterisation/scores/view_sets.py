@@ -127,14 +127,9 @@ def fewest_views(
 ) -> ViewSet:
     """Return the fewest views that keep all limits.
 
-    Parameters
-    ----------
-    features, limits
-        Information about each feature from every view; l_m (measurements,) in their units.
-    seconds
-        Time limit of the proof; after it, the greedy set is returned, marked as not exact.
-    joined
-        Returns the actual uncertainty of a set; by default :func:`set_uncertainty`.
+    ``features``, ``limits``: information about each feature from every view; l_m (measurements,) in their units.
+    ``seconds``: time limit of the proof; after it, the greedy set is returned, marked as not exact. ``joined``: returns
+    the actual uncertainty of a set; by default :func:`set_uncertainty`.
     """
     began = time.monotonic()
     uncertainty_of = joined or (lambda chosen: set_uncertainty(features, chosen))

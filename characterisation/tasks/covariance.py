@@ -115,22 +115,15 @@ class ExpectedPoints:
 
 @dataclass(frozen=True)
 class ExpectedFit:
-    """Predicted fit about the nominal geometry.
+    """Predicted fit about the nominal geometry."""
 
-    - ``noise_covariance`` (p, p): covariance of the parameters due to noise.
-    - ``shared`` (p, 1 + k): changes of the parameters by the known displacement, and by each error that features share.
-    - ``count`` of expected points.
-    - ``chance``: probability that there are enough points, and that the fit is credible.
-    - ``middle`` (3,) [mm] of the expected points.
-    - ``noise`` [mm]: without persistent noise, the mean of all n points would have the standard uncertainty noise /
-      sqrt(n).
-    """
-
-    noise_covariance: Floats
+    noise_covariance: Floats  # (p, p) covariance of the parameters due to noise
+    #: (p, 1 + k) changes of the parameters by the known displacement, and by each error that features share
     shared: Floats
-    count: float
-    chance: float
-    middle: Floats
+    count: float  # of expected points
+    chance: float  # probability that there are enough points, and that the fit is credible
+    middle: Floats  # (3,) [mm] of the expected points
+    #: [mm]: without persistent noise, the mean of all n points would have the standard uncertainty noise / sqrt(n)
     noise: float
 
     @property
@@ -160,10 +153,7 @@ class Sums:
 def expected_fit(surface: Surface, expected: ExpectedPoints, minimum_points: float) -> ExpectedFit:
     """Predict the fit of a surface to its own points.
 
-    Raises
-    ------
-    FitError
-        If the points would not determine the surface even if all were recovered, or nearly all are false.
+    Raises FitError if the points would not determine the surface even if all were recovered, or nearly all are false.
     """
     used = usable(surface, expected)
     jacobian = surface.linearised(np.zeros(surface.parameter_count), used.point, used.ray)[1]

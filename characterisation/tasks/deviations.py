@@ -60,15 +60,12 @@ LENGTHS = (
 
 @dataclass(frozen=True)
 class Deviations:
-    """Deviations behind a measurement.
+    """Deviations behind a measurement."""
 
-    - ``of``: the deviations (k, m) in mm or rad, of the measured features (or form, or pose) and the nominal ones, in
-      one frame.
-    - ``size``: size (...) of deviations (..., k, m).
-    """
-
+    #: the deviations (k, m) in mm or rad, of the measured features (or form, or pose) and the nominal ones, in one
+    #: frame
     of: Callable[[Sequence[Any], Sequence[Any]], Array]
-    size: Size
+    size: Size  # size (...) of deviations (..., k, m)
 
 
 def fold_of(asked: Measurement) -> float | None:

@@ -40,14 +40,8 @@ def place_functions(
 
     The point of an axis slides along it when it tilts, since the ``middle`` of the points lies beside the axis.
 
-    Parameters
-    ----------
-    fit
-        Surface in the sensor frame [mm].
-    middle
-        (3,) of its points [mm], sensor frame.
-    frame
-        (4, 4) rigid transform from the sensor frame to that of the quantities [mm].
+    ``fit``: surface in the sensor frame [mm]. ``middle``: (3,) of its points [mm], sensor frame. ``frame``: (4, 4)
+    rigid transform from the sensor frame to that of the quantities [mm].
     """
     rotation, shift = frame[:3, :3], frame[:3, 3]
     functions: list[Callable[[Any], float]]

@@ -175,19 +175,8 @@ def angularity(feature: Plane, datum: Datum, *, nominal: Sequence[Geometry], out
     The zone is rotated about the direction of the datum to the least width. For small rotations from the fitted plane,
     the width is piecewise linear in the angle, and least where two of the places change order.
 
-    Parameters
-    ----------
-    feature, datum
-        Fitted plane and datum.
-    nominal
-        Nominal feature and datum.
-    outline
-        (k, 3) [mm], places that span the feature.
-
-    See Also
-    --------
-    parallelism : parallel to the datum
-    perpendicularity : at right angles to the datum
+    ``feature``, ``datum``: fitted plane and datum. ``nominal``: nominal feature and datum. ``outline``: (k, 3) [mm],
+    places that span the feature.
     """
     target, nominal_datum = (direction(surface) for surface in nominal if isinstance(surface, Plane | Cylinder | Cone))
     along = direction(datum) * (1.0 if direction(datum) @ nominal_datum >= 0 else -1.0)

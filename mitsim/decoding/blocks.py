@@ -14,10 +14,7 @@ BLOCK = 16384
 
 
 def in_blocks(work: Callable[[list[slice]], None], count: int) -> None:
-    """Call ``work`` on each thread with a list of slices; together they cover ``count`` pixels.
-
-    The blocks do not depend on the number of threads, so neither do the results.
-    """
+    """Call ``work`` on each thread with slices that cover ``count`` pixels; results do not depend on the threads."""
     blocks = [slice(start, start + BLOCK) for start in range(0, count, BLOCK)]
     workers = max(min(thread_count(), len(blocks) // 2), 1)
     in_threads(work, [blocks[len(blocks) * k // workers : len(blocks) * (k + 1) // workers] for k in range(workers)])

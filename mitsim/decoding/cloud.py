@@ -97,13 +97,7 @@ def _where(capture: Capture) -> str:
 
 
 def in_range(settings: Settings, range_mm: tuple[float, float] | None, where: str) -> Settings:
-    """Return settings with the depths [mm] of ``range_mm`` as search range; unchanged if it is None.
-
-    Raises
-    ------
-    InputError
-        If the range is invalid. ``where`` says in the message where it was given.
-    """
+    """Return settings that search the depths ``range_mm``, if given; InputError names ``where`` it was given."""
     if range_mm is None:
         return settings
     near, far = range_mm

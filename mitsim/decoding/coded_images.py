@@ -33,24 +33,18 @@ from mitsim.sensor.light_code import GrayCode, LightCode, roles
 
 @dataclass(frozen=True)
 class CodedImages:
-    """Images of structured light that show one exposure, and their code.
+    """Images of structured light that show one exposure, and their code."""
 
-    - ``stacks``: (P, H, W) images [DN] of the code, without an ambient image: of the first camera or, if two cameras
-      triangulate, of both.
-    - ``code``, ``size``: the code, and width and height of the projector [px].
-    - ``settings``: limits of the decoder.
-    - ``full_scale``: value of a saturated pixel [DN].
-    - ``noise``: the imager, or the noise that the fringes show; None if neither is known.
-    - ``read_out``: region that was read out of each camera, without cameras that were read out completely.
-    """
-
+    #: (P, H, W) images [DN] of the code, without an ambient image: of the first camera or, if two cameras triangulate,
+    #: of both
     stacks: dict[str, NDArray[np.unsignedinteger[Any]]]
+    #: ``code``, ``size``: the code, and width and height of the projector [px]
     code: LightCode
     size: tuple[int, int]
-    settings: DecoderSettings
-    full_scale: float
-    noise: Imager | MeasuredNoise | None
-    read_out: dict[str, Roi]
+    settings: DecoderSettings  # limits of the decoder
+    full_scale: float  # value of a saturated pixel [DN]
+    noise: Imager | MeasuredNoise | None  # the imager, or the noise that the fringes show; None if neither is known
+    read_out: dict[str, Roi]  # region that was read out of each camera, without cameras that were read out completely
 
     @classmethod
     def of(cls, capture: Capture, settings: Settings, imager: Imager | None = None) -> CodedImages | None:
@@ -113,19 +107,9 @@ def decoded_once(
 
     The noise is that of the imager or, without one, the noise that fringes show.
 
-    Parameters
-    ----------
-    capture, settings
-        Images of a code, and the settings that decode them.
-    imager
-        The imager that took them, if its numbers are known.
-    geometry
-        Of the capture's rig, if it is prepared already.
-
-    Raises
-    ------
-    InputError
-        If the settings belong to another technology, or the capture is inconsistent.
+    ``capture``, ``settings``: images of a code, and the settings that decode them. ``imager``: the imager that took
+    them, if its numbers are known. ``geometry``: of the capture's rig, if it is prepared already. Raises InputError if
+    the settings belong to another technology, or the capture is inconsistent.
     """
     images = CodedImages.of(capture, settings, imager)
     if images is None:

@@ -136,13 +136,7 @@ class Images:
         return overlap, overlap is not None
 
     def first_images(self, count: int, camera: str | None = None) -> NDArray[np.unsignedinteger[Any]]:
-        """Return the first ``count`` images of a camera, by default the reference; the ambient image follows them.
-
-        Raises
-        ------
-        InputError
-            If there are fewer.
-        """
+        """Return the first ``count`` images of a camera, by default the reference; InputError if there are fewer."""
         name = camera or self.reference[0]
         stack = self.stacks[name]
         if len(stack) < count:
@@ -152,19 +146,16 @@ class Images:
 
 @dataclass(frozen=True)
 class Technology:
-    """How the captures of one kind of sensor become clouds.
+    """How the captures of one kind of sensor become clouds."""
 
-    - ``patterns``: kinds of pattern that a capture must name; empty if the decoder does not need one.
-    - ``geometry``: function from rig, settings and pattern to the geometry that is prepared once.
-    - ``decode``: function from images, geometry, settings and pattern to a cloud.
-    - ``range_mm``: default range of depths to search [mm].
-    - ``from_device``: whether the device has measured the points. Of a sensor's settings only the range is then used.
-    """
-
+    #: kinds of pattern that a capture must name; empty if the decoder does not need one
     patterns: tuple[type[Pattern], ...]
+    #: function from rig, settings and pattern to the geometry that is prepared once
     geometry: Callable[[Rig, Any, Any], Geometry]
+    #: function from images, geometry, settings and pattern to a cloud
     decode: Callable[[Images, Any, Any, Any], PointCloud]
-    range_mm: tuple[float, float] = DEFAULT_RANGE_MM
+    range_mm: tuple[float, float] = DEFAULT_RANGE_MM  # default range of depths to search [mm]
+    #: whether the device has measured the points. Of a sensor's settings only the range is then used
     from_device: bool = False
 
 
@@ -311,13 +302,7 @@ TECHNOLOGIES: dict[str, Technology] = {
 
 
 def technology_of(name: str) -> Technology:
-    """Return the entry of a technology.
-
-    Raises
-    ------
-    InputError
-        If there is none of this name.
-    """
+    """Return the entry of a technology. Raises InputError if there is none of this name."""
     if name not in TECHNOLOGIES:
         raise InputError("capture", "technology", repr(name), ", ".join(TECHNOLOGIES))
     return TECHNOLOGIES[name]

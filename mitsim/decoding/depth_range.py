@@ -73,10 +73,7 @@ _TABLES = {MatcherSettings: "matcher", DecoderSettings: "decoder", TimeOfFlightS
 
 @dataclass(frozen=True)
 class SurfaceBeyond:
-    """A surface outside the range.
-
-    ``depths`` are the 10th and 90th percentiles of its depths [mm]; ``share`` is that of its pixels in the image [1].
-    """
+    """A surface out of range: 10th and 90th percentile of its ``depths`` [mm], and its ``share`` of the pixels [1]."""
 
     depths: tuple[float, float]
     share: float
@@ -211,10 +208,7 @@ def _uses_pair(rig: Rig, settings: Settings) -> bool:
 
 
 def _coarse_capture(capture: Capture, step: int, *, binned: bool) -> Capture:
-    """Return the capture with pixels of step x step (``binned``), or with every ``step``-th pixel in both directions.
-
-    A device's own map remains unchanged, since reading its points costs no time.
-    """
+    """Return the capture, but of a device's map, ``binned`` by step x step, or of every ``step``-th pixel each way."""
     if step == 1 or technology_of(capture.technology).from_device:
         return capture
     offset = 0 if binned else step // 2

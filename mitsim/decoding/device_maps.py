@@ -33,16 +33,11 @@ MapName = Literal["depth", "disparity", "points"]
 
 @dataclass(frozen=True)
 class DeviceMapGeometry:
-    """Geometry of a device's map.
+    """Geometry of a device's map."""
 
-    - ``grid``: pixels of the map.
-    - ``baseline``: (3,) unit vector in the sensor frame.
-    - ``rectification``: of a map of disparities; else None.
-    """
-
-    grid: ViewGrid
-    baseline: NDArray[np.float64]
-    rectification: Rectification | None = None
+    grid: ViewGrid  # pixels of the map
+    baseline: NDArray[np.float64]  # (3,) unit vector in the sensor frame
+    rectification: Rectification | None = None  # of a map of disparities; else None
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -56,13 +51,7 @@ def camera_map_geometry(rig: Rig) -> DeviceMapGeometry:
 
 
 def disparity_map_geometry(rig: Rig) -> DeviceMapGeometry:
-    """Return the geometry of a map of disparities: the grid of the rectified left image.
-
-    Raises
-    ------
-    InputError
-        If the rig has no rectification. Disparities need the rectification with which the device made them.
-    """
+    """Return the geometry of disparities, on the rectified left grid; InputError without the device's rectification."""
     pair = rig.rectification
     if pair is None:
         raise InputError("rig", "rectification", "none", "the rectification with which the device made the disparities")
@@ -87,36 +76,17 @@ def decode_device_map(
 ) -> PointCloud:
     """Convert a map to points on the view rays of the grid; a map of points is accepted as it is.
 
-    Parameters
-    ----------
-    name
-        ``depth``, ``disparity`` or ``points``.
-    values
-        Depths along the axis of the grid (H, W) [mm]; disparities of the rectified left image (H, W) [px]; or points in
-        the sensor frame (H, W, 3) [mm]. NaN where there is none.
-    geometry
-        From :func:`camera_map_geometry`, or :func:`disparity_map_geometry` for disparities.
-    range_mm
-        Nearest and farthest accepted depth [mm].
-    sensor, source
-        Copied into the cloud.
-    roi
-        Region of the grid to decode; None for all.
+    - ``name``: ``depth``, ``disparity`` or ``points``.
+    - ``values``: depths along the axis of the grid (H, W) [mm]; disparities of the rectified left image (H, W) [px]; or
+      points in the sensor frame (H, W, 3) [mm]. NaN where there is none.
+    - ``geometry``: from :func:`camera_map_geometry`, or :func:`disparity_map_geometry` for disparities.
+    - ``range_mm``: nearest and farthest accepted depth [mm].
+    - ``sensor``, ``source``: copied into the cloud.
+    - ``roi``: region of the grid to decode; None for all.
 
-    Returns
-    -------
-    PointCloud
-        Points in the sensor frame [mm]. Status ``NO_SURFACE`` where the map is NaN, ``OUT_OF_RANGE`` outside the range,
-        ``UNCALIBRATED`` where the pixel has no ray, since the distortion of the camera folds over before it.
-
-    Raises
-    ------
-    InputError
-        If the map does not have the grid's size, or the region does not lie in the grid.
-
-    See Also
-    --------
-    mitsim.decoding.cloud.capture_cloud : any capture
+    Returns: points in the sensor frame [mm]. Status ``NO_SURFACE`` where the map is NaN, ``OUT_OF_RANGE`` outside the
+    range, ``UNCALIBRATED`` where the pixel has no ray, since the distortion of the camera folds over before it. Raises
+    InputError if the map does not have the grid's size, or the region does not lie in the grid.
     """
     grid = geometry.grid
     if values.shape != (grid.height, grid.width, *((3,) if name == "points" else ())):
@@ -155,14 +125,8 @@ def roi_of_other_grid(grid: ViewGrid, other: ViewGrid, roi: Roi, near_mm: float,
     The boundary of the region is projected pixel by pixel at both depths, so distorted rays are included. If a point of
     it cannot be projected, the result is the whole of ``other``.
 
-    Parameters
-    ----------
-    grid, other
-        Grid of the region, and grid of the result.
-    roi
-        Region of ``grid``.
-    near_mm, far_mm
-        Range of depths [mm].
+    ``grid``, ``other``: grid of the region, and grid of the result. ``roi``: region of ``grid``. ``near_mm``,
+    ``far_mm``: range of depths [mm].
     """
     columns, rows = np.arange(roi.left, roi.right), np.arange(roi.top, roi.bottom)
     boundary = np.concatenate(

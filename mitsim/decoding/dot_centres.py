@@ -109,10 +109,7 @@ def _dots_of_diameter(fine: NDArray[Any], diameter: float, scale: int) -> NDArra
 
 
 def _centre(fine: NDArray[Any], outline: NDArray[Any]) -> NDArray[np.float64] | None:
-    """Return the centre of gravity (2,) of the dot within an outline, in pixels of the upsampled image.
-
-    The dot is the area below half level. The result is None without a background or a closed outline at that level.
-    """
+    """Return the centre of gravity (2,) [upsampled px] of a dot below half level; None without a closed outline."""
     column, row, width, height = cv2.boundingRect(outline)
     step = max(round(_RING * (width + height) / 2), 1)
     left, top = max(column - 2 * step, 0), max(row - 2 * step, 0)

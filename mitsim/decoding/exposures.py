@@ -52,21 +52,11 @@ def merge_exposures(
     A pixel that is saturated in the shortest exposure has :data:`MERGED_FULL_SCALE`. The level without light is in the
     same ratio to it as ``black_level`` to ``full_scale``.
 
-    Parameters
-    ----------
-    stack
-        (E, P, H, W) grey levels [DN] of E exposures of P images, uint8 or uint16.
-    exposures_s
-        (E,) exposures [s] in any order, over 0.
-    black_level, full_scale
-        Level without light and largest level [DN]; a pixel at full scale is saturated.
-    gamma
-        Exponent of the imager's response curve [1], which is undone first.
-
-    Raises
-    ------
-    InputError
-        If the stack has another shape or type, the exposures do not fit it, or a level or gamma is not allowed.
+    ``stack``: (E, P, H, W) grey levels [DN] of E exposures of P images, uint8 or uint16. ``exposures_s``: (E,)
+    exposures [s] in any order, over 0. ``black_level``, ``full_scale``: level without light and largest level [DN]; a
+    pixel at full scale is saturated. ``gamma``: exponent of the imager's response curve [1], which is undone first.
+    Raises InputError if the stack has another shape or type, the exposures do not fit it, or a level or gamma is not
+    allowed.
     """
     if stack.ndim != 4 or stack.dtype not in (np.uint8, np.uint16) or len(stack) == 0:
         found = f"{stack.dtype} of shape {stack.shape}"
@@ -111,10 +101,6 @@ def companded(levels: NDArray[np.uint16], black_level: float, share: float) -> N
     have a few levels. A match needs no absolute levels: both cameras have the same curve.
 
     ``black_level`` is the level without light [merged DN], ``share`` the shortest over the longest exposure [1].
-
-    See Also
-    --------
-    merge_exposures : linear images
     """
     signal = (np.arange(MERGED_FULL_SCALE + 1) - black_level) / (MERGED_FULL_SCALE - black_level) / share
     logarithm = np.log1p(np.maximum(signal / _COMPANDED_LINEAR, -0.5))

@@ -17,14 +17,10 @@ from mitsim.sensor.point_spread import kept_variance
 
 @dataclass(frozen=True)
 class MeasuredNoise:
-    """Variance of grey levels as a function of the level, measured in images.
+    """Variance of grey levels as a function of the level, measured in images."""
 
-    - ``levels``: (n,) increasing [DN].
-    - ``variances``: (n,) [DN^2]; linear between the levels, and constant beyond them.
-    """
-
-    levels: NDArray[np.float64]
-    variances: NDArray[np.float64]
+    levels: NDArray[np.float64]  # (n,) increasing [DN]
+    variances: NDArray[np.float64]  # (n,) [DN^2]; linear between the levels, and constant beyond them
 
     def variance(self, level: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return the variance [DN^2] at levels (...) [DN]."""
@@ -40,10 +36,7 @@ class MeasuredNoise:
 def with_dark_noise(
     imager: Imager | MeasuredNoise | None, exposures_s: tuple[float, ...]
 ) -> Imager | MeasuredNoise | None:
-    """Return an imager whose read noise contains the shot noise of its dark current, which then is 0.
-
-    Measured noise contains it, and that of several or unknown exposures [s] is left out.
-    """
+    """Return an imager with the shot noise of its dark current as read noise; unknown with several exposures [s]."""
     if not isinstance(imager, Imager) or len(exposures_s) != 1 or imager.dark_current == 0:
         return imager
     dark = imager.dark_current * exposures_s[0]
@@ -79,13 +72,7 @@ def grey_level_variance(level: NDArray[np.float32], imager: Imager | MeasuredNoi
 
 
 def check_full_scale(stack: NDArray[np.generic], full_scale: float) -> None:
-    """Reject a full scale [DN] that the stack's type cannot represent.
-
-    Raises
-    ------
-    InputError
-        If it is not over 0, or exceeds the largest value of the type.
-    """
+    """Reject a full scale [DN] not over 0, or above the largest value of the stack's type, by an InputError."""
     largest = 2.0 ** (8 * stack.dtype.itemsize) - 1 if stack.dtype.kind == "u" else np.inf
     if not 0 < full_scale <= largest or not np.isfinite(full_scale):
         raise InputError("image stack", "full_scale", full_scale, f"over 0, up to {largest:g} DN")

@@ -38,20 +38,12 @@ def cloud_on_grid(
 ) -> PointCloud:
     """Return a cloud of the whole grid with the results of a region; pixels outside are ``NO_SURFACE``.
 
-    Parameters
-    ----------
-    points
-        (h, w, 3) in the sensor frame [mm].
-    status
-        (h, w) of :class:`~characterisation.point_cloud.Status`.
-    sigma
-        (h, w) standard deviation along the view ray [mm], or None.
-    roi
-        The region; it is ignored if ``status`` has the size of the grid.
-    geometry
-        Grid and baseline of the cloud.
-    sensor, source
-        Copied into the cloud.
+    - ``points``: (h, w, 3) in the sensor frame [mm].
+    - ``status``: (h, w) of :class:`~characterisation.point_cloud.Status`.
+    - ``sigma``: (h, w) standard deviation along the view ray [mm], or None.
+    - ``roi``: the region; it is ignored if ``status`` has the size of the grid.
+    - ``geometry``: grid and baseline of the cloud.
+    - ``sensor``, ``source``: copied into the cloud.
     """
     grid, baseline = geometry.grid, geometry.baseline
     if status.shape == (grid.height, grid.width):

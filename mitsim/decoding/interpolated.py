@@ -9,10 +9,7 @@ from characterisation.region_of_interest import Roi
 
 
 def needed_region(positions: NDArray[np.float32], width: int, height: int) -> Roi:
-    """Return the region of an image that interpolation needs at ``positions`` (2, ...), column and row [px].
-
-    It is clipped to the image. Positions beyond the image therefore give the same result as in the whole image.
-    """
+    """Return the region, clipped to the image, that interpolation needs at positions (2, ...), column and row [px]."""
     limits = []
     for coordinates, size in zip(positions, (width, height), strict=True):
         # the positions of a fisheye camera may be infinite
@@ -29,18 +26,8 @@ def was_read_out(positions: NDArray[np.float32], read_out: Roi, width: int, heig
     Where the region ends at the edge of the image, positions up to half a pixel beyond it are included, as in whole
     images.
 
-    Parameters
-    ----------
-    positions
-        (2, ...) columns and rows [px].
-    read_out
-        Region of the image that was read out.
-    width, height
-        Size of the image [px].
-
-    See Also
-    --------
-    needed_region : the pixels that the interpolation needs
+    ``positions``: (2, ...) columns and rows [px]. ``read_out``: region of the image that was read out. ``width``,
+    ``height``: size of the image [px].
     """
     column, row = positions
     inside = column >= (read_out.left if read_out.left > 0 else -0.5)

@@ -30,10 +30,7 @@ SLOW_S = 1.0
 
 
 def kept_cloud(contents: object, decode: Callable[[], PointCloud]) -> PointCloud:
-    """Return the cloud of a capture: the kept one, or that of ``decode``, which is kept if it took long.
-
-    ``contents`` is everything that determines the cloud (:func:`~characterisation.files.value_digest.value_digest`).
-    """
+    """Return a kept cloud, or that of ``decode``, kept if it took long; ``contents`` determines the cloud."""
     folder = _folder()
     file = None if folder is None else folder / f"{value_digest((own_build(), contents))}.ply"
     if file is not None and file.is_file():

@@ -45,15 +45,7 @@ def is_array_or_text(path: Path) -> bool:
 
 
 def read_plain_cloud(path: Path, unit: str | None = None) -> tuple[PointCloud, str]:
-    """Return the cloud [mm] of an array or a text, and a sentence about its unit and its grid.
-
-    ``unit`` is that of :func:`plain_cloud`.
-
-    Raises
-    ------
-    InputError
-        If the file holds no points with x, y and z.
-    """
+    """Return the cloud [mm] of an array or a text, and a sentence on unit and grid; InputError without points."""
     data = read_bounded(path, "a cloud")
     suffix = path.suffix.lower()
     if suffix in TEXTS:
@@ -67,19 +59,9 @@ def plain_cloud(
 ) -> tuple[PointCloud, str]:
     """Return the cloud [mm] of points (n, 3) or (H, W, 3) as a file has them, and a sentence about its unit and grid.
 
-    Parameters
-    ----------
-    stored
-        The points.
-    path
-        The file, for messages.
-    unit, stated
-        Unit of length that the user gives, and the one that the file states; by default that of the median distance.
-
-    Raises
-    ------
-    InputError
-        If there is no point, or one is too far away.
+    ``stored``: the points. ``path``: the file, for messages. ``unit``, ``stated``: unit of length that the user gives,
+    and the one that the file states; by default that of the median distance. Raises InputError if there is no point, or
+    one is too far away.
     """
     points = np.array(stored, np.float64)
     notes = leave_out_marks(points), leave_out_copies(points)

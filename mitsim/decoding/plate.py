@@ -77,18 +77,12 @@ class Plate:
 
 @dataclass(frozen=True)
 class PlateDots:
-    """Measured dots of a plate.
+    """Measured dots of a plate."""
 
-    - ``centres`` (n, 3) [mm], in the sensor frame.
-    - ``indices`` (n, 2): row and column of each dot in the plate.
-    - ``distances`` (m,) [mm] of all neighbours along rows and columns.
-    - ``dot_count``: number of dots in the window, on the plate or not.
-    """
-
-    centres: Array
-    indices: NDArray[np.int64]
-    distances: Array
-    dot_count: int
+    centres: Array  # (n, 3) [mm], in the sensor frame
+    indices: NDArray[np.int64]  # (n, 2) row and column of each dot in the plate
+    distances: Array  # (m,) [mm] of all neighbours along rows and columns
+    dot_count: int  # number of dots in the window, on the plate or not
 
 
 def image_on_grid(capture: Capture, grid: ViewGrid) -> NDArray[np.uint8]:

@@ -65,24 +65,17 @@ _DEPTHS = 5
 
 @dataclass(frozen=True)
 class TimeOfFlightGeometry:
-    """Geometry of a camera and its light source, computed once.
+    """Geometry of a camera and its light source, computed once."""
 
-    - ``camera_name``, ``camera``: the camera.
-    - ``ray``: (H, W, 3) unit view direction of each raw pixel in the sensor frame.
-    - ``light_source``: (3,) position p [mm] relative to the camera's centre, in the sensor frame.
-    - ``projection``: (H, W) [mm] d.p, the projection of p on each ray.
-    - ``cosine``: (H, W) cosine of the angle between ray and camera axis.
-    - ``seen``: (H, W) whether the light source reaches the ray between near and far.
-    - ``grid``, ``baseline``: pixels of the cloud, and unit vector (3,) from the camera to the light source.
-    """
-
+    #: ``camera_name``, ``camera``: the camera
     camera_name: str
     camera: Camera
-    ray: NDArray[np.float64]
-    light_source: NDArray[np.float64]
-    projection: NDArray[np.float64]
-    cosine: NDArray[np.float64]
-    seen: NDArray[np.bool_]
+    ray: NDArray[np.float64]  # (H, W, 3) unit view direction of each raw pixel in the sensor frame
+    light_source: NDArray[np.float64]  # (3,) position p [mm] relative to the camera's centre, in the sensor frame
+    projection: NDArray[np.float64]  # (H, W) [mm] d.p, the projection of p on each ray
+    cosine: NDArray[np.float64]  # (H, W) cosine of the angle between ray and camera axis
+    seen: NDArray[np.bool_]  # (H, W) whether the light source reaches the ray between near and far
+    #: ``grid``, ``baseline``: pixels of the cloud, and unit vector (3,) from the camera to the light source
     grid: ViewGrid
     baseline: NDArray[np.float64]
 
@@ -90,12 +83,7 @@ class TimeOfFlightGeometry:
 def time_of_flight_geometry(rig: Rig, near_mm: float, far_mm: float) -> TimeOfFlightGeometry:
     """Prepare the first camera of a rig and its light source, which takes the place of the rig's projector.
 
-    ``near_mm`` and ``far_mm`` are depths along the camera's axis.
-
-    Raises
-    ------
-    InputError
-        If the rig has no light source.
+    ``near_mm`` and ``far_mm`` are depths along the camera's axis. Raises InputError if the rig has no light source.
     """
     if rig.projector is None:
         raise InputError("rig", "projector", "none", "the light source of the time-of-flight camera")
@@ -125,10 +113,7 @@ def time_of_flight_geometry(rig: Rig, near_mm: float, far_mm: float) -> TimeOfFl
 
 
 def unambiguous_path(code: AmplitudeModulation) -> float:
-    """Return the optical path [mm] up to which the phases determine the path uniquely.
-
-    It is c / gcd(f), after which the phases of all frequencies repeat, or the search limit if that is shorter.
-    """
+    """Return the optical path [mm] that phases determine uniquely: c / gcd(f), at most the search limit."""
     return _candidate_count(code) * LIGHT_MM_S / float(code.frequencies_hz[-1])
 
 
@@ -139,43 +124,20 @@ def decode_time_of_flight(
     settings: TimeOfFlightSettings,
     context: ImageContext,
 ) -> PointCloud:
-    """Decode the images of one capture.
+    """Decode the images of one capture to a cloud on the camera's own pixels, sensor frame [mm].
 
-    Parameters
-    ----------
-    stack
-        (P, H, W) differences of the taps [DN], all delays of the lowest frequency first.
-    geometry
-        From :func:`time_of_flight_geometry`.
-    code, settings
-        Frequencies, delays and contrasts of the modulation, and range and limits.
-    context
-        Of the images. Its ``roi`` is a region of the image; ``read_out`` is not used. Without an :class:`Imager`
-        ``sigma`` is None, and phases are compared by quantisation and ``systematic_rad`` alone. Measured noise does not
-        replace the imager here.
+    - ``SATURATED``: an image is at full scale, or at 0 where another is not.
+    - ``LOW_MODULATION``: the amplitude at one frequency at least is too small. The surface is dark or in shadow, or
+      near and far light in one pixel cancel.
+    - ``NO_SURFACE``: the same, where the light source does not reach the ray.
+    - ``PHASE_INCONSISTENT``: no path fits all phases.
+    - ``OUT_OF_RANGE``: the depth of the path is not between near and far.
+    - ``UNCALIBRATED``: the pixel has no ray, since the distortion of the camera folds over before it.
 
-    Returns
-    -------
-    PointCloud
-        On the camera's own pixels, points in the sensor frame [mm]. Status:
-
-        - ``SATURATED``: an image is at full scale, or at 0 where another is not.
-        - ``LOW_MODULATION``: the amplitude at one frequency at least is too small. The surface is dark or in shadow, or
-          near and far light in one pixel cancel.
-        - ``NO_SURFACE``: the same, where the light source does not reach the ray.
-        - ``PHASE_INCONSISTENT``: no path fits all phases.
-        - ``OUT_OF_RANGE``: the depth of the path is not between near and far.
-        - ``UNCALIBRATED``: the pixel has no ray, since the distortion of the camera folds over before it.
-
-    Raises
-    ------
-    InputError
-        If the stack does not fit the code, the range exceeds the unambiguous path, or the region of interest does not
-        lie in the images.
-
-    See Also
-    --------
-    time_of_flight_geometry : prepares the camera
+    ``stack``: (P, H, W) differences of the taps [DN], all delays of the lowest frequency first. ``context``: its
+    ``roi`` is a region of the image; ``read_out`` is not used. Without an :class:`Imager` ``sigma`` is None, and phases
+    are compared by quantisation and ``systematic_rad`` alone: measured noise does not replace it. Raises InputError if
+    the stack does not fit the code, the range exceeds the unambiguous path, or the ``roi`` does not lie in the images.
     """
     camera, full_scale = geometry.camera, context.full_scale
     imager = context.imager if isinstance(context.imager, Imager) else None

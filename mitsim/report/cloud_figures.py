@@ -42,10 +42,7 @@ _CROP_LEAST_PX = 12
 
 
 def part_window(camera: Camera, points: NDArray[np.floating]) -> tuple[slice, slice]:
-    """Return the rows and columns of an image that show points (n, 3) [mm], sensor frame, with a margin.
-
-    The whole image is returned if it shows none of the points.
-    """
+    """Return rows and columns of an image that show points (n, 3) [mm], sensor frame, with a margin; else all."""
     pixels = camera.project(points)
     pixels = pixels[np.isfinite(pixels).all(axis=1)]
     whole = slice(0, camera.height), slice(0, camera.width)

@@ -265,10 +265,7 @@ def _of_statement(document: StatementDocument, exposures: str) -> list[tuple[str
 
 
 def _influences(document: StatementDocument, lay_open: bool) -> list[tuple[str, str]]:
-    """Return the influences that are varied, fixed and left out (ISO/TS 15530-4).
-
-    With ``lay_open``, the scene does not give the direction of the marks of a face.
-    """
+    """Return the influences varied, fixed and left out (ISO/TS 15530-4); ``lay_open``: no known direction of marks."""
     varied = [influence for influence in document.influences if influence.included]
     fixed = [influence for influence in document.influences if not influence.included and influence.simulated]
     left_out = [influence for influence in document.influences if not influence.included and not influence.simulated]

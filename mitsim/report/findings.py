@@ -24,10 +24,7 @@ NOISE_UP_TO_DEG = 45.0
 
 
 def ranked_views(scores: xr.Dataset, measurement: str) -> NDArray[np.int64]:
-    """Return the indices (not numbers) of the views that can make a measurement, least predicted risk first.
-
-    The risk is u / sqrt(chance), by which the race chooses its views too.
-    """
+    """Return the indices of views that can make a measurement, least risk u / sqrt(chance) first, as in the race."""
     here = scores.sel(measurement=measurement)
     order = np.argsort(here["uncertainty_rank"].values, kind="stable")
     return np.asarray(order[here["uncertainty_possible"].values.astype(bool)[order]])

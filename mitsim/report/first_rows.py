@@ -183,9 +183,7 @@ def tolerance_words(tolerance: float | tuple[float, float] | None, nominal: floa
 
 
 def accepted_words(readings: tuple[float | None, float] | None, unit: str, tolerance: float | None) -> str:
-    """Format the readings that are accepted: ``19.82 to 20.18 mm``, ``up to 0.13 mm``, ``none``; a dash without
-    tolerance.
-    """
+    """Format accepted readings: ``19.82 to 20.18 mm``, ``up to 0.13 mm``, ``none``; a dash without tolerance."""
     if tolerance is None:
         return NONE
     if readings is None:

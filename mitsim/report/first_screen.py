@@ -210,10 +210,7 @@ def _without_statement(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
 
 
 def _apart(run: Run, document: StatementDocument) -> str:
-    """Return that no single view can make all measurements, if the stated one cannot and no set of views is asked for.
-
-    The map may find a view impossible that makes a measurement.
-    """
+    """Say that no single view makes all measurements, unless a set is asked for; the map may wrongly exclude a view."""
     made = all(1 - measurement.without_value >= LEAST_CHANCE for measurement in document.measurements.values())
     apart = "" if made or run.about.view_sets else apart_in_words(run.scores)
     return apart and f"By the map, {apart}. {TOGETHER}"
@@ -273,10 +270,7 @@ def _others_fit_more(choice: ChoiceDocument, best: SensorEntry) -> Iterator[str]
 
 
 def sensor_rows(choice: ChoiceDocument, sensor_entry: SensorEntry) -> list[ResultRow]:
-    """Return the rows for the measurements of one sensor; screening alone gives no readings and no losses.
-
-    A row from another view than the first names it.
-    """
+    """Return a sensor's rows, which name another view than the first; screening gives no readings and no losses."""
     shown = [pose.view for pose in sensor_entry.poses[:1]]
     return [
         RowValues(

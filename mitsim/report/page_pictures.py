@@ -159,16 +159,8 @@ def placement_picture(
 ) -> Picture | None:
     """Return the picture of a page, wide and narrow, with its caption; None without a part or a pose.
 
-    Parameters
-    ----------
-    geometry, poses, verdicts
-        As of :func:`mitsim.report.placement_figure.draw_placement`.
-    caption
-        Words on sensor and pose.
-
-    See Also
-    --------
-    mitsim.report.placement_figure.placement_figure : one of both figures
+    ``geometry``, ``poses``, ``verdicts``: as of :func:`mitsim.report.placement_figure.draw_placement`. ``caption``:
+    words on sensor and pose.
     """
     if geometry is None or not len(geometry.corners) or not poses:
         return None

@@ -94,15 +94,7 @@ def face_verdicts(measurements: Mapping[str, tuple[Sequence[str], str]]) -> dict
 def placement_figure(
     geometry: SceneGeometry, poses: Sequence[tuple[str, ArrayLike]], verdicts: Mapping[str, str], stacked: bool = False
 ) -> Figure:
-    """Draw a part with a sensor at each pose and its verdicts, as a figure of its own.
-
-    Parameters
-    ----------
-    geometry, poses, verdicts
-        As of :func:`draw_placement`.
-    stacked
-        Whether the enlarged part is below, for narrow windows, not on the right.
-    """
+    """Draw a part with a sensor at each pose as a figure of its own; the rest as for :func:`draw_placement`."""
     with drawing():
         figure = Figure(_STACKED_IN if stacked else _SIZE_IN)
     draw_placement(figure, geometry, poses, verdicts, stacked)
@@ -118,15 +110,11 @@ def draw_placement(
 ) -> None:
     """Draw a part with a sensor at each pose into a figure.
 
-    Parameters
-    ----------
-    figure, stacked
-        Figure or subfigure, about 1.9 times as wide as high; if ``stacked``, 0.7 times: the enlarged part is then
-        below, not on the right.
-    geometry, verdicts
-        Triangles of the part, and eyes of the sensor [mm]; verdict of each feature, a key of :data:`VERDICTS`.
-    poses
-        Label and part_from_sensor (4, 4) [mm] of each pose; the first sensor is drawn in full.
+    - ``figure``, ``stacked``: figure or subfigure, about 1.9 times as wide as high; if ``stacked``, 0.7 times: the
+      enlarged part is then below, not on the right.
+    - ``geometry``, ``verdicts``: triangles of the part, and eyes of the sensor [mm]; verdict of each feature, a key of
+      :data:`VERDICTS`.
+    - ``poses``: label and part_from_sensor (4, 4) [mm] of each pose; the first sensor is drawn in full.
     """
     matrices = [np.asarray(pose, float) for _, pose in poses]
     with drawing():
@@ -155,10 +143,7 @@ def draw_placement(
 def _viewpoint(
     geometry: SceneGeometry, part_from_sensor: Floats, middle: Floats, verdicts: Mapping[str, str]
 ) -> Floats:
-    """Return rows (3, 3): right, up and toward the viewer, who looks from a side of the sensor's line of sight.
-
-    Of both sides it is that from which more faces with a verdict are seen.
-    """
+    """Return rows (3, 3) right, up, toward the viewer, on the side of the line of sight with more judged faces."""
     away = part_from_sensor[:3, 3] - middle
     azimuth = math.atan2(away[1], away[0]) if np.hypot(away[0], away[1]) > 1e-6 else -math.pi / 2
     elevation = math.atan2(away[2], math.hypot(away[0], away[1]))

@@ -68,10 +68,8 @@ def wrapped(text: str, size: float, across: float, weight: str = "normal") -> li
 
     A line breaks at a space, or after an underscore or a slash; a longer word breaks where it must.
 
-    Parameters
-    ----------
-    text, size, weight, across
-        The text, size [pt] and weight of the font, and largest width of a line [in].
+    ``text``, ``size``, ``weight``, ``across``: the text, size [pt] and weight of the font, and largest width of a line
+    [in].
     """
     lines, line, width = list[str](), "", 0.0
     for word in text.split(" "):

@@ -65,10 +65,7 @@ _OF_ROOM = ("room_factor", "daylight", "filter_nm")
 
 
 def unknowns_in_words(unknowns: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the sizes that the virtual measurements drew from: ``form deviation: plane 0.02 mm; coat: ...``.
-
-    One standard deviation each, or a range; a group without a size is left out.
-    """
+    """Return the drawn sizes, one standard deviation or a range: ``form deviation: plane 0.02 mm; coat: ...``."""
     groups = {head: list(_sizes(name, unknowns.get(name, {}))) for name, head in _HEADS.items()}
     if not unknowns.get("decoder", {}).get("known", True):
         groups["decoder"] = ["settings within the ranges in statement.json"]

@@ -104,15 +104,7 @@ def choose_clouds(scores: xr.Dataset, available: Sequence[int], first: Sequence[
 
 
 def shown_cloud(cloud: PointCloud, part_from_sensor: Floats, features: Sequence[str], most: int) -> ShownCloud:
-    """Return points of a cloud, evenly over its pixels.
-
-    Parameters
-    ----------
-    cloud, part_from_sensor
-        The cloud, and the pose of its sensor, (4, 4) [mm].
-    features, most
-        Names of the features of the task, and largest number of points.
-    """
+    """Return at most ``most`` points of a cloud, evenly over its pixels, by a pose (4, 4) [mm]."""
     valid, stride = cloud.valid, 1.0
     rows, columns = np.nonzero(valid)
     while len(rows) > most:
@@ -158,10 +150,7 @@ def packed_cloud(cloud: ShownCloud, box: CoordinateRaster, ends: tuple[float, fl
 
 
 def packed_part(mesh: trimesh.Trimesh, box: CoordinateRaster) -> dict[str, Any]:
-    """Return the part for the page: ``vertices`` (planes x, y, z), ``normals`` (times 127), ``triangles`` (uint16).
-
-    ``shown`` is the number of triangles on the page, ``count`` that of the part.
-    """
+    """Return the page's part: ``vertices``, ``normals`` (x 127), ``triangles`` (uint16), ``shown`` of ``count``."""
     shaded = smoothly_shaded(mesh)
     return {
         "vertices": packed(box.steps(np.asarray(shaded.vertices)).T.tobytes()),

@@ -111,9 +111,7 @@ def _measurement(run: Run, name: str) -> dict[str, Any]:
 
 
 def sites(directions: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Return for each view the index (view,) of its direction, 0, 1, ... in order of appearance; ``directions`` (view,
-    3).
-    """
+    """Return for each view the index (view,) of its direction (view, 3), in order of appearance."""
     _, first, of_view = np.unique(np.round(directions, 5) + 0.0, axis=0, return_index=True, return_inverse=True)
     order = np.empty(len(first), np.int64)
     order[np.argsort(first)] = np.arange(len(first))

@@ -37,10 +37,7 @@ def view_places(scores: xr.Dataset) -> NDArray[np.float64]:
 
 
 def uncertainty_limits(uncertainty: Floats) -> tuple[float, float]:
-    """Return the ends of the colour scale of u (views,), for the views that can make a measurement.
-
-    The scale runs from the least u to the 90th percentile, so that a few hopeless views do not compress it.
-    """
+    """Return the ends of the colour scale of u (views,): the least, and the 90th percentile against hopeless views."""
     values = np.sort(uncertainty[uncertainty > 0])
     if not len(values):
         return 0.1, 1.0
@@ -53,12 +50,9 @@ def uncertainty_figure(scores: xr.Dataset, measurement: str, unit: str, checked:
 
     Bright is a small u. If views share a position, the best is on top.
 
-    Parameters
-    ----------
-    scores, measurement, unit
-        Scores of a run, over ``view`` and ``measurement``; name of the measurement, and its unit: mm or deg.
-    checked, best
-        Numbers of the views that were rendered, and of the best one; None if no view can make the measurement.
+    ``scores``, ``measurement``, ``unit``: scores of a run, over ``view`` and ``measurement``; name of the measurement,
+    and its unit: mm or deg. ``checked``, ``best``: numbers of the views that were rendered, and of the best one; None
+    if no view can make the measurement.
     """
     worst_first = np.argsort(-scores["uncertainty_rank"].sel(measurement=measurement).values, kind="stable")
     scores = scores.isel(view=worst_first)

@@ -124,17 +124,8 @@ def conductor_bsdf(
 ) -> dict[str, Any]:
     """Return the Mitsuba description of one microfacet lobe.
 
-    Parameters
-    ----------
-    distribution, alphas
-        Of the normals; its widths along u and v [1], in the sense of the distribution.
-    index, factor
-        n and k of the surface [1], and a factor on all reflected light [1].
-
-    See Also
-    --------
-    diffuse_bsdf : a Lambertian surface
-    metal_bsdf : a machined metal
+    ``distribution``, ``alphas``: of the normals; its widths along u and v [1], in the sense of the distribution.
+    ``index``, ``factor``: n and k of the surface [1], and a factor on all reflected light [1].
     """
     return {
         "type": "roughconductor",

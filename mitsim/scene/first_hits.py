@@ -15,15 +15,11 @@ from mitsim.scene.device import known_to_device, vectors_to_device, vectors_to_h
 
 @dataclass(frozen=True)
 class Hits:
-    """First surfaces on n rays.
+    """First surfaces on n rays."""
 
-    - ``shape`` (n,): index of the shape, of the instance for a shape in a group; -1 for none.
-    - ``front`` (n,): whether the ray meets the reflecting side.
-    - ``normal`` (n, 3) on the side of the ray's origin, world frame, and ``distance`` (n,) [mm]; NaN without a surface.
-    """
-
-    shape: NDArray[np.int16]
-    front: NDArray[np.bool_]
+    shape: NDArray[np.int16]  # (n,) index of the shape, of the instance for a shape in a group; -1 for none
+    front: NDArray[np.bool_]  # (n,) whether the ray meets the reflecting side
+    #: ``normal`` (n, 3) on the side of the ray's origin, world frame, and ``distance`` (n,) [mm]; NaN without a surface
     normal: Floats
     distance: Floats
 
@@ -50,10 +46,7 @@ def first_hits(scene: Any, origins: NDArray[np.floating], directions: NDArray[np
 
 
 def numbers_met(surface: Any, valid: Any) -> Any:
-    """Return Mitsuba's number of the shape that each lane met, of the instance for a shape in a group; 0 for none.
-
-    ``surface`` is an interaction or a preliminary intersection.
-    """
+    """Return the number of the shape, or instance, that each lane of an interaction met; 0 for none."""
     inside, instance = (dr.reinterpret_array(mi.UInt32, pointer) for pointer in (surface.shape, surface.instance))
     return dr.select(valid, dr.select(instance != 0, instance, inside), 0)
 

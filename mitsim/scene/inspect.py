@@ -181,10 +181,7 @@ def _area(shape: Any) -> float:
 
 
 def _points_on(shape: Any) -> tuple[Floats, Floats]:
-    """Return points and normals (n, 3) spread evenly over a shape, by the R2 sequence; none if it cannot be sampled.
-
-    The R2 sequence: Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018.
-    """
+    """Return points and normals (n, 3) even over a shape, by Roberts's R2 sequence (2018); none if not sampled."""
     steps = np.arange(1, _SAMPLES + 1)[:, None] * np.array([0.7548776662466927, 0.5698402909980532])
     square = (0.5 + steps).astype(np.float64) % 1.0
     try:

@@ -69,25 +69,19 @@ class Finish:
 
 @dataclass
 class Loading:
-    """State while one scene is loaded.
-
-    - ``where``: the scene's file, for messages.
-    - ``folder`` to which the file names of materials are relative.
-    - ``deviation`` of a finish from its best estimate, by the id of its BSDF.
-    - ``sprayed``: whether every finish is under a matt white spray.
-    - ``finishes`` loaded so far, by the id of the BSDF.
-    - ``fault``: first error of the author. It is kept here because Mitsuba replaces our exceptions by its own.
-    - ``unnamed``: numbers of BSDFs without an id of their own. They start anew, so that another loading of the scene
-      gives each the same id.
-    """
+    """State while one scene is loaded."""
 
     wavelength_nm: float = 850.0
-    where: str = "scene"
-    folder: Path = field(default_factory=Path)
+    where: str = "scene"  # the scene's file, for messages
+    folder: Path = field(default_factory=Path)  # to which the file names of materials are relative
+    #: of a finish from its best estimate, by the id of its BSDF
     deviation: Callable[[str], Deviation] = lambda _: NOMINAL
-    sprayed: bool = False
-    finishes: dict[str, Finish] = field(default_factory=dict)
+    sprayed: bool = False  # whether every finish is under a matt white spray
+    finishes: dict[str, Finish] = field(default_factory=dict)  # loaded so far, by the id of the BSDF
+    #: first error of the author. It is kept here because Mitsuba replaces our exceptions by its own
     fault: InputError | None = None
+    #: numbers of BSDFs without an id of their own. They start anew, so that another loading of the scene gives each the
+    #: same id
     unnamed: Iterator[int] = field(default_factory=itertools.count)
 
 
@@ -111,14 +105,8 @@ def loading(
 
     Only one block is active at a time; others wait.
 
-    Parameters
-    ----------
-    wavelength_nm, where, folder
-        As in :class:`Loading`.
-    deviation
-        Of all finishes, or a function from the id of a BSDF to its deviation.
-    sprayed
-        As in :class:`Loading`.
+    ``wavelength_nm``, ``where``, ``folder``: as in :class:`Loading`. ``deviation``: of all finishes, or a function from
+    the id of a BSDF to its deviation. ``sprayed``: as in :class:`Loading`.
     """
     global _current
     with _lock:
@@ -213,10 +201,7 @@ def _paint(kind: str, greatest: float, describe: Callable[[float, Scatter], dict
 
 
 def _make_bsdf(props: Any, finish_of: Callable[[Deviation], Finish]) -> Any:
-    """Make the BSDF of a finish and store the finish under the id of the BSDF.
-
-    BSDFs inside shapes have no id, or all that of a dictionary's key; they get a number, the same in each loading.
-    """
+    """Make a finish's BSDF and store the finish by its id, or by its number in the shape, fixed over loadings."""
     from mitsim.scene.backend import mi
 
     name = props.id()

@@ -16,24 +16,20 @@ from characterisation.files.arrays import Floats
 
 @dataclass(frozen=True)
 class MeshFacts:
-    """The triangles of a shape, world frame.
+    """The triangles of a shape, world frame."""
 
-    - ``vertices`` (n, 3) [mm], after merging, and ``triangles`` (m, 3), indices of vertices.
-    - ``open_edges``, ``nonmanifold_edges``: number of edges of only one triangle, and of more than two.
-    - ``volume`` [mm^3], positive if the normals point outward; 0 if the mesh is not closed.
-    - ``degenerate``, ``duplicate``: number of triangles without area, and of repeated triangles.
-    - ``texture``: whether the vertices have texture coordinates u, v.
-    - ``open_edge_ends`` (open_edges, 2, 3): end points of the open edges [mm].
-    """
-
+    #: ``vertices`` (n, 3) [mm], after merging, and ``triangles`` (m, 3), indices of vertices
     vertices: Floats
     triangles: NDArray[np.int64]
+    #: ``open_edges``, ``nonmanifold_edges``: number of edges of only one triangle, and of more than two
     open_edges: int
     nonmanifold_edges: int
-    volume: float
+    volume: float  # [mm^3], positive if the normals point outward; 0 if the mesh is not closed
+    #: ``degenerate``, ``duplicate``: number of triangles without area, and of repeated triangles
     degenerate: int
     duplicate: int
-    texture: bool
+    texture: bool  # whether the vertices have texture coordinates u, v
+    #: (open_edges, 2, 3) end points of the open edges [mm]
     open_edge_ends: Floats = field(default_factory=lambda: np.empty((0, 2, 3)), repr=False)
 
     @property
@@ -45,14 +41,8 @@ class MeshFacts:
 def mesh_facts(vertices: Floats, triangles: NDArray[np.int64], merge: float, texture: bool = False) -> MeshFacts:
     """Return the facts about a mesh. The volume is a sum over triangles of a . (b x c) / 6, about the mean vertex.
 
-    Parameters
-    ----------
-    vertices, triangles
-        (n, 3) [mm], and (m, 3) indices of vertices.
-    merge
-        Vertices in one cell of a grid of this spacing [mm] are merged.
-    texture
-        Whether the vertices have u and v.
+    ``vertices``, ``triangles``: (n, 3) [mm], and (m, 3) indices of vertices. ``merge``: vertices in one cell of a grid
+    of this spacing [mm] are merged. ``texture``: whether the vertices have u and v.
     """
     _, first, inverse = np.unique(np.round(vertices / merge), axis=0, return_index=True, return_inverse=True)
     vertices, triangles = vertices[first], inverse.reshape(-1)[triangles]

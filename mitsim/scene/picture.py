@@ -39,19 +39,9 @@ _ELEVATION = np.radians(35.0)
 def draw_scene(scene: Any, names: tuple[str, ...], bounds: Floats, ax: Any, pose: Transform | None) -> Axes:
     """Draw the shapes of a scene with their names, from the default viewpoint or as a sensor at ``pose`` sees them.
 
-    Parameters
-    ----------
-    scene, names, bounds
-        The ``mi.Scene``, the names of its shapes, and the corners (2, 3) of the bounding box [mm].
-    ax
-        Axes to draw into; None for those of a new figure.
-    pose
-        ``world_from_sensor`` [mm]; None for the default viewpoint.
-
-    Raises
-    ------
-    InputError
-        If ``ax`` is not one axes.
+    ``scene``, ``names``, ``bounds``: the ``mi.Scene``, the names of its shapes, and the corners (2, 3) of the bounding
+    box [mm]. ``ax``: axes to draw into; None for those of a new figure. ``pose``: ``world_from_sensor`` [mm]; None for
+    the default viewpoint. Raises InputError if ``ax`` is not one axes.
     """
     frame = (
         viewer_frame(_AZIMUTH, _ELEVATION) if pose is None else np.array([1.0, -1.0, -1.0])[:, None] * pose.rotation.T

@@ -61,13 +61,9 @@ _ENCODING = re.compile(rb"""^[^>]*?encoding\s*=\s*["']([^"']*)["']""")
 def checked_trees(path: Path, parameters: Mapping[str, str] | None = None) -> list[ElementTree.Element]:
     """Read a scene XML and its includes, reject what Mitsuba cannot handle, and return their root elements.
 
-    ``parameters`` replace the values of ``<default>`` elements, of which names of files may consist.
-
-    Raises
-    ------
-    InputError
-        If a file is missing, does not parse, is not UTF-8, or is too large or too deeply nested. Also if it refers to
-        something that is not a regular file.
+    ``parameters`` replace the values of ``<default>`` elements, of which names of files may consist. Raises InputError
+    if a file is missing, does not parse, is not UTF-8, or is too large or too deeply nested. Also if it refers to
+    something that is not a regular file.
     """
     return [root for _, root in _with_includes(path, dict(parameters or {}))]
 
@@ -75,10 +71,7 @@ def checked_trees(path: Path, parameters: Mapping[str, str] | None = None) -> li
 def check_rotations(path: Path, trees: Sequence[ElementTree.Element], parameters: Mapping[str, str]) -> None:
     """Check that every rotation is about a unit vector: Mitsuba 3.9 scales and shears shapes by others.
 
-    Raises
-    ------
-    InputError
-        For the first that is not, with the unit vector.
+    Raises InputError for the first that is not, with the unit vector.
     """
     elements, values = _elements(trees, parameters)
     for element in elements:
@@ -100,21 +93,9 @@ def check_spectra(
 ) -> None:
     """Check that every spectrum is one number: with one wavelength Mitsuba takes the luminance of other spectra.
 
-    Parameters
-    ----------
-    path, trees, parameters
-        The scene, from :func:`checked_trees`, and the values of its parameters.
-    wavelength_nm
-        Of the sensor.
-
-    Raises
-    ------
-    InputError
-        For the first that is not, with its value at the wavelength if the scene states it.
-
-    See Also
-    --------
-    mitsim.scene.load.load_scene : load the scene
+    ``path``, ``trees``, ``parameters``: the scene, from :func:`checked_trees`, and the values of its parameters.
+    ``wavelength_nm``: of the sensor. Raises InputError for the first that is not, with its value at the wavelength if
+    the scene states it.
     """
     elements, values = _elements(trees, parameters)
     for element in elements:
@@ -253,11 +234,7 @@ def _with_includes(
 
 
 def _parsed(path: Path, text: str) -> ElementTree.Element:
-    """Return the root element of an XML text.
-
-    The text is parsed as a stream of events, so that depth and number of elements are checked before the tree is
-    complete.
-    """
+    """Return an XML text's root, parsed as events: depth and number of elements are checked on the way."""
     reader: Any = ElementTree.XMLPullParser(("start", "end"))
     depth = count = 0
     root: ElementTree.Element | None = None

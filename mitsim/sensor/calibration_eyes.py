@@ -271,25 +271,9 @@ def lens_in(maps: Sequence[_Named], fisheye: bool) -> Composed | None:
 def in_opencvs_order(value: Any, table: Mapping[str, Any], fisheye: bool, where: Path) -> Any:
     """Return coefficients in OpenCV's order if their map states another; anything else as it is.
 
-    Parameters
-    ----------
-    value
-        The coefficients, as the file has them.
-    table
-        Their map, which may have a list of names, such as ``distortion_names``.
-    fisheye
-        Whether they are those of a fisheye lens.
-    where
-        The file, for messages.
-
-    Raises
-    ------
-    InputError
-        If a name is unknown, or there are not as many names as coefficients.
-
-    See Also
-    --------
-    lens_in : coefficients that are single numbers
+    ``value``: the coefficients, as the file has them. ``table``: their map, which may have a list of names, such as
+    ``distortion_names``. ``fisheye``: whether they are those of a fisheye lens. ``where``: the file, for messages.
+    Raises InputError if a name is unknown, or there are not as many names as coefficients.
     """
     numbers = vector(value)
     if numbers is None or not numbers.size:

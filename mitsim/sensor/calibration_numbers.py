@@ -99,10 +99,7 @@ def by_rows(K: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
 def checked_matrix(K: NDArray[np.float64], name: str, file: str) -> NDArray[np.float64]:
     """Return K (3, 3), the matrix of the eye ``name`` in a ``file``, after a check that it is a camera matrix.
 
-    Raises
-    ------
-    InputError
-        If it has a skew, or is no camera matrix by rows.
+    Raises InputError if it has a skew, or is no camera matrix by rows.
     """
     if abs(K[0, 1]) > 1e-9 and K[0, 0] > 0:
         hint = "calibrate without skew: est_alpha = 0 in MATLAB's toolbox"
@@ -115,19 +112,11 @@ def checked_matrix(K: NDArray[np.float64], name: str, file: str) -> NDArray[np.f
 def rotation_matrix(R: NDArray[np.float64], name: str, file: str, by_columns: bool) -> NDArray[np.float64]:
     """Return R (3, 3) by rows, of a rotation vector or of nine numbers, after a check that it is a rotation.
 
-    Parameters
-    ----------
-    R
-        As the file has it.
-    name, file
-        The eye and the file, for messages.
-    by_columns
-        Whether the camera matrix in the file is written by columns. Then the order of R is not known.
+    - ``R``: as the file has it.
+    - ``name``, ``file``: the eye and the file, for messages.
+    - ``by_columns``: whether the camera matrix in the file is written by columns. Then the order of R is not known.
 
-    Raises
-    ------
-    InputError
-        If it is no rotation, or the transposed one is as likely.
+    Raises InputError if it is no rotation, or the transposed one is as likely.
     """
     field = f"rotation of {name}"
     if R.size == 3:

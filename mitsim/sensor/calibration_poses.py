@@ -41,10 +41,7 @@ _OF_CAMERA = ("orientation",), ("position",)
 
 
 def pose_in(maps: Sequence[tuple[str, dict[str, Any]]]) -> dict[str, Composed]:
-    """Return ``rotation`` and ``translation`` from the common frame to the camera; empty if no map states them.
-
-    Each of ``maps`` has its dotted name; a rotation beside a translation in no map needs no search.
-    """
+    """Return ``rotation`` and ``translation``, common frame to camera, from maps by dotted name; empty without any."""
     of_librealsense = any("ppx" in table for _, table in maps)
     for name, table in maps:
         for key, (unit, of_camera) in _MOTIONS.items():

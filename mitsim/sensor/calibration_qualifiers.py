@@ -72,19 +72,8 @@ class ReadOut:
 def check_intrinsics(focal: tuple[float, float], principal: tuple[float, float], width: int, height: int) -> None:
     """Check that a focal length and a principal point belong to images of a size.
 
-    Parameters
-    ----------
-    focal, principal, width, height
-        All [px].
-
-    Raises
-    ------
-    ValueError
-        If they cannot; the message names the key of a sensor file, the limits, and the likely cause.
-
-    See Also
-    --------
-    check_camera : the matrix of a camera
+    ``focal``, ``principal``, ``width``, ``height``: all [px]. Raises ValueError if they cannot; the message names the
+    key of a sensor file, the limits, and the likely cause.
     """
     side = max(width, height)
     low, high = (share * side for share in _FOCAL_SHARE)
@@ -128,12 +117,8 @@ def check_camera(camera: Camera, where: str | Path, field: str = "") -> None:
 def read_out_of(table: dict[str, Any], where: str | Path) -> ReadOut | None:
     """Return the part of the imager that a table states; None for the full imager.
 
-    In ROS a ``roi`` of zeros means the full imager, and a binning of 0 means 1.
-
-    Raises
-    ------
-    InputError
-        If a stated value is not a whole number of pixels.
+    In ROS a ``roi`` of zeros means the full imager, and a binning of 0 means 1. Raises InputError if a stated value is
+    not a whole number of pixels.
     """
     stated = table.get("roi")
     roi: dict[str, Any] = stated if isinstance(stated, dict) else {}
@@ -168,20 +153,9 @@ def of_images(
     the size of the part; the matrix is then that of the full imager, or already that of the part: the reading whose
     principal point is nearer to the middle of the images is used.
 
-    Parameters
-    ----------
-    matrix
-        K (3, 3) [px] of the full imager.
-    stated
-        (width, height) [px] of the full imager as the file states it.
-    read_out
-        Part of the imager that is read out, and its binning.
-    images
-        (width, height) [px] of the images, if known.
-
-    See Also
-    --------
-    read_out_of : the read-out that a table states
+    ``matrix``: K (3, 3) [px] of the full imager. ``stated``: (width, height) [px] of the full imager as the file states
+    it. ``read_out``: part of the imager that is read out, and its binning. ``images``: (width, height) [px] of the
+    images, if known.
     """
     corner, binning = np.array(read_out.corner), np.array(read_out.binning)
     full = None if stated is None else np.array(stated, float)

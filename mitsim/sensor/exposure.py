@@ -39,19 +39,13 @@ class PlannedExposure:
 
 @dataclass(frozen=True)
 class ExposurePolicy:
-    """Exposure rule of a sensor.
+    """Exposure rule of a sensor."""
 
-    - ``rule`` in words.
-    - ``base_s``: the exposure; None if it follows the scene by ``control``, or is unknown.
-    - ``bracket``: the exposures around it.
-    - ``limits_s``: the limits of the device.
-    """
-
-    rule: str
-    base_s: float | None
+    rule: str  # in words
+    base_s: float | None  # the exposure; None if it follows the scene by ``control``, or is unknown
     control: AutomaticExposure | None
-    bracket: Bracket | None
-    limits_s: tuple[float, float]
+    bracket: Bracket | None  # the exposures around it
+    limits_s: tuple[float, float]  # the limits of the device
 
     def exposures(self, brightest: NDArray[np.floating] | None, full_well: float) -> tuple[float, ...]:
         """Return the exposures of one capture [s], shortest first.
@@ -77,18 +71,10 @@ def exposure_policy(
 ) -> ExposurePolicy:
     """Return the exposure policy of a sensor file.
 
-    Parameters
-    ----------
-    path, rule
-        The file, and its ``[exposure]``; None if it has none.
-    projector, imager, wavelength_nm
-        Of the sensor, for a rule that refers to a matt white plate; NaN if unknown.
-
-    Raises
-    ------
-    InputError
-        If a rule that refers to a plate asks for an exposure beyond its limits. A stated exposure counts as it is: a
-        recording may have another device's.
+    ``path``, ``rule``: the file, and its ``[exposure]``; None if it has none. ``projector``, ``imager``,
+    ``wavelength_nm``: of the sensor, for a rule that refers to a matt white plate; NaN if unknown. Raises InputError if
+    a rule that refers to a plate asks for an exposure beyond its limits. A stated exposure counts as it is: a recording
+    may have another device's.
     """
     if rule is None:
         return ExposurePolicy("unknown", None, None, None, (math.nan, math.nan))
@@ -124,20 +110,11 @@ def automatic(
 ) -> float:
     """Return the exposure [s] that brings a percentile of the pixels to a level, as a device's auto-exposure does.
 
-    Parameters
-    ----------
-    levels
-        Mean electrons per second in the pixels of the brightest image [e-/s], any shape; NaN is ignored.
-    full_well, level
-        Full well [e-], and the target share of it [1].
-    percentile
-        Of the pixels, 0 to 100: at 99, 1 % of them are brighter than ``level``.
-    limits_s
-        Shortest and longest exposure of the device [s]; the result is clipped to them. A dark scene gets the longest.
-
-    See Also
-    --------
-    bracket : several exposures
+    - ``levels``: mean electrons per second in the pixels of the brightest image [e-/s], any shape; NaN is ignored.
+    - ``full_well``, ``level``: full well [e-], and the target share of it [1].
+    - ``percentile``: of the pixels, 0 to 100: at 99, 1 % of them are brighter than ``level``.
+    - ``limits_s``: shortest and longest exposure of the device [s]; the result is clipped to them. A dark scene gets
+      the longest.
     """
     rate = float(np.nanpercentile(levels, percentile))
     return float(np.clip(level * full_well / rate, *limits_s)) if rate > 0 else limits_s[1]

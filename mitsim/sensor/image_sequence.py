@@ -72,13 +72,7 @@ class GrayImages(Document):
     offset_px: Offset | None = None
 
     def stripes(self, extent: int) -> tuple[int, float]:
-        """Return the number of bits and the width of the finest stripe [px] along an axis of ``extent`` pixels.
-
-        Raises
-        ------
-        InputError
-            If the bits and stripes do not cover the projector, or more than 15 bits are needed.
-        """
+        """Return bits and stripe width [px] along ``extent``; InputError if they leave pixels, or over 15 bits."""
         if self.stripe_px is None:
             needed = max(1, int(np.ceil(np.log2(extent))))
             bits = self.bits or needed

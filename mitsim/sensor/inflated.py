@@ -12,15 +12,7 @@ GZIP = 31
 
 
 def inflated(data: bytes | memoryview, most: int, wbits: int) -> bytes:
-    """Return the bytes of a stream; of one with more than ``most`` bytes, the first ``most + 1``.
-
-    ``wbits``: :data:`ZLIB` or :data:`GZIP`.
-
-    Raises
-    ------
-    zlib.error
-        If the stream is damaged or cut off.
-    """
+    """Return at most ``most + 1`` bytes of a stream (:data:`ZLIB`, :data:`GZIP`); zlib.error if damaged or cut."""
     stream = zlib.decompressobj(wbits)
     out = stream.decompress(data, most + 1)
     if len(out) <= most and not stream.eof:

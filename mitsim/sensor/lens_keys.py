@@ -34,10 +34,8 @@ _MEANT = {
 def with_lenses(path: Path, table: dict[str, Any]) -> dict[str, Any]:
     """Return a sensor file's table with ``focal_px`` and ``principal_px`` in place of lenses in mm.
 
-    Raises
-    ------
-    InputError
-        If a focal length is not a length, has no pixel pitch, or stands beside ``focal_px``; or a key is a misnomer.
+    Raises InputError if a focal length is not a length, has no pixel pitch, or stands beside ``focal_px``; or a key is
+    a misnomer.
     """
     imager = table.get("imager")
     shared = imager.get("pixel_um") if isinstance(imager, dict) else None

@@ -80,21 +80,9 @@ def lens_model(
 ) -> str | None:
     """Return ``perspective`` or ``fisheye`` if a table states the lens model; None if it does not.
 
-    Parameters
-    ----------
-    table, where, model
-        Table of the calibration file, file that messages name, and model that the sensor file gives.
-    straight
-        Whether all coefficients are zero, so that the distortion model does not matter.
-
-    Raises
-    ------
-    InputError
-        If the model is none of OpenCV's, or contradicts ``model``.
-
-    See Also
-    --------
-    is_fisheye : whether coefficients are those of a fisheye lens
+    ``table``, ``where``, ``model``: table of the calibration file, file that messages name, and model that the sensor
+    file gives. ``straight``: whether all coefficients are zero, so that the distortion model does not matter. Raises
+    InputError if the model is none of OpenCV's, or contradicts ``model``.
     """
     stated = list(_stated(table, straight))
     for name, text, found in stated:
@@ -113,25 +101,9 @@ def lens_model(
 def of_single_numbers(value: Any, sources: str, fisheye: bool, where: str | Path) -> Any:
     """Return coefficients that stand as single numbers; k1 to k4 alone are those of a fisheye lens.
 
-    Parameters
-    ----------
-    value
-        The coefficients in the order of a perspective lens, or four of a fisheye lens.
-    sources
-        Their names in the file, with commas between them.
-    fisheye
-        Whether the lens is a fisheye.
-    where
-        The file, for messages.
-
-    Raises
-    ------
-    InputError
-        If k4 has no model.
-
-    See Also
-    --------
-    check_fourth : coefficients under names in any order
+    ``value``: the coefficients in the order of a perspective lens, or four of a fisheye lens. ``sources``: their names
+    in the file, with commas between them. ``fisheye``: whether the lens is a fisheye. ``where``: the file, for
+    messages. Raises InputError if k4 has no model.
     """
     names = [source.rpartition(".")[2].lower().replace("_", "") for source in sources.split(", ")]
     if len(value) != 8 or set(names) - set(_RATIONAL):  # two lists, or a model that is whole
@@ -145,23 +117,8 @@ def of_single_numbers(value: Any, sources: str, fisheye: bool, where: str | Path
 def check_fourth(names: Sequence[str], values: Sequence[float], fisheye: bool, where: str | Path) -> None:
     """Check that k4 is that of a fisheye lens, or that of OpenCV's rational lens, which has k5 and k6 too.
 
-    Parameters
-    ----------
-    names, values
-        The coefficients of a lens by name.
-    fisheye
-        Whether the lens is a fisheye.
-    where
-        The file, for messages.
-
-    Raises
-    ------
-    InputError
-        If it is neither: the same number means another camera in other programs.
-
-    See Also
-    --------
-    lens_model : the model that words state
+    ``names``, ``values``: the coefficients of a lens by name. ``fisheye``: whether the lens is a fisheye. ``where``:
+    the file, for messages. Raises InputError if it is neither: the same number means another camera in other programs.
     """
     named = dict(zip(names, values, strict=True))
     if fisheye or not named.get("k4") or {"k5", "k6"} & set(named):

@@ -122,19 +122,9 @@ def read_mat(file: Path, data: bytes, most: int, **options: bool) -> dict[str, A
 def check_mat(file: Path, data: bytes, most: int) -> bool:
     """Check the bytes of a file of level 5; return False for files of other levels, which pass unchecked.
 
-    Parameters
-    ----------
-    file
-        Path of the file, for messages.
-    data
-        Content of the file.
-    most
-        Largest number of values in the file.
-
-    Raises
-    ------
-    InputError
-        If an element has a type, size or place that the format does not allow, or is nested too deep.
+    ``file``: path of the file, for messages. ``data``: content of the file. ``most``: largest number of values in the
+    file. Raises InputError if an element has a type, size or place that the format does not allow, or is nested too
+    deep.
     """
     if len(data) < 128 or 0 in data[:4]:  # level 4 begins with a small number; other files SciPy refuses itself
         return False

@@ -107,20 +107,9 @@ def random_blobs(
 ) -> NDArray[np.float32]:
     """Return one pattern (height, width), values 0..1.
 
-    Parameters
-    ----------
-    width, height
-        Of the projector [px].
-    run_length_px, bright_share
-        Mean length of a bright or dark run along a row before the blur [projector px], and share of bright pixels [1].
-    blur_px
-        Standard deviation of the lens's point spread function [projector px].
-    seed
-        Selects the pattern.
-
-    See Also
-    --------
-    diffraction_spots : bright spots on a dark field
+    ``width``, ``height``: of the projector [px]. ``run_length_px``, ``bright_share``: mean length of a bright or dark
+    run along a row before the blur [projector px], and share of bright pixels [1]. ``blur_px``: standard deviation of
+    the lens's point spread function [projector px]. ``seed``: selects the pattern.
     """
     binary = _sharp_blobs(width, height, run_length_px, bright_share, seed)
     for axis in (0, 1) if blur_px > 0 else ():
@@ -143,20 +132,9 @@ def diffraction_spots(
 
     Cells are counted from the field's upper left corner.
 
-    Parameters
-    ----------
-    width, height
-        Of the field [projector px].
-    cell_px, places, spot_px
-        Side of a cell, number of positions of its spot along each axis, and standard deviation of the spot.
-    tiles
-        (across, down) tiles of whole cells in which the pattern repeats; the last tile ends at the field's edge.
-    seed
-        Selects the pattern.
-
-    See Also
-    --------
-    random_blobs : random dark and bright areas
+    ``width``, ``height``: of the field [projector px]. ``cell_px``, ``places``, ``spot_px``: side of a cell, number of
+    positions of its spot along each axis, and standard deviation of the spot. ``tiles``: (across, down) tiles of whole
+    cells in which the pattern repeats; the last tile ends at the field's edge. ``seed``: selects the pattern.
     """
     down, across = int(np.ceil(height / cell_px)), int(np.ceil(width / cell_px))
     tile = (int(np.ceil(down / tiles[1])), int(np.ceil(across / tiles[0])))

@@ -95,24 +95,9 @@ def described(pattern: Pattern | ProjectorImages) -> Pattern | ImagesDescription
 def checked_images(images: ArrayLike, width: int, height: int, where: str) -> ProjectorImages:
     """Return images as the pattern of a projector.
 
-    Parameters
-    ----------
-    images
-        (P, H, W), or (H, W) for one: uint8, uint16 or bool, or floats 0..1.
-    width, height
-        Of the projector [px].
-    where
-        What names the images in messages.
-
-    Raises
-    ------
-    InputError
-        If they have another size or type, are too many, or a value is not between 0 and 1.
-
-    See Also
-    --------
-    read_images : from a folder
-    allowed_images : what a sensor can decode
+    ``images``: (P, H, W), or (H, W) for one: uint8, uint16 or bool, or floats 0..1. ``width``, ``height``: of the
+    projector [px]. ``where``: what names the images in messages. Raises InputError if they have another size or type,
+    are too many, or a value is not between 0 and 1.
     """
     values = np.asarray(images)
     if values.ndim == 2:
@@ -140,23 +125,8 @@ def allowed_images(
 ) -> ProjectorImages:
     """Return images of the user's own, checked against what a sensor can project and decode.
 
-    Parameters
-    ----------
-    pattern
-        The images.
-    technology, matcher
-        Of the sensor.
-    where
-        What names the images in messages.
-
-    Raises
-    ------
-    InputError
-        If the technology has a pattern of its own, or the matcher takes one image only.
-
-    See Also
-    --------
-    checked_images : checks size and values
+    ``pattern``: the images. ``technology``, ``matcher``: of the sensor. ``where``: what names the images in messages.
+    Raises InputError if the technology has a pattern of its own, or the matcher takes one image only.
     """
     if technology == "time_of_flight":
         raise InputError(where, "pattern", f"images, for {technology}", "images for sensors that project a pattern")
@@ -169,13 +139,7 @@ def allowed_images(
 
 
 def read_images(folder: Path, width: int, height: int) -> ProjectorImages:
-    """Read the PNG files of a folder, in the order of the numbers in their names.
-
-    Raises
-    ------
-    InputError
-        If the folder is missing or has no PNG, or a file is damaged or differs in size or depth from the others.
-    """
+    """Read a folder's PNG files by the numbers in their names; InputError if none, damaged, or of unequal kinds."""
     if not folder.is_dir():
         raise InputError(folder, "", "no such folder", "a folder of PNG images, relative to the sensor file")
     paths = sorted((path for path in folder.iterdir() if path.suffix.lower() == ".png"), key=counted)

@@ -40,10 +40,7 @@ class PublishedNoise(Document):
 
 
 class PublishedAccuracy(Document):
-    """Accuracy of points or lengths that the maker states as one figure.
-
-    ``source`` and what exactly it states; ``sigma_mm``: one standard deviation.
-    """
+    """Points' or lengths' accuracy as one figure: ``source`` and what it states; ``sigma_mm``, one sigma."""
 
     source: str = Field(min_length=1, max_length=200)
     sigma_mm: Positive

@@ -143,10 +143,7 @@ class MisalignmentTable(Document):
 
 
 class Bracket(Document):
-    """Several exposures of every image, merged into one of a wider range.
-
-    ``count`` exposures, each ``factor`` times the one before; the rule's own exposure is in the middle.
-    """
+    """``count`` exposures merged into a wider range, each ``factor`` times the last, the rule's own in the middle."""
 
     count: int = Field(ge=2, le=7)
     factor: Annotated[float, Field(gt=1, le=64)]
@@ -301,13 +298,7 @@ _LIGHT = ("wavelength_nm", "working_range_mm", "projector.flux_w", "exposure.rul
 
 
 def needed_keys(table: dict[str, Any], purpose: Purpose) -> tuple[str, ...]:
-    """Return the keys that a purpose needs in a sensor file's table, beyond those that every file has.
-
-    Raises
-    ------
-    InputError
-        If there is no such purpose.
-    """
+    """Return the keys that a purpose needs in a sensor file beyond those of every file; InputError if unknown."""
     if purpose not in get_args(Purpose):
         raise InputError("sensor", "purpose", repr(purpose), ", ".join(get_args(Purpose)))
     technology, decoder = table.get("technology"), table.get("decoder")

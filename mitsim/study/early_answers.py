@@ -39,10 +39,7 @@ class StepTimes:
 
 
 class Answers:
-    """Answers before the end of a run: its folder and report, first after a minute and then as they improve.
-
-    ``plan`` has the longest time that one has taken so far as its ``page_s``.
-    """
+    """Answers before the end of a run, first after a minute; the longest so far is ``page_s`` of ``plan``."""
 
     def __init__(
         self,

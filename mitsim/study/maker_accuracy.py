@@ -41,14 +41,8 @@ def maker_sigma(sensor: Sensor, measurement: Measurement, distance_mm: float) ->
 def below_the_maker(rows: Sequence[tuple[str, float | None, float | None]], left_out: str, sensor: str) -> list[str]:
     """Return a sentence on measurements whose uncertainty is below a tenth of the maker's figure; none without any.
 
-    Parameters
-    ----------
-    rows
-        Name, standard uncertainty [mm] and figure of the maker [mm] of each measurement.
-    left_out
-        The influences that the statement does not contain, in words.
-    sensor
-        Name of the sensor.
+    ``rows``: name, standard uncertainty [mm] and figure of the maker [mm] of each measurement. ``left_out``: the
+    influences that the statement does not contain, in words. ``sensor``: name of the sensor.
     """
     below = [(name, u, sigma) for name, u, sigma in rows if u is not None and sigma is not None and u < SHARE * sigma]
     if not below:

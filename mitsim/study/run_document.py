@@ -13,10 +13,7 @@ from mitsim.study.virtual.race import ALL
 
 
 class MeasurementEntry(PartialDocument):
-    """Entry of a measurement in ``run.json``; ``kind`` and ``tolerance`` as in the task.
-
-    ``shapes`` are the faces whose points decide it, which are not the ``features`` of an edge or a rim.
-    """
+    """A measurement in ``run.json``, as in the task; its points lie on ``shapes``, not an edge's ``features``."""
 
     nominal: float
     unit: str

@@ -41,24 +41,9 @@ AGAIN = "run the study again: mitsim run STUDY.toml -o DIR"
 def claim_folder(folder: str | Path, command: str, digest: str) -> Path | None:
     """Reserve a folder for the results of a command, before it writes anything; remove its ``run.json``.
 
-    Parameters
-    ----------
-    folder
-        Folder of the run.
-    command
-        Command that writes: ``run``, ``score``, ``budget of view 3``.
-    digest
-        Digest of everything that decides the results.
-
-    Returns
-    -------
-    Path or None
-        New place of results of another command or digest; None if there were none.
-
-    Raises
-    ------
-    InputError
-        If they cannot be moved, or the folder cannot be written to.
+    ``folder``: folder of the run. ``command``: command that writes: ``run``, ``score``, ``budget of view 3``.
+    ``digest``: digest of everything that decides the results. Returns: new place of results of another command or
+    digest; None if there were none. Raises InputError if they cannot be moved, or the folder cannot be written to.
     """
     folder = Path(folder)
     mine = {"schema_version": 1, "command": command, "digest": digest, "mitsim": __version__}
@@ -87,13 +72,7 @@ def digests_of(folder: Path, names: Iterable[str]) -> dict[str, str]:
 
 
 def check_own(folder: Path, files: Mapping[str, str], names: Iterable[str]) -> None:
-    """Check that files of a run match the digests in its ``run.json``; older versions of ``run.json`` hold none.
-
-    Raises
-    ------
-    InputError
-        Naming the first file that another run has written, or that was changed or removed.
-    """
+    """Check files against their run's digests, which old runs lack; InputError names a changed or foreign file."""
     for name in names:
         if name not in files:
             continue

@@ -40,14 +40,9 @@ def draw_clouds(
 ) -> list[int]:
     """Write a predicted cloud of each of some views, and return the numbers of those written.
 
-    Parameters
-    ----------
-    session, performance_map
-        The study with its folder, and the map that the clouds are drawn from.
-    numbers
-        Of the views, the most important first.
-    limit
-        Time of all but the first, which is written in any case; none by default.
+    ``session``, ``performance_map``: the study with its folder, and the map that the clouds are drawn from.
+    ``numbers``: of the views, the most important first. ``limit``: time of all but the first, which is written in any
+    case; none by default.
     """
     study, predictor, drawn = session.study, session.predictor, list[int]()
     for number in track(numbers, "predict clouds"):
@@ -104,22 +99,13 @@ def write_record(
 
     The index of a capture has the digests of its other files.
 
-    Parameters
-    ----------
-    session
-        Session of the study, with the folder.
-    performance_map
-        Map that screened the views.
-    raced
-        Race of the promising views.
-    drawn
-        Numbers of the views with a predicted cloud.
-    shown
-        Numbers of the views with images and a decoded cloud.
-    stated
-        Whether the run has a statement.
-    more
-        Other entries, and other values of those that this function writes.
+    - ``session``: session of the study, with the folder.
+    - ``performance_map``: map that screened the views.
+    - ``raced``: race of the promising views.
+    - ``drawn``: numbers of the views with a predicted cloud.
+    - ``shown``: numbers of the views with images and a decoded cloud.
+    - ``stated``: whether the run has a statement.
+    - ``more``: other entries, and other values of those that this function writes.
     """
     study = session.study
     finishes = finishes_of_features(study)
@@ -175,16 +161,8 @@ def write_record(
 def complete_winner(session: Session, scores: xr.Dataset, raced: Raced, leaders: dict[str, int]) -> None:
     """Write everything of a run into the folder of a sensor that has its statement; ``run.json`` last.
 
-    Parameters
-    ----------
-    session
-        The sensor's, with the folder.
-    scores
-        Scores of all views by screening.
-    raced
-        Race of the promising views.
-    leaders
-        Best view of every measurement, and of all measurements.
+    ``session``: the sensor's, with the folder. ``scores``: scores of all views by screening. ``raced``: race of the
+    promising views. ``leaders``: best view of every measurement, and of all measurements.
     """
     folder, performance_map = session.folder, session.study.performance_map
     assert performance_map is not None  # sensors are screened with a map

@@ -72,10 +72,7 @@ def write_raced(session: Session, scores: xr.Dataset, raced: Raced) -> xr.Datase
 
 
 def with_race(scores: xr.Dataset, raced: Raced) -> xr.Dataset:
-    """Add ``measured_risk``, ``trials`` and ``final_rank`` (measurement, view) from the race.
-
-    Measured views come first, by their risk; the others follow in the order of screening.
-    """
+    """Add ``measured_risk``, ``trials`` and ``final_rank`` (measurement, view): by risk, the rest as screened."""
     names = [str(name) for name in scores["measurement"].values]
     indices = {int(view): index for index, view in enumerate(scores["view"].values)}
     shape = (len(names), scores.sizes["view"])
@@ -138,18 +135,11 @@ def set_within(
 ) -> ViewSet:
     """Return the fewest views that keep the limits according to the map.
 
-    Parameters
-    ----------
-    study
-        Its task, its table ``set`` and the middle of its part.
-    inputs
-        Expected input quantities of every view.
-    shares
-        (measurements,) of the task: stated over predicted standard uncertainty, from :func:`stated_shares`.
-    limits
-        Stated standard uncertainties by measurement, in its unit; so is the uncertainty of the set.
-    table
-        How the views are joined, and how long to search; by default as the study says.
+    - ``study``: its task, its table ``set`` and the middle of its part.
+    - ``inputs``: expected input quantities of every view.
+    - ``shares``: (measurements,) of the task: stated over predicted standard uncertainty, from :func:`stated_shares`.
+    - ``limits``: stated standard uncertainties by measurement, in its unit; so is the uncertainty of the set.
+    - ``table``: how the views are joined, and how long to search; by default as the study says.
     """
     table = table or study.file.set or SetTable()
     joining = SetJoining(

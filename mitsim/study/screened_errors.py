@@ -20,10 +20,7 @@ _NORMAL = norm.ppf((np.arange(400) + 0.5) / 400)
 
 
 def stated_shares(task: Task) -> Floats:
-    """Return the stated over the predicted standard uncertainty of every measurement, for errors of equal size.
-
-    Screening predicts the error of a nominal part; the statement of a zone is about a part at its limit.
-    """
+    """Return stated over predicted u of every measurement for equal errors; zones are stated at their limit."""
     folded = folded_values(task)
     return np.array([folded[name].far_share() if name in folded else 1.0 for name in task.measurements])
 

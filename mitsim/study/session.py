@@ -115,10 +115,7 @@ class Session:
 
     @cached_property
     def runner(self) -> RenderedMeasurements | MappedMeasurements | SpreadMeasurements:
-        """Return the maker of the trials: the measurements of this process, or workers that make the same.
-
-        Clouds that are drawn from a map are quicker in this process.
-        """
+        """Return the maker of the trials, workers or this process, which is quicker for clouds of a map."""
         if self.workers is None or self.renderer is None:
             return self.measurements
         return SpreadMeasurements(self.workers, self.renderer, self.digest)
@@ -177,16 +174,9 @@ class Session:
     ) -> Raced:
         """Race the views.
 
-        Parameters
-        ----------
-        scores
-            Of all views.
-        rules
-            By default those of the study.
-        limit
-            Time of the race; by default its rules alone end it.
-        after_round
-            Receives the state before the first trial, and after every round but the last.
+        ``scores``: of all views. ``rules``: by default those of the study. ``limit``: time of the race; by default its
+        rules alone end it. ``after_round``: receives the state before the first trial, and after every round but the
+        last.
         """
         rules = self.study.file.race if rules is None else rules
         limit = TimeLimit() if limit is None else limit
@@ -213,10 +203,7 @@ class Session:
         return self._exposures[view.number]
 
     def trials_of(self, view: View, limit: TimeLimit | None = None) -> TrialsOfView:
-        """Return what makes the trials of a statement of a view at its exposures, and where they are kept.
-
-        A plan of exposures may take half of the time within a ``limit``.
-        """
+        """Return the maker of a view's trials at its exposures, whose plan takes at most half of a ``limit``."""
         planned = self.exposures(view, None if limit is None else limit.part(_PLAN_SHARE))
         if planned is None:
             return TrialsOfView(self.runner, self.trials, None)

@@ -50,10 +50,7 @@ _REMEDIES_SHARE = 0.6
 
 @dataclass(frozen=True)
 class TimePlan:
-    """Planned seconds of the steps of a run.
-
-    ``page_s`` is what clouds and page of an earlier answer took, ``busy`` the wall time of a second of processor time.
-    """
+    """Planned seconds of a run's steps; ``page_s`` as measured, ``busy`` wall time of a second of processor time."""
 
     screening: float
     race: float
@@ -133,14 +130,8 @@ def busyness(elapsed_s: float) -> float:
 def time_plan(seconds: float, views: int, remedies: bool = False, sets: bool = False) -> TimePlan:
     """Return the plan of a command.
 
-    Parameters
-    ----------
-    seconds
-        Of the whole command.
-    views
-        Number of candidate views.
-    remedies, sets
-        Whether it looks for changes that would make measurements fit, and measures a set of views virtually.
+    ``seconds``: of the whole command. ``views``: number of candidate views. ``remedies``, ``sets``: whether it looks
+    for changes that would make measurements fit, and measures a set of views virtually.
     """
     report = min(max(_REPORT_SHARE * seconds, _REPORT_S[0]), _REPORT_S[1], seconds / 2)
     screening = min(SCREENING_S * views, _SCREENING_SHARE * seconds)

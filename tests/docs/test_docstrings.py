@@ -1,4 +1,7 @@
-"""Public functions of four or more arguments document each argument, and sections See Also name what exists.
+"""Shared functions of four or more arguments document each argument, and sections See Also name what exists.
+
+A function is shared if the interface promises it or another room uses its name; a room is ``mitsim.X`` or
+``characterisation.X``. Any section Parameters is complete.
 
 Constants of modules and classes stand on a line each, so that each has a comment of its own. griffe reads signatures
 and numpydoc sections from the source, as it does for the site.
@@ -12,9 +15,12 @@ from pathlib import Path
 import griffe
 import pytest
 
+import characterisation
+import mitsim
+
 ROOT = Path(__file__).parents[2]
 
-#: least number of arguments, without self, of a function that must have a section Parameters. Any section is complete
+#: least number of arguments, without self, of a shared function that must have a section Parameters
 LEAST = 4
 
 #: the commands: their options are documented by ``--help``
@@ -55,10 +61,41 @@ def names_of(function: griffe.Function) -> dict[str, list[str]]:
     return out
 
 
-def fault(names: list[str], documented: list[str] | None) -> str:
+def names_used(source: str) -> set[str]:
+    """Return all names that a module reads, imports or takes from an object."""
+    nodes = list(ast.walk(ast.parse(source)))
+    return {one.id for one in nodes if isinstance(one, ast.Name)} | {
+        one.attr if isinstance(one, ast.Attribute) else one.name
+        for one in nodes
+        if isinstance(one, ast.Attribute | ast.alias)
+    }
+
+
+@pytest.fixture(scope="module")
+def users() -> dict[str, set[str]]:
+    """The rooms that use each name."""
+    out: dict[str, set[str]] = {}
+    for path in (path for top in ("mitsim", "characterisation") for path in (ROOT / top).rglob("*.py")):
+        for name in names_used(path.read_text(encoding="utf-8")):
+            out.setdefault(name, set()).add(room(path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".")))
+    return out
+
+
+def room(path: str) -> str:
+    return ".".join(path.split(".")[:2])
+
+
+def shared(function: griffe.Function, users: dict[str, set[str]]) -> bool:
+    """Return whether a function, or the class of a method, is promised, or another room uses its name."""
+    promised = {*mitsim.__all__, *characterisation.__all__}
+    names = {function.name, function.parent.name} if function.parent.is_class else {function.name}
+    return bool(names & promised) or bool(users.get(function.name, set()) - {room(function.path)})
+
+
+def fault(names: list[str], documented: list[str] | None, needed: bool = True) -> str:
     """Return the difference of a section Parameters from the signature, "" for none."""
     if documented is None:
-        return f"no section Parameters, {len(names)} arguments" if len(names) >= LEAST else ""
+        return f"no section Parameters, {len(names)} arguments" if needed and len(names) >= LEAST else ""
     missing = [name for name in names if name not in documented]
     unknown = [name for name in documented if name not in names]
     parts = [f"not documented: {', '.join(missing)}"] * bool(missing)
@@ -66,10 +103,12 @@ def fault(names: list[str], documented: list[str] | None) -> str:
     return "; ".join(parts)
 
 
-def test_parameters_are_those_of_the_signature(package):
+def test_parameters_are_those_of_the_signature(package, users):
     every = list(functions(package))
-    assert any(len(arguments(function)) >= LEAST for function in every)
-    found = [(one.path, fault(arguments(one), names_of(one).get("Parameters"))) for one in every]
+    needed = {one.path for one in every if shared(one, users)}
+    assert any(len(arguments(one)) >= LEAST for one in every if one.path in needed)
+    documented = {one.path: names_of(one).get("Parameters") for one in every}
+    found = [(one.path, fault(arguments(one), documented[one.path], one.path in needed)) for one in every]
     faults = [f"{path}: {words}" for path, words in found if words]
     assert not faults, "\n" + "\n".join(faults)
 
@@ -112,6 +151,16 @@ def test_faults_are_found(signature, documented, expected):
     module = griffe.visit("example", Path("example.py"), f'def one({signature}):\n    """{docstring}"""\n')
     one = module["one"]
     assert fault(arguments(one), names_of(one).get("Parameters")) == expected
+
+
+@pytest.mark.parametrize(
+    ("user", "needed"),
+    [("from package.one import f", True), ("from package import one\n\none.f()", True), ("def f(): ...", False)],
+)
+def test_functions_of_other_rooms_are_shared(user, needed):
+    module = griffe.visit("package.one", Path("one.py"), "def f(a, b, c, d): ...")
+    assert shared(module["f"], {name: {"package.two"} for name in names_used(user)}) == needed
+    assert not shared(module["f"], {name: {"package.one"} for name in names_used(user)})
 
 
 def packed_constants(source: str) -> list[str]:

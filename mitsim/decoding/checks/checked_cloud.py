@@ -36,10 +36,7 @@ from mitsim.sensor.sensor import Sensor
 
 @dataclass(frozen=True)
 class CheckedCloud:
-    """A decoded ``cloud``; ``warnings`` about its capture, and ``notes`` on its rows and its sigma: one sentence each.
-
-    The warnings that the capture's settings already have come first.
-    """
+    """A ``cloud``; ``warnings``, the capture settings' first, and ``notes`` on rows and sigma, one sentence each."""
 
     cloud: PointCloud
     warnings: tuple[str, ...]

@@ -23,18 +23,14 @@ _LINES = 48
 
 @dataclass(frozen=True)
 class CodeLines:
-    """Some lines of the images of one camera; ``dataclasses.replace`` gives them another code or other settings.
+    """Some lines of the images of one camera; ``dataclasses.replace`` gives them another code or other settings."""
 
-    - ``lines``: images (P, n, W) of rows, and (P, H, m) of columns [DN].
-    - ``code``, and ``size`` (width, height) of the projector [px].
-    - ``settings``: limits of the decoder; ``full_scale``: value of a saturated pixel [DN].
-    """
-
-    lines: tuple[Levels, Levels]
+    lines: tuple[Levels, Levels]  # images (P, n, W) of rows, and (P, H, m) of columns [DN]
+    #: ``code``, and ``size`` (width, height) of the projector [px]
     code: LightCode
     size: tuple[int, int]
-    settings: DecoderSettings
-    full_scale: float
+    settings: DecoderSettings  # limits of the decoder
+    full_scale: float  # value of a saturated pixel [DN]
 
     @cached_property
     def image_roles(self) -> list[Role]:

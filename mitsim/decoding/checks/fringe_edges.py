@@ -28,20 +28,14 @@ _BY_ONE = 0.75
 
 @dataclass(frozen=True)
 class StripeEdges:
-    """Fringes at the edges of Gray stripes along one axis.
+    """Fringes at the edges of Gray stripes along one axis."""
 
-    - ``by_one``: share of the changes of the stripe's number that are by one [1]; NaN if there are few.
-    - ``position`` (n,) of the edges from the projector's edge [projector px].
-    - ``cycles`` (periods, n): phase there [cycles].
-    - ``rising``: share of the steps of the phases that rise with the stripe's number [1].
-    - ``rates`` (periods,): change of the phase from edge to edge, over that of the position, and their standard errors
-      [cycles/px]; NaN if there are few edges.
-    """
-
-    by_one: float
-    position: Floats
-    cycles: Floats
-    rising: float
+    by_one: float  # share of the changes of the stripe's number that are by one [1]; NaN if there are few
+    position: Floats  # (n,) of the edges from the projector's edge [projector px]
+    cycles: Floats  # (periods, n) phase there [cycles]
+    rising: float  # share of the steps of the phases that rise with the stripe's number [1]
+    #: (periods,) change of the phase from edge to edge, over that of the position, and their standard errors
+    #: [cycles/px]; NaN if there are few edges
     rates: tuple[Floats, Floats]
 
     @property

@@ -115,10 +115,7 @@ CHANGES = sorted(
 
 
 def origin_in_words(edges: StripeEdges, images: CodeLines, axis: Axis) -> str:
-    """Return a warning if fringes and Gray code of an axis do not count from one origin, or not in one direction.
-
-    "" if they agree, or the edges do not tell.
-    """
+    """Warn if fringes and Gray code of an axis do not count from one origin, or not in one direction; "" if unknown."""
     code, image_roles = images.code, images.image_roles
     every = described(code, image_roles, axis)
     if not edges.bits_fit or edges.cycles.shape[1] < ENOUGH:
@@ -204,10 +201,7 @@ def described(code: LightCode, image_roles: list[Role], axis: Axis) -> list[Desc
 
 @dataclass(frozen=True)
 class PhaseDeviation:
-    """Phase at the edges less that of their coordinate.
-
-    ``cycles``: circular mean [cycles]. ``length`` of the mean of the unit vectors [1].
-    """
+    """Phase at the edges less that of their coordinate: mean ``cycles``, ``length`` of the mean unit vector [1]."""
 
     cycles: float
     length: float

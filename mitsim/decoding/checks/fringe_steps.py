@@ -76,10 +76,7 @@ def _periods(lines: CodeLines, axis: Axis) -> Iterator[tuple[list[int], Floats, 
 
 
 def contradiction(images: Floats, shifts: Floats) -> float:
-    """Return how far images of one period contradict the shifts of their steps, relative to the modulation; 0 to 1.
-
-    ``images`` (N, n) are of n pixels [DN], ``shifts`` (N,) the delta of each image [rad].
-    """
+    """Return how far images (N, n) [DN] of a period contradict their shifts (N,) [rad], over the modulation; 0 to 1."""
     model = np.stack([np.ones(len(shifts)), np.cos(shifts), np.sin(shifts)], axis=1)
     left, singular, _ = np.linalg.svd(model)
     rank = int((singular > 1e-6 * singular[0]).sum())

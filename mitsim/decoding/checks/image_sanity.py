@@ -284,10 +284,7 @@ def _unresolved(stack: Levels, image_roles: list[Role], axis: Axis, settings: De
 def _with_bits_in_place(
     orders: Iterable[tuple[str, list[int]]], image_roles: list[Role], axis: Axis
 ) -> list[tuple[str, list[int]]]:
-    """Return the orders that leave the Gray bits of an axis in place.
-
-    If the bits alone are in the right order, another order of them can only make fringes agree with wrong stripes.
-    """
+    """Return the orders with the Gray bits of an axis in place: others only make fringes agree with wrong stripes."""
     bits = [i for i, role in enumerate(image_roles) if role.axis == axis and role.kind in ("gray", "gray_inverse")]
     return [(name, order) for name, order in orders if all(order[i] == i for i in bits)]
 

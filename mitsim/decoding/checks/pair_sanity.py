@@ -92,10 +92,7 @@ def pair_findings(images: CodedImages, rig: Rig, geometry: StereoGeometry) -> Fi
 
 
 def plain_pair_warning(images: tuple[Floats, Floats], rig: Rig, geometry: StereoGeometry) -> str:
-    """Return a warning if two images (H, W) [DN] without a code contradict the calibration of their cameras, or "".
-
-    ``geometry`` is that of the rectified pair of the calibration ``rig``.
-    """
+    """Warn if two images (H, W) [DN] without a code contradict their calibration; ``geometry`` of that ``rig``."""
     names = " and ".join(list(rig.cameras)[:2])
     if images[0].shape == images[1].shape and np.array_equal(*images):
         return f"the images of {names} are the same: one is a copy of the other"
@@ -114,10 +111,7 @@ def plain_pair_warning(images: tuple[Floats, Floats], rig: Rig, geometry: Stereo
 def _texture_contradiction(
     textures: tuple[Floats, Floats], columns: tuple[Floats, Floats], rig: Rig, geometry: StereoGeometry
 ) -> tuple[str, bool]:
-    """Describe how texture matched over all rows contradicts the calibration, and whether the other order fits.
-
-    "" if the texture agrees, or does not suffice.
-    """
+    """Describe how texture in all rows contradicts the calibration, "" if it does not; whether the other order fits."""
     pixels = texture_matches(textures, columns)
     if len(pixels[0]) < LEAST_PAIRS:
         return "", False
@@ -250,10 +244,7 @@ def _row_by_code(
     lines: NDArray[np.intp],
     right_columns: Floats,
 ) -> tuple[Floats, float]:
-    """Return the row error [px] of the right image at each match, and projector rows per pixel.
-
-    The error is the projector row of the left image less that of the right, over their slope.
-    """
+    """Return the right image's row error [px], left less right row over slope, and projector rows per pixel."""
     row, column = np.nonzero(np.isfinite(right_columns))
     at = right_columns[row, column]
     mine = geometry.map_left[:, lines[row], column]

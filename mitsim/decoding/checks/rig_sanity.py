@@ -52,10 +52,7 @@ def baseline_warning(rig: Rig, code: LightCode) -> str:
 
 
 def camera_warnings(decoded: Mapping[Axis, ProjectorCoordinate], rig: Rig, settings: DecoderSettings) -> list[str]:
-    """Return warnings about one camera and a projector: rays that miss their light, or meet it behind the camera.
-
-    ``decoded``: coordinates (H, W) that the camera sees.
-    """
+    """Warn of rays that miss their light, or meet it behind the camera; ``decoded`` coordinates are (H, W)."""
     eye, projector = rig.reference, rig.projector
     if projector is None or not decoded:
         return []
@@ -95,10 +92,7 @@ def camera_warnings(decoded: Mapping[Axis, ProjectorCoordinate], rig: Rig, setti
 
 
 def _other_place(eye: Camera, projector: Camera, rays: Floats, coordinates: dict[Axis, Floats]) -> str:
-    """Return another reading of R and T with which nearly all rays meet their light in front of the camera.
-
-    Only codes of both axes reveal it: with one axis nearly every reading gives depths.
-    """
+    """Return another R and T with which nearly all rays meet their light; only codes of both axes reveal it."""
     if len(coordinates) < 2:
         return ""
     camera_from_projector = eye.sensor_from_camera.inverse() @ projector.sensor_from_camera
@@ -166,14 +160,8 @@ def meet_light_planes(eye: Camera, projector: Camera, rays: Floats, value: Float
 
     Negative behind the camera, infinite or NaN for a ray along its plane.
 
-    Parameters
-    ----------
-    eye, projector
-        Camera and projector of a rig.
-    rays
-        (n, 3) unit directions from the camera, in the sensor frame.
-    value, axis
-        (n,) columns or rows [projector px].
+    ``eye``, ``projector``: camera and projector of a rig. ``rays``: (n, 3) unit directions from the camera, in the
+    sensor frame. ``value``, ``axis``: (n,) columns or rows [projector px].
     """
     last = (projector.height if axis == "columns" else projector.width) - 1.0
     ends = [np.full_like(value, end) for end in (0.0, last)]

@@ -42,16 +42,9 @@ def with_warnings(capture: Capture) -> Capture:
 def code_findings(images: CodedImages, rig: Rig, recorded: bool, geometry: StereoGeometry | None = None) -> Findings:
     """Check coded images and the calibration of their rig; the calibration only if the images match their code.
 
-    Parameters
-    ----------
-    images
-        The images, decoded once.
-    rig
-        Calibration of their cameras and projector.
-    recorded
-        Whether to check the origin of the code: a simulation has the pattern that its file states.
-    geometry
-        Of two cameras that triangulate, if it is prepared already.
+    ``images``: the images, decoded once. ``rig``: calibration of their cameras and projector. ``recorded``: whether to
+    check the origin of the code: a simulation has the pattern that its file states. ``geometry``: of two cameras that
+    triangulate, if it is prepared already.
     """
     try:
         coordinates = images.coordinates
@@ -77,10 +70,7 @@ def code_findings(images: CodedImages, rig: Rig, recorded: bool, geometry: Stere
 
 
 def pair_row_error(capture: Capture, cloud: PointCloud, geometry: StereoGeometry | None = None) -> float:
-    """Return the row error [px] of the right image of a matched pair, by its own texture; NaN if unknown.
-
-    ``geometry`` of the pair, if it is prepared already.
-    """
+    """Return the row error [px] of the right image of a matched pair, by its texture; NaN if unknown."""
     if capture.technology != "active_stereo" or len(capture.images) < 2:
         return float("nan")
     left, right = (stack[0] for stack in list(capture.images.values())[:2])
@@ -88,10 +78,7 @@ def pair_row_error(capture: Capture, cloud: PointCloud, geometry: StereoGeometry
 
 
 def pair_contradiction(capture: Capture, geometry: StereoGeometry | None = None) -> str:
-    """Return a warning if the images of a recorded pair contradict its calibration, or ""; see :func:`pair_row_error`.
-
-    ``geometry`` of the pair, if it is prepared already.
-    """
+    """Warn if the images of a recorded pair contradict its calibration, else ""; see :func:`pair_row_error`."""
     if capture.technology != "active_stereo" or capture.source != "device" or len(capture.images) < 2:
         return ""
     left, right = (np.asarray(stack[0], float) for stack in list(capture.images.values())[:2])
@@ -99,19 +86,7 @@ def pair_contradiction(capture: Capture, geometry: StereoGeometry | None = None)
 
 
 def row_error_in_words(capture: Capture, settings: Settings, findings: Findings, matched: float) -> str:
-    """Describe the row error of the second camera, or that it is unknown; "" if only one camera measures.
-
-    Parameters
-    ----------
-    capture, settings, findings
-        Capture that is decoded, settings of its decoder, and findings of the checks.
-    matched
-        Row error of a pair decoded by a matcher, from :func:`pair_row_error` [px].
-
-    See Also
-    --------
-    pair_row_error : the number
-    """
+    """Describe the row error of the second camera, ``matched`` [px] without a code; "" if only one camera measures."""
     if np.isfinite(matched):
         return f"row error of the second camera: {matched:+.2f} px"
     if np.isfinite(findings.row_error):

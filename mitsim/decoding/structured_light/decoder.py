@@ -60,30 +60,15 @@ def decode_coordinates(  # noqa: PLR0913 - options, all by name
 
     Along each axis, the images are those of Gray bits, of fringes, or of both; the roles of the images tell which.
 
-    Parameters
-    ----------
-    stack
-        (P, H, W) raw images [DN] of one camera, in the order of :func:`mitsim.sensor.light_code.roles`.
-    code, settings
-        The code, and the limits of the decoder.
-    size, full_scale
-        Width and height of the projector [px], and value of a saturated pixel [DN].
-    imager
-        The imager, or measured noise, from which the expected noise follows; None if neither is known.
-    interpolate
-        For a Gray code without fringes: interpolate columns along rows between the edges of their stripes, instead of
-        taking the stripes' centres.
-    only
-        The axis to decode; None for all of the code.
+    - ``stack``: (P, H, W) raw images [DN] of one camera, in the order of :func:`mitsim.sensor.light_code.roles`.
+    - ``code``, ``settings``: the code, and the limits of the decoder.
+    - ``size``, ``full_scale``: width and height of the projector [px], and value of a saturated pixel [DN].
+    - ``imager``: the imager, or measured noise, from which the expected noise follows; None if neither is known.
+    - ``interpolate``: for a Gray code without fringes: interpolate columns along rows between the edges of their
+      stripes, instead of taking the stripes' centres.
+    - ``only``: the axis to decode; None for all of the code.
 
-    Raises
-    ------
-    InputError
-        If the stack does not fit the code, or the code is ambiguous over the projector.
-
-    See Also
-    --------
-    triangulate_coordinate : the points of the coordinates
+    Raises InputError if the stack does not fit the code, or the code is ambiguous over the projector.
     """
     image_roles = roles(code, *size)
     check_stack(stack, image_roles)
@@ -142,41 +127,20 @@ def decode_structured_light(
     context: ImageContext,
     decoded_before: Mapping[Axis, ProjectorCoordinate] | None = None,
 ) -> PointCloud:
-    """Decode the images of one camera.
+    """Decode the images of one camera to a cloud on its own pixels, sensor frame [mm].
 
-    Parameters
-    ----------
-    stack
-        (P, H, W) raw images [DN], uint8, uint16 or floats, in the order of :func:`mitsim.sensor.light_code.roles`.
-    geometry
-        From :func:`structured_light_geometry`.
-    code, settings
-        The code of the images, and range and limits.
-    context
-        Of the images. Its ``roi`` is a region of the image; ``read_out`` is not used.
-    decoded_before
-        Coordinates (H, W) of the whole images, from :func:`decode_coordinates` with the same settings. None if the
-        images are not decoded yet.
+    ``sigma`` [mm] along the view ray is known if the imager or the width of a stripe determines it. Status, in addition
+    to that of the code:
 
-    Returns
-    -------
-    PointCloud
-        On the camera's own pixels, points in the sensor frame [mm]. ``sigma`` [mm] along the view ray, if the imager or
-        the width of a stripe determines it. Status, in addition to that of the code:
+    - ``OUT_OF_RANGE``: the pixel is decoded, but its depth is not between near and far.
+    - ``NO_SURFACE``: the pixel shows no code, and the projector does not reach its ray.
+    - ``LOW_MODULATION``: the pixel shows no code. Shadow cannot be distinguished from a dark surface.
+    - ``UNCALIBRATED``: the lens distortion gives the pixel no unique ray, or no unique depth on it.
 
-        - ``OUT_OF_RANGE``: the pixel is decoded, but its depth is not between near and far.
-        - ``NO_SURFACE``: the pixel shows no code, and the projector does not reach its ray.
-        - ``LOW_MODULATION``: the pixel shows no code. Shadow cannot be distinguished from a dark surface.
-        - ``UNCALIBRATED``: the lens distortion gives the pixel no unique ray, or no unique depth on it.
-
-    Raises
-    ------
-    InputError
-        If the images do not fit code and calibration, or the region of interest does not lie in them.
-
-    See Also
-    --------
-    mitsim.decoding.structured_light.two_cameras.decode_structured_light_stereo : two cameras
+    ``stack``: (P, H, W) raw images [DN] in the order of :func:`mitsim.sensor.light_code.roles`. ``context``: its
+    ``roi`` is a region of the image; ``read_out`` is not used. ``decoded_before``: (H, W) from
+    :func:`decode_coordinates` with the same settings. Raises InputError if the images do not fit code and calibration,
+    or the ``roi`` does not lie in them.
     """
     if geometry.axis not in axes(code):
         raise InputError("structured-light geometry", "", f"code along {', '.join(axes(code))}", geometry.axis)

@@ -62,33 +62,25 @@ MINIMUM_CHANGE_PX = 0.5
 
 @dataclass(frozen=True)
 class StructuredLightGeometry:
-    """Geometry of a camera and a projector, computed once.
+    """Geometry of a camera and a projector, computed once."""
 
-    - ``camera_name``, ``camera``, ``projector``: the camera of the rig, and the projector.
-    - ``axis``: axis of the coordinate.
-    - ``near``, ``far``: range of depths along the camera's axis [mm].
-    - ``ray``: (H, W, 3) view ray of each raw pixel in the sensor frame, scaled to a depth of 1.
-    - ``nodes``: (K, H, W) coordinates u_k [projector px], which include both ends of the range.
-    - ``differences``: (K, H, W) divided differences of w(u) [1/mm/px^k].
-    - ``seen``: (H, W) whether the projector reaches the ray between near and far, and its coordinate determines the
-      depth.
-    - ``undetermined``: (H, W) whether the lens distortion gives the pixel no ray, or several depths for one coordinate.
-    - ``exact``: whether the polynomial is only the start of :func:`exact_inverse_depth`.
-    - ``grid``, ``baseline``: pixels of the cloud, and unit vector (3,) from the camera to the projector.
-    """
-
+    #: ``camera_name``, ``camera``, ``projector``: the camera of the rig, and the projector
     camera_name: str
     camera: Camera
     projector: Camera
-    axis: Axis
+    axis: Axis  # axis of the coordinate
+    #: ``near``, ``far``: range of depths along the camera's axis [mm]
     near: float
     far: float
-    ray: Floats
-    nodes: Floats
-    differences: Floats
+    ray: Floats  # (H, W, 3) view ray of each raw pixel in the sensor frame, scaled to a depth of 1
+    nodes: Floats  # (K, H, W) coordinates u_k [projector px], which include both ends of the range
+    differences: Floats  # (K, H, W) divided differences of w(u) [1/mm/px^k]
+    #: (H, W) whether the projector reaches the ray between near and far, and its coordinate determines the depth
     seen: NDArray[np.bool_]
+    #: (H, W) whether the lens distortion gives the pixel no ray, or several depths for one coordinate
     undetermined: NDArray[np.bool_]
-    exact: bool
+    exact: bool  # whether the polynomial is only the start of :func:`exact_inverse_depth`
+    #: ``grid``, ``baseline``: pixels of the cloud, and unit vector (3,) from the camera to the projector
     grid: ViewGrid
     baseline: Floats
 
@@ -101,19 +93,9 @@ def structured_light_geometry(
     If the code has both axes, points are triangulated along the axis with the larger separation of projector and
     camera.
 
-    Parameters
-    ----------
-    rig, camera_name
-        The rig, and the name of the camera in it.
-    code
-        The code, which determines the axis, or the axis itself.
-    near_mm, far_mm
-        Range of depths along the camera's axis [mm].
-
-    Raises
-    ------
-    InputError
-        If the rig has no projector, or the code's coordinate changes with depth at no pixel.
+    ``rig``, ``camera_name``: the rig, and the name of the camera in it. ``code``: the code, which determines the axis,
+    or the axis itself. ``near_mm``, ``far_mm``: range of depths along the camera's axis [mm]. Raises InputError if the
+    rig has no projector, or the code's coordinate changes with depth at no pixel.
     """
     if rig.projector is None:
         raise InputError("rig", "projector", "none", "a calibrated projector, for structured light of one camera")
@@ -225,8 +207,7 @@ def camera_grid(camera: Camera, local: Floats | None = None) -> ViewGrid:
 def _depth_limits(camera: Camera, projector: Camera, ray: Floats, near: float, far: float) -> tuple[Floats, Floats]:
     """Return the inverse depths (H, W) between which each ray is in range and in the projector's field.
 
-    A point at inverse depth w is proportional to ray + w (camera - projector). Each side of the field is a plane
-    through the projector's centre, and thus an inequality that is linear in w.
+    A point at inverse depth w is along ray + w (camera - projector): each side of the field is linear in w.
     """
     columns = np.concatenate([np.linspace(-0.5, projector.width - 0.5, 33)] * 2 + [np.full(33, -0.5)] * 2)
     columns[-33:] = projector.width - 0.5
@@ -300,16 +281,8 @@ def exact_inverse_depth(
 
     NaN where the exact projection does not reach ``u`` to :data:`MAXIMUM_ERROR_PX`.
 
-    Parameters
-    ----------
-    geometry
-        Camera, projector and axis of the code.
-    ray
-        (n, 3) from the camera's centre, sensor frame; the point is ``ray / w`` from it.
-    start
-        (n,) first w [1/mm].
-    u
-        (n,) coordinates [projector px].
+    ``geometry``: camera, projector and axis of the code. ``ray``: (n, 3) from the camera's centre, sensor frame; the
+    point is ``ray / w`` from it. ``start``: (n,) first w [1/mm]. ``u``: (n,) coordinates [projector px].
     """
     component = 0 if geometry.axis == "columns" else 1
 

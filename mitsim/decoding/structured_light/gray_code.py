@@ -85,16 +85,9 @@ def decode_stripes(
 ) -> DecodedStripes:
     """Decode the Gray bits of one axis.
 
-    Parameters
-    ----------
-    stack, image_roles
-        (P, H, W) images [DN] and their roles.
-    axis
-        Axis of the bits.
-    bit_share
-        A bit is undecided if its two levels differ by less than this share of white minus black.
-    middle_contrast
-        Threshold, and white minus black, (H, W) [DN]; needed if the stack has neither inverse nor white and black.
+    ``stack``, ``image_roles``: (P, H, W) images [DN] and their roles. ``axis``: axis of the bits. ``bit_share``: a bit
+    is undecided if its two levels differ by less than this share of white minus black. ``middle_contrast``: threshold,
+    and white minus black, (H, W) [DN]; needed if the stack has neither inverse nor white and black.
     """
     image_of = {(role.kind, role.axis, role.index): image for role, image in zip(image_roles, stack, strict=True)}
     bits = sorted(role.index for role in image_roles if role.kind == "gray" and role.axis == axis)
@@ -145,16 +138,12 @@ def decode_gray_code(
 ) -> ProjectorCoordinate:
     """Return the projector coordinate of a Gray code of one axis. Stripes beyond the projector are rejected.
 
-    Parameters
-    ----------
-    images, image_roles
-        (P, H, W) images [DN] and their roles.
-    coded, settings
-        The code, and limits of the decoder.
-    full_scale, saturated
-        Value of a saturated pixel [DN], and (H, W) whether the pixel is saturated in any image of the code.
-    interpolate
-        Whether columns are interpolated between the edges of their stripes, instead of the stripes' centres.
+    - ``images``, ``image_roles``: (P, H, W) images [DN] and their roles.
+    - ``coded``, ``settings``: the code, and limits of the decoder.
+    - ``full_scale``, ``saturated``: value of a saturated pixel [DN], and (H, W) whether the pixel is saturated in any
+      image of the code.
+    - ``interpolate``: whether columns are interpolated between the edges of their stripes, instead of the stripes'
+      centres.
     """
     decoded = decode_stripes(images, image_roles, coded.axis, settings.bit_share)
     coordinate = _stripe_coordinate(decoded, coded, saturated, settings.minimum_modulation_dn * full_scale / 255)
@@ -220,21 +209,11 @@ def decode_gray_fringes(
     half-way between them, 3/8 period, the phase contradicts the Gray code. Where a stripe is as wide as a fringe, they
     cannot contradict each other.
 
-    Parameters
-    ----------
-    stack, image_roles
-        (P, H, W) raw images [DN] of one camera and their roles. Images of the other axis are ignored. The fringes come
-        period after period, the longest first.
-    coded_axis, fringes
-        Axis and stripes of the Gray code, and periods and shifts of the fringes.
-    settings, full_scale
-        Limits of the decoder, and value of a saturated pixel [DN].
-    imager
-        As for :func:`mitsim.decoding.structured_light.phase_shift.decode_phase_shift`.
-
-    See Also
-    --------
-    mitsim.decoding.structured_light.phase_shift.decode_fringes : fringes alone
+    - ``stack``, ``image_roles``: (P, H, W) raw images [DN] of one camera and their roles. Images of the other axis are
+      ignored. The fringes come period after period, the longest first.
+    - ``coded_axis``, ``fringes``: axis and stripes of the Gray code, and periods and shifts of the fringes.
+    - ``settings``, ``full_scale``: limits of the decoder, and value of a saturated pixel [DN].
+    - ``imager``: as for :func:`mitsim.decoding.structured_light.phase_shift.decode_phase_shift`.
     """
     axis, extent, stripe = coded_axis.axis, coded_axis.extent, coded_axis.stripe
     used = [index for index, role in enumerate(image_roles) if role.kind == "phase" and role.axis == axis]

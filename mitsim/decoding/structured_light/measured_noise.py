@@ -122,10 +122,7 @@ def _variance(squares: Floats) -> float:
 
 
 def _without_harmonics(residuals: Floats, phase: Floats, modulation: Floats) -> Floats:
-    """Return residuals (m, n) [DN] without their part that is a function of a phase times its modulation.
-
-    ``phase`` (k, n) [rad] and ``modulation`` (k, n) [DN] of k periods.
-    """
+    """Return residuals (m, n) [DN] without functions of the phases (k, n) [rad] times their modulations (k, n) [DN]."""
     # the constant terms have one amplitude: shot noise changes an offset with the modulation of its own period, and a
     # difference of modulations would describe it
     common = modulation.mean(axis=0)

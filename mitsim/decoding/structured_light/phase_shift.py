@@ -42,16 +42,11 @@ _VECTOR = 64
 
 @dataclass(frozen=True)
 class Phases:
-    """Fitted parameters of the fringes, float32.
+    """Fitted parameters of the fringes, float32."""
 
-    - ``phase``: (n, H, W) [rad] of each period, 0 to 2 pi.
-    - ``modulation``: (n, H, W) amplitude B [DN].
-    - ``offset``: (H, W) level A [DN], the mean over all periods.
-    """
-
-    phase: NDArray[np.float32]
-    modulation: NDArray[np.float32]
-    offset: NDArray[np.float32]
+    phase: NDArray[np.float32]  # (n, H, W) [rad] of each period, 0 to 2 pi
+    modulation: NDArray[np.float32]  # (n, H, W) amplitude B [DN]
+    offset: NDArray[np.float32]  # (H, W) level A [DN], the mean over all periods
 
 
 def fit_phases(stack: NDArray[np.generic], shifts: Sequence[NDArray[np.floating]]) -> Phases:
@@ -97,15 +92,11 @@ def fit_phases(stack: NDArray[np.generic], shifts: Sequence[NDArray[np.floating]
 
 @dataclass(frozen=True)
 class Fringes:
-    """Fringes along one axis.
+    """Fringes along one axis."""
 
-    - ``periods``: decreasing [px].
-    - ``shifts``: shifts delta [rad] of the images of each period.
-    - ``mean``, ``contrast``: of the projected cosine [1].
-    """
-
-    periods: tuple[float, ...]
-    shifts: tuple[NDArray[np.floating], ...]
+    periods: tuple[float, ...]  # decreasing [px]
+    shifts: tuple[NDArray[np.floating], ...]  # shifts delta [rad] of the images of each period
+    #: ``mean``, ``contrast``: of the projected cosine [1]
     mean: float
     contrast: float
 
@@ -134,30 +125,17 @@ def decode_fringes(
 ) -> ProjectorCoordinate:
     """Decode fringes with any shifts.
 
-    Parameters
-    ----------
-    stack
-        (P, H, W) images [DN], period after period.
-    fringes
-        Periods and shifts.
-    extent, settings
-        Number of projector pixels along the axis, and the limits of the decoder.
-    full_scale
-        Value of a saturated pixel [DN]; a pixel that has it in any image is rejected.
-    imager
-        The imager, or measured noise, from which the expected noise follows. If it is None, ``sigma`` is NaN. Phases of
-        different periods are then compared by quantisation and ``systematic_rad`` alone.
-    white_black
-        Images (H, W) of a white and a black frame, from which gamma can be estimated with fewer than five steps.
+    - ``stack``: (P, H, W) images [DN], period after period.
+    - ``fringes``: periods and shifts.
+    - ``extent``, ``settings``: number of projector pixels along the axis, and the limits of the decoder.
+    - ``full_scale``: value of a saturated pixel [DN]; a pixel that has it in any image is rejected.
+    - ``imager``: the imager, or measured noise, from which the expected noise follows. If it is None, ``sigma`` is NaN.
+      Phases of different periods are then compared by quantisation and ``systematic_rad`` alone.
+    - ``white_black``: images (H, W) of a white and a black frame, from which gamma can be estimated with fewer than
+      five steps.
 
-    Raises
-    ------
-    InputError
-        If the fringes are ambiguous over the extent, or gamma has to be corrected from fewer than five steps.
-
-    See Also
-    --------
-    mitsim.decoding.structured_light.gray_code.decode_gray_fringes : with a Gray code
+    Raises InputError if the fringes are ambiguous over the extent, or gamma has to be corrected from fewer than five
+    steps.
     """
     path = unwrapping_path(fringes.periods, fringes.steps, extent)
     phases = fit_phases(stack, fringes.shifts)
@@ -190,27 +168,14 @@ def gamma_corrected(
 
     The estimate uses the second harmonic of the shortest period if that has five steps or more, else white and black.
 
-    Parameters
-    ----------
-    phases
-        Fitted fringes.
-    stack
-        (P, H, W) images of the fringes [DN], period after period.
-    fringes, minimum_modulation
-        Periods and shifts, and least modulation of the pixels that the estimate uses [DN].
-    full_scale
-        Value of a saturated pixel [DN]; the estimate uses none that has it in any image.
-    white_black
-        (H, W) images of full light and of no light [DN].
+    - ``phases``: fitted fringes.
+    - ``stack``: (P, H, W) images of the fringes [DN], period after period.
+    - ``fringes``, ``minimum_modulation``: periods and shifts, and least modulation of the pixels that the estimate uses
+      [DN].
+    - ``full_scale``: value of a saturated pixel [DN]; the estimate uses none that has it in any image.
+    - ``white_black``: (H, W) images of full light and of no light [DN].
 
-    Raises
-    ------
-    InputError
-        If both are missing, or the steps of a period are not equidistant.
-
-    See Also
-    --------
-    fit_phases : the phases
+    Raises InputError if both are missing, or the steps of a period are not equidistant.
     """
     mean, contrast, steps = fringes.mean, fringes.contrast, fringes.steps
     orders = [equidistant_order(shifts) for shifts in fringes.shifts]

@@ -12,18 +12,14 @@ from characterisation.point_cloud import Status
 
 @dataclass(frozen=True)
 class ProjectorCoordinate:
-    """Projector column or row seen by each pixel of a camera, (H, W).
+    """Projector column or row seen by each pixel of a camera, (H, W)."""
 
-    - ``value``: coordinate [projector px], float64, with pixel centres at integers; NaN if rejected.
-    - ``sigma``: standard deviation by noise, or by the width of a stripe [projector px], float32; NaN if unknown.
-    - ``modulation``: half of white minus black, or the amplitude of the weakest fringe [DN], float32.
-    - ``status``: uint8 of :class:`~characterisation.point_cloud.Status`: VALID, SATURATED, LOW_MODULATION,
-      PHASE_INCONSISTENT, or AMBIGUOUS after interpolation between stripes.
-    """
-
-    value: NDArray[np.float64]
+    value: NDArray[np.float64]  # coordinate [projector px], float64, with pixel centres at integers; NaN if rejected
+    #: standard deviation by noise, or by the width of a stripe [projector px], float32; NaN if unknown
     sigma: NDArray[np.float32]
-    modulation: NDArray[np.float32]
+    modulation: NDArray[np.float32]  # half of white minus black, or the amplitude of the weakest fringe [DN], float32
+    #: uint8 of :class:`~characterisation.point_cloud.Status`: VALID, SATURATED, LOW_MODULATION, PHASE_INCONSISTENT, or
+    #: AMBIGUOUS after interpolation between stripes
     status: NDArray[np.uint8]
 
     @property

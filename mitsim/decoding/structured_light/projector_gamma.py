@@ -33,23 +33,9 @@ def estimate_gamma(stack: NDArray[np.generic], mean: float, contrast: float, min
     then divided. Noise and the third harmonic, which aliases onto the second at N = 5, cancel over the phases. The
     pixels must therefore show all phases about equally often.
 
-    Parameters
-    ----------
-    stack
-        (N, H, W) images [DN].
-    mean, contrast
-        Of the projected cosine [1].
-    minimum_modulation
-        Least modulation of the pixels that are used [DN].
-
-    Raises
-    ------
-    InputError
-        If there are fewer than five shifts, no pixel has the modulation, or no gamma fits.
-
-    See Also
-    --------
-    gamma_from_white : fewer than five steps
+    ``stack``: (N, H, W) images [DN]. ``mean``, ``contrast``: of the projected cosine [1]. ``minimum_modulation``: least
+    modulation of the pixels that are used [DN]. Raises InputError if there are fewer than five shifts, no pixel has the
+    modulation, or no gamma fits.
     """
     steps = len(stack)
     if steps < 5:
@@ -84,26 +70,13 @@ def gamma_from_white(
     The mean of (A - black) / (white - black) over all phases equals that of (mean + contrast cos phi)^gamma.
     Reflectance, blur and interreflections do not affect it, since they change all means alike.
 
-    Parameters
-    ----------
-    offset
-        (H, W) mean level A of the fringes [DN].
-    white, black
-        (H, W) images of a white and a black frame [DN].
-    mean, contrast
-        Of the projected cosine [1].
-    used
-        (H, W) pixels to use. They must show all phases about equally often, and exclude pixels whose white is
-        saturated.
+    - ``offset``: (H, W) mean level A of the fringes [DN].
+    - ``white``, ``black``: (H, W) images of a white and a black frame [DN].
+    - ``mean``, ``contrast``: of the projected cosine [1].
+    - ``used``: (H, W) pixels to use. They must show all phases about equally often, and exclude pixels whose white is
+      saturated.
 
-    Raises
-    ------
-    InputError
-        If no used pixel is brighter in white than in black, or no gamma fits.
-
-    See Also
-    --------
-    estimate_gamma : five steps or more
+    Raises InputError if no used pixel is brighter in white than in black, or no gamma fits.
     """
     black_sum = float(black[used].sum(dtype=np.float64))
     range_sum = float(white[used].sum(dtype=np.float64)) - black_sum
@@ -123,13 +96,7 @@ def mean_level(gamma: float, mean: float, contrast: float) -> float:
 
 
 def equidistant_order(shifts: NDArray[np.floating]) -> NDArray[np.intp]:
-    """Return the order in which shifts [rad] increase by 2 pi / N, starting from the first.
-
-    Raises
-    ------
-    InputError
-        If they are not equidistant.
-    """
+    """Return the order in which shifts [rad] rise by 2 pi / N, starting from the first; InputError if they do not."""
     angle = np.mod(shifts - shifts[0], 2 * np.pi)
     angle[angle > 2 * np.pi - 1e-6] = 0.0
     order = np.argsort(angle)
@@ -151,17 +118,7 @@ def harmonic_ratio(gamma: float, mean: float, contrast: float) -> float:
 def correct_phase(
     phase: NDArray[np.float32], gamma: float, steps: int, mean: float, contrast: float
 ) -> NDArray[np.float32]:
-    """Return phases (...) [rad] without the error that a projector's gamma causes.
-
-    Parameters
-    ----------
-    phase
-        (...) measured phases [rad].
-    gamma, steps
-        Exponent of the projector, and number of equidistant steps.
-    mean, contrast
-        Of the projected cosine [1].
-    """
+    """Return phases (...) [rad] without a projector's gamma; ``mean``, ``contrast`` of the projected cosine [1]."""
     true = 2 * np.pi * np.arange(_SAMPLES) / _SAMPLES
     delta = 2 * np.pi * np.arange(steps) / steps
     light = np.maximum(mean + contrast * np.cos(true[:, None] - delta), 0) ** gamma

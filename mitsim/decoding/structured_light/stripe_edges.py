@@ -35,25 +35,9 @@ def interpolate_between_edges(
     beyond that edge, and stays within its own stripe. A pixel without an edge, or without that neighbouring stripe,
     has no position within its stripe. Its coordinate is NaN.
 
-    Parameters
-    ----------
-    number, valid
-        (H, W) number of the stripe, and whether it was decoded.
-    signed
-        Light of a bit, which locates the edges.
-    stripe
-        Width of a stripe [projector px].
-
-    Returns
-    -------
-    coordinate
-        (H, W) [projector px].
-    located
-        (H, W) whether the coordinate is a number.
-
-    See Also
-    --------
-    status_without_edges : pixels with an unknown position in their stripe
+    ``number``, ``valid``: (H, W) number of the stripe, and whether it was decoded. ``signed``: light of a bit, which
+    locates the edges. ``stripe``: width of a stripe [projector px]. Returns ``coordinate``: (H, W) [projector px];
+    ``located``: (H, W) whether the coordinate is a number.
     """
     height, width = number.shape
     is_edge, edge_column, edge_coordinate = _stripe_edges(number.astype(np.int64), valid, signed, stripe)

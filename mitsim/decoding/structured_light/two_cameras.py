@@ -62,46 +62,21 @@ def decode_structured_light_stereo(
     context: ImageContext,
     decoded_before: Sequence[Mapping[Axis, ProjectorCoordinate]] | None = None,
 ) -> PointCloud:
-    """Decode the images of one code by two cameras.
+    """Decode the images of one code by two cameras to a cloud on the rectified left grid, sensor frame [mm].
 
-    Parameters
-    ----------
-    stacks
-        (P, H, W) raw images [DN] of the first and of the second camera of the rig, in the order of
-        :func:`mitsim.sensor.light_code.roles`.
-    geometry
-        From :func:`mitsim.decoding.matching.stereo_geometry.stereo_geometry`.
-    code, settings
-        The code, and range and limits.
-    projector_size
-        Width and height of the pattern [px].
-    context
-        Of the images. Its ``roi`` is a region of the rectified left grid.
-    decoded_before
-        Coordinates (H, W) of each camera's whole images, with ``interpolate`` of
-        :func:`~mitsim.decoding.structured_light.decoder.decode_coordinates`. None if they are not decoded yet.
+    ``sigma`` [mm] is along the view ray, if the imager determines it, and None for Gray code without fringes, whose
+    error is not independent between pixels. Status, in addition to that of the code:
 
-    Returns
-    -------
-    PointCloud
-        On the rectified left grid, points in the sensor frame [mm]. ``sigma`` [mm] along the view ray, if the imager
-        determines it. It is None for Gray code without fringes, whose error is not independent between pixels. Status,
-        in addition to that of the code:
+    - ``HIDDEN``: the right image does not have the pixel's coordinate in its row.
+    - ``AMBIGUOUS``: the right image has it more than once.
+    - ``OUT_OF_RANGE``: the depth is not between near and far.
+    - ``NO_SURFACE``: the camera has no such pixel.
 
-        - ``HIDDEN``: the right image does not have the pixel's coordinate in its row.
-        - ``AMBIGUOUS``: the right image has it more than once.
-        - ``OUT_OF_RANGE``: the depth is not between near and far.
-        - ``NO_SURFACE``: the camera has no such pixel.
-
-    Raises
-    ------
-    InputError
-        If the code has no columns, the images do not fit code and calibration, or the region of interest does not lie
-        in the grid.
-
-    See Also
-    --------
-    mitsim.decoding.structured_light.decoder.decode_structured_light : one camera
+    ``stacks``: (P, H, W) raw images [DN] of first and second camera, in the order of
+    :func:`mitsim.sensor.light_code.roles`. ``projector_size``: width and height of the pattern [px]. ``context``: its
+    ``roi`` is a region of the grid. ``decoded_before``: (H, W) of whole images, with ``interpolate`` of
+    :func:`~mitsim.decoding.structured_light.decoder.decode_coordinates`. Raises InputError if the code has no columns,
+    the images do not fit code and calibration, or the ``roi`` does not lie in the grid.
     """
     for name, stack, size in zip(("left", "right"), stacks, geometry.raw_size, strict=True):
         if stack.shape[1:] != size:
@@ -136,10 +111,7 @@ def _cloud_of_pair(
     settings: DecoderSettings,
     context: ImageContext,
 ) -> PointCloud:
-    """Return the cloud of two cameras.
-
-    ``decoded`` returns the columns in a region of the raw image of a camera, 0 or 1.
-    """
+    """Return the cloud of two cameras; ``decoded`` returns columns in a region of the raw image of camera 0 or 1."""
     if "columns" not in axes(code):
         raise InputError(
             "pattern", "axis", ", ".join(axes(code)), "'columns' or 'both', for cameras that are side by side"
@@ -192,20 +164,13 @@ def _cloud_of_pair(
 
 @dataclass(frozen=True)
 class _CameraCoordinates:
-    """Decoded coordinates of one camera at rectified pixels (h, w).
+    """Decoded coordinates of one camera at rectified pixels (h, w)."""
 
-    - ``coordinate``: [projector px], NaN unless all four raw pixels have one.
-    - ``sigma``: of a raw pixel there [projector px].
-    - ``status``: of the nearest raw pixel.
-    - ``seen``: whether the pixels were read out.
-    - ``positions``: (2, h, w) raw column and row [px].
-    """
-
-    coordinate: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-    status: NDArray[np.uint8]
-    seen: NDArray[np.bool_]
-    positions: NDArray[np.float32]
+    coordinate: NDArray[np.float64]  # [projector px], NaN unless all four raw pixels have one
+    sigma: NDArray[np.float64]  # of a raw pixel there [projector px]
+    status: NDArray[np.uint8]  # of the nearest raw pixel
+    seen: NDArray[np.bool_]  # whether the pixels were read out
+    positions: NDArray[np.float32]  # (2, h, w) raw column and row [px]
 
     @classmethod
     def of(
@@ -234,11 +199,7 @@ class _CameraCoordinates:
 def _disparity_sigma(
     right_column: NDArray[np.float64], left: _CameraCoordinates, right: _CameraCoordinates, u_right: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the standard deviation (h, w) [px] of disparities; NaN without a match.
-
-    ``right_column`` (h, w) is the matched column of the right grid [px], ``u_right`` (h, W) the grid's coordinate
-    [projector px].
-    """
+    """Return the sigma (h, w) [px] of disparities; ``right_column`` (h, w) [px], ``u_right`` (h, W) [projector px]."""
     matched = np.isfinite(right_column)
     position = np.where(matched, right_column, 0.0)
     column = np.minimum(position.astype(np.intp), u_right.shape[1] - 2)
@@ -260,10 +221,7 @@ def _disparity_sigma(
 
 
 def _shared_weight(first: NDArray[np.floating], second: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return the sum over raw pixels of the product of their weights in two bilinear interpolations.
-
-    ``first`` and ``second`` (2, ...) are the positions of the interpolations [px].
-    """
+    """Return the sum over raw pixels of the product of two bilinear interpolations' weights, at (2, ...) [px] each."""
     first_pixel, second_pixel = np.floor(first), np.floor(second)
     first_fraction, second_fraction, offset = first - first_pixel, second - second_pixel, second_pixel - first_pixel
     product = np.select(

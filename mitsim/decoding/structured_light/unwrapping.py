@@ -30,10 +30,7 @@ LARGEST_RESIDUAL = 0.25
 
 @dataclass(frozen=True)
 class Beat:
-    """A sum of phases.
-
-    ``weights`` are the integers c_i, one for each period; ``period`` is that of the sum [px].
-    """
+    """A sum of phases with integer ``weights`` c_i, one for each period, and its own ``period`` [px]."""
 
     weights: tuple[int, ...]
     period: float
@@ -41,28 +38,19 @@ class Beat:
 
 @dataclass(frozen=True)
 class UnwrappingPath:
-    """Beats from the longest to the finest, and the gain of noise at each step between them.
+    """Beats from the longest to the finest, and the gain of noise at each step between them."""
 
-    - ``beats``: from the longest to the finest.
-    - ``noise``: (steps,) standard deviation of the residual f_b x_a - psi_b [cycles] per unit of sigma_I / B.
-    - ``systematic``: (steps,) the same per radian of an independent error of all phases.
-    """
-
-    beats: tuple[Beat, ...]
+    beats: tuple[Beat, ...]  # from the longest to the finest
+    #: (steps,) standard deviation of the residual f_b x_a - psi_b [cycles] per unit of sigma_I / B
     noise: tuple[float, ...]
-    systematic: tuple[float, ...]
+    systematic: tuple[float, ...]  # (steps,) the same per radian of an independent error of all phases
 
 
 def unwrapping_path(periods: tuple[float, ...], steps: tuple[int, ...], extent: float) -> UnwrappingPath:
     """Return the most robust path.
 
     ``steps`` is the number N of steps of each of the ``periods`` [px], ``extent`` that of projector pixels along the
-    code.
-
-    Raises
-    ------
-    InputError
-        If no period, and no beat of two or three, is as long as the extent.
+    code. Raises InputError if no period, and no beat of two or three, is as long as the extent.
     """
     beats = _beats(periods)
     scale = np.sqrt(2.0 / np.array(steps))
@@ -111,35 +99,18 @@ def unwrap(
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return the coordinate from the phases of all periods.
 
-    Parameters
-    ----------
-    phase
-        (n, ...) [rad], one image for each period, any multiple of 2 pi.
-    path
-        From :func:`unwrapping_path`.
-    extent
-        Number of projector pixels along the code.
-    relative_variance
-        (...) sigma_I^2 / B^2 of each pixel.
-    systematic_rad, k_sigma
-        A step is accepted if its residual is at most k sigma, and at most :data:`LARGEST_RESIDUAL`. sigma^2 is the sum
-        of the variances of noise and systematic error.
-    order
-        (...) whole turns of the path's first beat, if they are known from another source, for example a Gray code. The
-        beat then need not cover the projector.
+    - ``phase``: (n, ...) [rad], one image for each period, any multiple of 2 pi.
+    - ``path``: from :func:`unwrapping_path`.
+    - ``extent``: number of projector pixels along the code.
+    - ``relative_variance``: (...) sigma_I^2 / B^2 of each pixel.
+    - ``systematic_rad``, ``k_sigma``: a step is accepted if its residual is at most k sigma, and at most
+      :data:`LARGEST_RESIDUAL`. sigma^2 is the sum of the variances of noise and systematic error.
+    - ``order``: (...) whole turns of the path's first beat, if they are known from another source, for example a Gray
+      code. The beat then need not cover the projector.
 
-    Returns
-    -------
-    coordinate
-        (...) [projector px], with pixel centres at integers.
-    inconsistent
-        (...) whether the phases contradict each other, or the coordinate is outside the projector by more than a pixel.
-        If the longest period extends at most 2 px beyond the projector, pixels within a pixel of its two ends are
-        inconsistent too.
-
-    See Also
-    --------
-    unwrapping_path : the most robust order of the periods
+    Returns ``coordinate``: (...) [projector px], with pixel centres at integers; ``inconsistent``: (...) whether the
+    phases contradict each other, or the coordinate is outside the projector by more than a pixel. If the longest period
+    extends at most 2 px beyond the projector, pixels within a pixel of its two ends are inconsistent too.
     """
     flat = phase.reshape(len(phase), -1)
     variance = relative_variance.reshape(-1)

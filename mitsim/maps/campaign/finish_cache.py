@@ -75,10 +75,7 @@ def kept_finish(finish: OneFinish, distance: float) -> PerformanceMap | None:
 
 
 def made_finish(finish: OneFinish, simulated: SimulatedSensor, distance: float) -> PerformanceMap:
-    """Characterise a finish at a distance [mm] and keep the map.
-
-    Raises InputError if the folder cannot be created. Raises MissingEnvironmentError if the disk is full.
-    """
+    """Characterise a finish at a distance [mm], keep the map; MissingEnvironmentError if the disk is full."""
     folder, digest = cache_folder(), finish.digest(distance)
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -69,10 +69,7 @@ def random_normals(count: int, largest_deg: float, rng: np.random.Generator) -> 
 
 
 def distances_between(performance_map: PerformanceMap) -> list[float]:
-    """Return the map's distances [mm] and the geometric means between them.
-
-    The distances at both ends are moved slightly inward.
-    """
+    """Return the map's distances [mm], those at both ends moved slightly inward, and the geometric means between."""
     distances = performance_map.data["distance"].values.astype(float)
     if len(distances) == 1:
         return [float(distances[0])]

@@ -171,10 +171,7 @@ def _characterise(
 
 
 def distances_about(performance_map: PerformanceMap, between: tuple[float, float]) -> list[float]:
-    """Return the distances of a map [mm] that determine its values in an interval of |V|.
-
-    These are the distances in the interval and the next one beyond each end.
-    """
+    """Return the map's distances [mm] in an interval of |V|, and the next one beyond each end: they determine it."""
     distances = performance_map.data["distance"].values.astype(float)
     low = max(int(np.searchsorted(distances, between[0], "right")) - 1, 0)
     high = min(int(np.searchsorted(distances, between[1], "left")), len(distances) - 1)

@@ -155,12 +155,8 @@ def plan_of(largest_deg: float, seed: int = 1) -> CampaignFile:
 def one_finish_campaign(finish: OneFinish, distance: float, file: CampaignFile, lay_deg: float = 0.0) -> Campaign:
     """Return the campaign of a finish at a distance [mm], with its u at a lay angle if it has a lay.
 
-    Parameters
-    ----------
-    finish, distance
-        The finish with the sensor that characterises it, and |V| [mm].
-    file, lay_deg
-        The plan, from :func:`plan_of`; angle of u [deg], if the finish has a lay.
+    ``finish``, ``distance``: the finish with the sensor that characterises it, and |V| [mm]. ``file``, ``lay_deg``: the
+    plan, from :func:`plan_of`; angle of u [deg], if the finish has a lay.
     """
     half = half_size(finish.sensor, distance, COUPON_PX if file.coupon_px is None else file.coupon_px)
     recipe = CouponRecipe(finish.finish.name, (), finish.sensor.wavelength_nm)
@@ -173,17 +169,7 @@ def one_finish_campaign(finish: OneFinish, distance: float, file: CampaignFile, 
 
 
 def characterise_finish(finish: OneFinish, simulated: SimulatedSensor, distance: float, folder: Path) -> PerformanceMap:
-    """Run the campaign of a finish at a distance [mm] in its own folder.
-
-    Raises MissingEnvironmentError if the disk is full.
-
-    Parameters
-    ----------
-    finish, simulated, distance
-        The finish with the sensor that characterises it, that sensor on the device, and |V| [mm].
-    folder
-        Empty folder for the captures.
-    """
+    """Run the campaign of a finish at a distance [mm] in an empty folder; MissingEnvironmentError if the disk fills."""
     file, made = plan_of(finish.largest_deg, finish.seed), []
     for turn in finish.turns:
         campaign = one_finish_campaign(finish, distance, file, turn)

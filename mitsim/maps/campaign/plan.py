@@ -198,12 +198,9 @@ def coupon_pose(
 ) -> Transform:
     """Return ``sensor_from_coupon`` with the coupon's centre on the view axis.
 
-    Parameters
-    ----------
-    normal, distance
-        (3,) in the view frame (z toward the sensor, x toward the second eye), and |V| [mm].
-    axis, eye
-        (3,) unit view direction and (3,) position of the camera [mm], by default the origin, in the sensor frame.
+    ``normal``, ``distance``: (3,) in the view frame (z toward the sensor, x toward the second eye), and |V| [mm].
+    ``axis``, ``eye``: (3,) unit view direction and (3,) position of the camera [mm], by default the origin, in the
+    sensor frame.
     """
     z = view_axes(axis) @ normal
     x = np.cross([0.0, 1.0, 0.0], z)
@@ -249,10 +246,7 @@ def _series_of(
 
 
 def _digest(file: CampaignFile, sensor: Sensor, sample: Sample, distance: float, calibration: str) -> str:
-    """Return twelve hexadecimal digits of everything that determines the captures of a series, except their normals.
-
-    ``calibration`` is the checksum of a live stage's calibration; connection and limits of the stage are not included.
-    """
+    """Return twelve hex digits of what determines a series, but its normals; a stage by its calibration's checksum."""
     common = [__version__, MEASUREMENT_VERSION, file.samples_per_pixel, file.keep_images, file.seed]
     values = [written(sensor), sample.origin, sample.label(), f"{distance:.6g}"]
     if file.device is not None:  # campaigns without a device keep their former digest

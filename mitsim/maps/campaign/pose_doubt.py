@@ -56,12 +56,8 @@ class _SeenPlane:
 def pose_doubt(cloud: PointCloud, decode: Decode, sample: Sample, sensor_from_coupon: Transform) -> str:
     """Return a warning if the points of a capture contradict the pose of its coupon, or "".
 
-    Parameters
-    ----------
-    cloud, decode
-        Cloud of the coupon at its pose, sensor frame; gives that of the same capture about a coupon at another place.
-    sample, sensor_from_coupon
-        The coupon, and its pose [mm].
+    ``cloud``, ``decode``: cloud of the coupon at its pose, sensor frame; gives that of the same capture about a coupon
+    at another place. ``sample``, ``sensor_from_coupon``: the coupon, and its pose [mm].
     """
     coupon, grid = sample.at(sensor_from_coupon), cloud.grid
     plane = _seen_plane(cloud, coupon)

@@ -136,13 +136,10 @@ def write_stage_calibration(
 ) -> None:
     """Write a calibration for campaigns, with the coupon's pose at zero.
 
-    Parameters
-    ----------
-    path, fit, names
-        File to write, the calibrated axes, and their names, as in the campaign's ``[stage]``.
-    board_from_coupon
-        The coupon's middle and axes on the board, z out of the face toward the sensor. Default: the coupon's frame is
-        that of the board.
+    - ``path``, ``fit``, ``names``: file to write, the calibrated axes, and their names, as in the campaign's
+      ``[stage]``.
+    - ``board_from_coupon``: the coupon's middle and axes on the board, z out of the face toward the sensor. Default:
+      the coupon's frame is that of the board.
     """
     coupon = Transform.from_matrix(fit.zero_pose) @ (board_from_coupon or Transform.identity())
     lines = zip(names, fit.axes.directions, fit.axes.points, strict=True)
@@ -156,10 +153,7 @@ def write_stage_calibration(
 
 
 def read_stage_calibration(path: str | Path) -> StageCalibration:
-    """Read a stage calibration, written by :func:`write_stage_calibration` or by hand.
-
-    Raises InputError if it is missing or damaged, with the field.
-    """
+    """Read a calibration of :func:`write_stage_calibration`, or one by hand; InputError with the field."""
     table = read_json_object(Path(path), "a stage calibration: see docs/how-to/first-capture.md")
     read = validate(path, table, StageCalibrationFile)
     directions = np.array([axis.direction for axis in read.axes])

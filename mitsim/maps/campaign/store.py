@@ -83,10 +83,7 @@ def shot_folder(captures: Path, shot: Shot) -> Path:
 
 
 def write_shot(captures: Path, shot: Shot, finished: Finished) -> None:
-    """Write a shot completely or not at all.
-
-    Raises MissingEnvironmentError if the disk is full, or writing is not permitted.
-    """
+    """Write a shot completely or not at all; MissingEnvironmentError if the disk is full or not writable."""
     folder = shot_folder(captures, shot)
     files = {"patches.npy": _table_bytes(finished.patches)}
     if finished.capture is not None:
@@ -116,9 +113,9 @@ def write_shot(captures: Path, shot: Shot, finished: Finished) -> None:
 
 
 def read_shot(captures: Path, shot: Shot) -> Finished | None:
-    """Return a kept shot, None if it is missing or of another found capture; images are checked but not read.
+    """Return a kept shot; None if missing or of another capture.
 
-    Raises InputError if any of its files is missing, truncated or changed, with the file.
+    InputError with the file that is damaged or changed.
     """
     folder = shot_folder(captures, shot)
     if not folder.exists():

@@ -123,12 +123,8 @@ def phase_bias(
 
     Both are 0 without direct light.
 
-    Parameters
-    ----------
-    direct, indirect
-        A_1 (H, W), and two renders of A_2 (H, W).
-    shape, step
-        (H, W) shape that each pixel shows, -1 for none; number of sensor pixels per pixel along an axis.
+    ``direct``, ``indirect``: A_1 (H, W), and two renders of A_2 (H, W). ``shape``, ``step``: (H, W) shape that each
+    pixel shows, -1 for none; number of sensor pixels per pixel along an axis.
     """
     size = np.abs(direct)
     # scale first: squares of radiances are too small for single precision

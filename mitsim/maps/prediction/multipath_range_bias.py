@@ -51,14 +51,9 @@ def path_bias(
 
     Without direct light the bias is 0 and the factor 1.
 
-    Parameters
-    ----------
-    direct, other
-        Complex amplitudes A_1 and A_2 (F, H, W) [DN].
-    code, settings, imager
-        Of the sensor.
-    shape, step
-        (H, W) shape that a pixel shows, -1 for none; number of sensor pixels per pixel along an axis.
+    ``direct``, ``other``: complex amplitudes A_1 and A_2 (F, H, W) [DN]. ``code``, ``settings``, ``imager``: of the
+    sensor. ``shape``, ``step``: (H, W) shape that a pixel shows, -1 for none; number of sensor pixels per pixel along
+    an axis.
     """
     size, direct_phase = np.abs(direct), np.angle(direct)
     turned = other * np.exp(-1j * direct_phase)

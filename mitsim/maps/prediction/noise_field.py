@@ -73,12 +73,8 @@ def correlated_noise(
 ) -> Singles:
     """Return the errors (h, w) of the points of a view in units of the map's sigma; 0 where the map has none.
 
-    Parameters
-    ----------
-    scene, performance_map
-        Scene with the finishes of the shapes; map with noise areas and persistent noise.
-    mapped, rng
-        The view, with normals, and the random generator.
+    ``scene``, ``performance_map``: scene with the finishes of the shapes; map with noise areas and persistent noise.
+    ``mapped``, ``rng``: the view, with normals, and the random generator.
     """
     assert mapped.normal is not None
     predicted = np.isfinite(mapped.sigma)
@@ -114,10 +110,7 @@ def correlated_noise(
 
 
 def own_field(area: Floats, fraction: NDArray[np.floating]) -> tuple[Floats, Singles]:
-    """Return the correlation area a [px^2], at least 1, and the strength s / sigma of the field, (n,) each.
-
-    ``area`` (n,) are noise areas, ``fraction`` (n,) is F.
-    """
+    """Return the correlation area a [px^2], at least 1, and strength s / sigma of the field, from (n,) areas and F."""
     with np.errstate(divide="ignore"):
         correlated = np.nan_to_num(np.maximum(area + 1 - 1 / fraction, 1.0), nan=1.0, neginf=1.0)
     field_area = own_area(correlated, DISC_RADIUS)

@@ -312,10 +312,7 @@ def _deviates(size: tuple[int, ...], rng: np.random.Generator) -> tuple[NDArray[
 
 
 def _in_image(eye: Camera, reach: float, point: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return whether points (n, 3) [mm] of the sensor frame lie in an eye's image.
-
-    Beyond ``reach`` from the axis, in x/z and y/z, a distortion polynomial may fold back into the image.
-    """
+    """Return whether points (n, 3) [mm] lie in an eye's image; distortion may fold back beyond ``reach`` (x/z, y/z)."""
     where = eye.project(point)
     size = np.array([eye.width, eye.height])
     local = eye.sensor_from_camera.inverse().points(point)

@@ -76,10 +76,7 @@ def find_sources(folder: str | Path) -> list[Source]:
 
 
 def objects_of(names: Sequence[str], patterns: Sequence[str]) -> list[tuple[str, ...]]:
-    """Return the shapes of each object, by patterns such as ``pin_1*``; without patterns, one object of all shapes.
-
-    Raises InputError if a pattern matches no shape, or a shape belongs to two objects.
-    """
+    """Return the shapes of each object by patterns, all in one without; InputError if none or two match a shape."""
     if not patterns:
         return [tuple(names)]
     objects = [tuple(fnmatch.filter(names, pattern)) for pattern in patterns]

@@ -50,17 +50,7 @@ class Frame:
 
 
 def bop_frame(capture: Capture, scene: Scene, objects: Sequence[Scene], where: str | Path) -> tuple[Frame, float]:
-    """Decode a capture onto the pixels of a pinhole for BOP; also return the scale of its depth images [mm].
-
-    Raises InputError if the capture has no pose, or cannot be decoded.
-
-    Parameters
-    ----------
-    capture, where
-        The capture, and its folder for errors.
-    scene, objects
-        The scene that was rendered, and parts of it (:meth:`mitsim.scene.load.Scene.only`).
-    """
+    """Decode a capture onto a pinhole for BOP, with the scale of its depth [mm]; InputError without pose or points."""
     if capture.world_from_sensor is None:
         raise InputError(where, "pose.json", "no pose", "a capture whose pose in the part frame is known")
     settings, imager = decoder_settings(capture)
@@ -103,10 +93,7 @@ def on_pinhole(cloud: PointCloud, grid: ViewGrid) -> tuple[NDArray[np.float64], 
 
 
 def _slope(inverse: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-    """Return the change of 1/depth per pixel along an axis.
-
-    It is the smaller one of both sides, because the other may lead over an edge, and 0 without neighbours.
-    """
+    """Return the change of 1/depth per pixel along an axis, the smaller of both sides: one may lead over an edge."""
     steps = np.diff(inverse, axis=axis, prepend=np.nan, append=np.nan)
     before, after = (np.take(steps, range(k, k + inverse.shape[axis]), axis) for k in (0, 1))
     least = np.fmin(np.abs(before), np.abs(after))

@@ -37,25 +37,20 @@ FIELDS: dict[str, str] = {
 
 @dataclass(frozen=True)
 class CloudPoints:
-    """The n valid points of a cloud, in row order of their pixels.
+    """The n valid points of a cloud, in row order of their pixels."""
 
-    - ``points``: (n, 3), in ``frame`` and in ``unit``.
-    - ``sigma``: (n,) standard deviation along the view ray, in ``unit``; NaN where unknown.
-    - ``rays``: (n, 3) unit view rays, in ``frame``.
-    - ``row``, ``col``, ``feature``: (n,) position in the sensor's grid; index into ``feature_names``, -1 for none.
-    - ``frame``, ``unit``: name of the frame; ``mm`` or ``m``.
-    - ``sensor``, ``source``: as of the cloud.
-    """
-
-    points: Floats
-    sigma: Floats
-    rays: Floats
+    points: Floats  # (n, 3), in ``frame`` and in ``unit``
+    sigma: Floats  # (n,) standard deviation along the view ray, in ``unit``; NaN where unknown
+    rays: Floats  # (n, 3) unit view rays, in ``frame``
+    #: ``row``, ``col``, ``feature``: (n,) position in the sensor's grid; index into ``feature_names``, -1 for none
     row: NDArray[np.uint16]
     col: NDArray[np.uint16]
     feature: NDArray[np.int16]
     feature_names: tuple[str, ...]
+    #: ``frame``, ``unit``: name of the frame; ``mm`` or ``m``
     frame: str
     unit: str
+    #: ``sensor``, ``source``: as of the cloud
     sensor: str
     source: str
 

@@ -153,15 +153,7 @@ def write_results_json(run_results: RunResults, path: str | Path) -> None:
 
 
 def expected_result(name: str, asked: Measurement, stated: StatedMeasurement, view: int) -> ExpectedResult:
-    """Return the expected result of a measurement.
-
-    Parameters
-    ----------
-    name, asked
-        The measurement, from the task.
-    stated, view
-        Its statement, and number of the stated view.
-    """
+    """Return the expected result of a measurement of the task from its statement at a view."""
     value = _part_value(asked, stated.errors_of)
     expected, low, high = (
         None if end is None or value is None else value + end for end in (stated.bias, *stated.interval)

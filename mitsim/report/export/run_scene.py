@@ -97,10 +97,7 @@ def numbers_of(views: str, available: Sequence[int]) -> list[int]:
 
 
 def frustum(grid: ViewGrid, depth: float) -> tuple[NDArray[np.float64], list[tuple[int, int]]]:
-    """Return apex and corners (5, 3) of a grid's view pyramid, in grid coordinates, and its 8 edges.
-
-    The corners lie at ``depth`` along the axis, at the outer corners of the corner pixels of the pinhole.
-    """
+    """Return apex and corners (5, 3), outer corners of a pinhole's image at ``depth`` along the axis, and 8 edges."""
     x = (np.array([-0.5, grid.width - 0.5]) - grid.cx) / grid.fx
     y = (np.array([-0.5, grid.height - 0.5]) - grid.cy) / grid.fy
     corners = [(x[0], y[0], 1.0), (x[1], y[0], 1.0), (x[1], y[1], 1.0), (x[0], y[1], 1.0)]

@@ -89,10 +89,7 @@ class Face:
         return float(_areas(self.vertices, self.triangles).sum())
 
     def corner_normals(self) -> Floats | None:
-        """Return the outward unit normals (m, 3, 3) at the corners of the triangles.
-
-        They are those of the recognised surface, else those of the CAD file; None without either.
-        """
+        """Return the outward unit normals (m, 3, 3) at triangles' corners, recognised or drawn; None without either."""
         if self.surface is None:
             return None if self.normals is None else self.normals[self.triangles]
         corners = self.vertices[self.triangles]

@@ -35,11 +35,7 @@ MOST_TRIANGLES = 400_000
 
 
 def sensor_sigma_mm(name: str) -> float:
-    """Return a sensor's smallest standard deviation [mm] of a point on matt white at normal incidence.
-
-    The source is the performance map shipped with mitsim, else published figures of the sensor. Raises InputError if
-    there is no such sensor, or its noise is unknown.
-    """
+    """Return a sensor's least sigma [mm] on matt white, by its shipped map or published figures; else InputError."""
     sensor = load_sensor(name)
     path = shipped_maps().get(sensor.name)
     if path is not None:

@@ -98,10 +98,7 @@ def with_names(faces: Sequence[Face]) -> list[Face]:
 
 
 def _unique(names: dict[int, str], faces: Sequence[Face]) -> list[str]:
-    """Return unique names by number of the face; different groups may have produced equal names.
-
-    Names of files differ in more than capital letters, and no name is that of a finish in the scene.
-    """
+    """Return unique names by face; those of files differ in more than capitals, and from finishes of the scene."""
     taken: dict[str, int] = {}
     out: dict[int, str] = {}
     rank = _ranks(np.array([_place(face) for face in faces]))
@@ -171,12 +168,7 @@ def _part_names(faces: Sequence[Face]) -> list[str]:
 def described_name(face: Face, faces: Sequence[Face], low: Floats, high: Floats) -> str:
     """Return the kind of a face with its size, among the ``faces`` of a part.
 
-    Parameters
-    ----------
-    face, faces
-        The face, and all of the part.
-    low, high
-        (3,) [mm] Corners of the part.
+    ``face``, ``faces``: the face, and all of the part. ``low``, ``high``: (3,) [mm] Corners of the part.
     """
     surface, part = face.surface, float(np.linalg.norm(high - low))
     if isinstance(surface, Plane):

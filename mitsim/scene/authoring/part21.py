@@ -106,10 +106,7 @@ class StepText:
 
 
 def read_step_text(path: str | Path) -> StepText:
-    """Read the records of a STEP file.
-
-    Raises InputError if it is not a Part-21 file.
-    """
+    """Read the records of a STEP file; InputError if it is not a Part-21 file."""
     data = Path(path).read_bytes()
     try:
         text = data.decode("utf-8")

@@ -100,13 +100,8 @@ def read_part(
     Raises InputError as :func:`~mitsim.scene.authoring.read_step.read_step`,
     :func:`~mitsim.scene.authoring.read_mesh.read_mesh` and :func:`~mitsim.scene.authoring.segment_mesh.segment_mesh`.
 
-    Parameters
-    ----------
-    path, units
-        The file, and its unit of length if it states none.
-    angle_deg, fineness
-        Of a mesh: neighbouring triangles with a smaller angle between them belong to one face; of the mesh of a STEP
-        file.
+    ``path``, ``units``: the file, and its unit of length if it states none. ``angle_deg``, ``fineness``: of a mesh:
+    neighbouring triangles with a smaller angle between them belong to one face; of the mesh of a STEP file.
     """
     path = Path(path)
     check_part_file(path, units)

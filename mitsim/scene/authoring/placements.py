@@ -17,10 +17,7 @@ _BOTH = ("CARTESIAN_TRANSFORMATION_OPERATOR", "CARTESIAN_TRANSFORMATION_OPERATOR
 
 
 def check_placements(path: Path, text: StepText) -> None:
-    """Check that every operator that places a component is a rigid motion.
-
-    Raises InputError for the first that is not, with its number in the file.
-    """
+    """Check that operators that place components are rigid; InputError with the number of the first that is not."""
     for entity in text.all(_BOTH[1]):
         *_, first, second, _, scale, third = (None,) * 5 + sum((entity.of(kind) or () for kind in _BOTH), ())
         axes = np.eye(3)

@@ -76,10 +76,7 @@ def read_mesh(path: str | Path, units: str | None = None) -> Mesh:
 
 
 def check_part_file(path: Path, units: str | None) -> None:
-    """Check that a part's file exists, has a supported type, and that its unit may be given.
-
-    Raises InputError if a check fails.
-    """
+    """Check that a part's file exists, has a supported type, and may be given this unit, by an InputError."""
     kind = path.suffix.lower()
     if units is not None and units not in LENGTHS_MM:
         raise InputError("--units", "", repr(units), ", ".join(LENGTHS_MM), nearest(units, list(LENGTHS_MM)))

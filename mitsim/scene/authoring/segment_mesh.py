@@ -51,12 +51,8 @@ def segment_mesh(vertices: Floats, triangles: Ints, angle_deg: float = 20.0, whe
 
     Raises InputError if no triangle has an area, or there are more than :data:`LARGEST_COUNT` faces.
 
-    Parameters
-    ----------
-    vertices, triangles, where
-        (n, 3) [mm] and (m, 3), and name of the mesh in messages.
-    angle_deg
-        Neighbouring triangles with a smaller angle between them belong to one face.
+    ``vertices``, ``triangles``, ``where``: (n, 3) [mm] and (m, 3), and name of the mesh in messages. ``angle_deg``:
+    neighbouring triangles with a smaller angle between them belong to one face.
     """
     mesh = trimesh.Trimesh(vertices, triangles, process=False)
     mesh.merge_vertices(digits_vertex=round(-np.log10(MERGE_MM)), merge_tex=True, merge_norm=True)

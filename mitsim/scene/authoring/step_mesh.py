@@ -44,13 +44,10 @@ _FLAT = 1.0
 def mesh_together(faces: list[Any], chord: float, bend: float, delabella: bool = True) -> None:
     """Mesh faces; those among them that have a mesh as fine keep it, and their neighbours take its points on an edge.
 
-    Parameters
-    ----------
-    faces, chord, bend
-        To be meshed; largest distance from the surface [mm], and angle between facets [rad].
-    delabella
-        Which of OpenCASCADE's two ways connects the same points. Delabella takes a seventeenth of the time for 146,000
-        triangles of a torus.
+    - ``faces``, ``chord``, ``bend``: to be meshed; largest distance from the surface [mm], and angle between facets
+      [rad].
+    - ``delabella``: which of OpenCASCADE's two ways connects the same points. Delabella takes a seventeenth of the time
+      for 146,000 triangles of a torus.
     """
     from OCP.BRep import BRep_Builder
     from OCP.BRepMesh import BRepMesh_IncrementalMesh
@@ -95,12 +92,8 @@ def fitted_chords(faces: list[Any], kinds: list[str], chord: float, largest_chor
 
     Chords differ in steps of a factor sqrt(2), since faces of one chord are meshed together.
 
-    Parameters
-    ----------
-    faces, kinds
-        Meshed faces, and the kinds of their surfaces.
-    chord, largest_chord, fitted
-        Least and largest chord; chord of a face whose radius has the standard uncertainty 1, as for :func:`mesh`.
+    ``faces``, ``kinds``: meshed faces, and the kinds of their surfaces. ``chord``, ``largest_chord``, ``fitted``: least
+    and largest chord; chord of a face whose radius has the standard uncertainty 1, as for :func:`mesh`.
     """
     out = np.full(len(faces), chord)
     for number, (face, kind) in enumerate(zip(faces, kinds, strict=True)):
@@ -127,12 +120,9 @@ def chords(
     are long. If all faces would have over ``most``, the chords of the faces with the most triangles are doubled: of
     measured faces up to ``other_chord``, then of all.
 
-    Parameters
-    ----------
-    kinds, counts, coarse
-        Kinds (n,) of the surfaces, and their triangles (n,) at the chord ``coarse``.
-    chord, other_chord, most
-        Of faces that a task can measure, one or for each face, and of other faces; triangles of all faces.
+    ``kinds``, ``counts``, ``coarse``: kinds (n,) of the surfaces, and their triangles (n,) at the chord ``coarse``.
+    ``chord``, ``other_chord``, ``most``: of faces that a task can measure, one or for each face, and of other faces;
+    triangles of all faces.
     """
     measured = np.array([kind in MEASURED for kind in kinds])
     out = np.where(measured, chord, other_chord)

@@ -62,10 +62,7 @@ _CORRELATION_WEIGHT = 0.3
 
 @lru_cache(maxsize=32)
 def aperture_samples(count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return positions (2, count) in the unit discs of the camera's and the projector's lens.
-
-    There is one pair for each cell of a pixel's raster, row by row. ``count`` is a square number.
-    """
+    """Return positions (2, count) in the unit discs of both lenses, a pair for each cell of a pixel's square raster."""
     side, half = round(np.sqrt(count)), count // 2
     i = np.arange(count)
     square = (np.stack([i % side, i // side]) + 0.5) / side * 2 - 1
@@ -130,10 +127,7 @@ def _with_opposites(half: Floats, count: int) -> NDArray[np.float32]:
 
 
 def _on_disc(square: Floats) -> Floats:
-    """Map the square [-1, 1]^2 to the unit disc; equal areas stay equal.
-
-    Shirley and Chiu's concentric map (J. Graphics Tools 2(3), 1997).
-    """
+    """Map the square [-1, 1]^2 to the unit disc with equal areas (Shirley and Chiu, J. Graphics Tools 2(3), 1997)."""
     x, y = square
     wide = np.abs(x) > np.abs(y)
     radius = np.where(wide, x, y)

@@ -141,14 +141,9 @@ def split_walk(
 ) -> tuple[Walk | None, CandidatePaths | None]:
     """Return the lanes that go on, and the records of those that are lit; None for none.
 
-    Parameters
-    ----------
-    walk
-        Lanes of this step.
-    lit, record
-        Mask of the lanes that are lit, and their weight, (u, v), length, material and local directions.
-    goes_on, follower
-        Mask of the lanes that go on, and all lanes after the step.
+    ``walk``: lanes of this step. ``lit``, ``record``: mask of the lanes that are lit, and their weight, (u, v), length,
+    material and local directions. ``goes_on``, ``follower``: mask of the lanes that go on, and all lanes after the
+    step.
     """
     followers = [] if follower is None else _arrays(follower)
     dr.eval(lit, goes_on, record, walk.pixel, walk.surfaces, followers)
@@ -201,14 +196,9 @@ def value_and_density(
 ) -> tuple[Any, Any]:
     """Return the BSDF times cosine, and the density of the other direction of travel [1/sr].
 
-    Parameters
-    ----------
-    bsdf, surface, active
-        BSDF, surface interaction, and mask of the lanes.
-    toward_projector, toward_camera
-        Local directions.
-    camera
-        Whether the density is that of a camera path that continues to the projector; else of a photon to the camera.
+    ``bsdf``, ``surface``, ``active``: BSDF, surface interaction, and mask of the lanes. ``toward_projector``,
+    ``toward_camera``: local directions. ``camera``: whether the density is that of a camera path that continues to the
+    projector; else of a photon to the camera.
     """
     view = mi.SurfaceInteraction3f(surface)
     view.wi = toward_camera
@@ -223,12 +213,8 @@ def value_and_density(
 def density_to_camera(bsdf: Any, surface: Any, toward_projector: Any, active: Any) -> Any:
     """Return the density with which a photon continues to the camera [1/sr].
 
-    Parameters
-    ----------
-    bsdf, surface, active
-        BSDF, surface interaction met from the camera, and mask of the lanes.
-    toward_projector
-        Local direction from which the photon arrives.
+    ``bsdf``, ``surface``, ``active``: BSDF, surface interaction met from the camera, and mask of the lanes.
+    ``toward_projector``: local direction from which the photon arrives.
     """
     view = mi.SurfaceInteraction3f(surface)
     view.wi = toward_projector

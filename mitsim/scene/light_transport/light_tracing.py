@@ -64,17 +64,12 @@ _FIRST_STREAM = 1 << 40
 
 @dataclass(frozen=True)
 class Photons:
-    """The photons that a projector emits.
+    """The photons that a projector emits."""
 
-    - ``count``: a square number.
-    - ``depth``: largest number of surfaces that a photon meets.
-    - ``seed`` of their directions.
-    - ``samples`` of the camera per pixel, with which the photons share the light; None if there are only photons.
-    """
-
-    count: int
-    depth: int
-    seed: int
+    count: int  # a square number
+    depth: int  # largest number of surfaces that a photon meets
+    seed: int  # of their directions
+    #: of the camera per pixel, with which the photons share the light; None if there are only photons
     samples: int | None = None
 
 
@@ -89,17 +84,12 @@ def add_photons(
 ) -> None:
     """Add to ``images`` the light of photons that has met 2 to ``photons.depth`` surfaces.
 
-    Parameters
-    ----------
-    images
-        (poses, P, height, width) of the region [W / (mm^2 sr)], changed in place. Photons do not depend on the region:
-        each pixel receives the same light as in the whole image.
-    scene, rays, light, poses
-        The scene, the camera's rays, the projector's light, and the poses of the sensor.
-    photons
-        Their number at each pose, depth and seed.
-    roi
-        The region of the image.
+    - ``images``: (poses, P, height, width) of the region [W / (mm^2 sr)], changed in place. Photons do not depend on
+      the region: each pixel receives the same light as in the whole image.
+    - ``scene``, ``rays``, ``light``, ``poses``: the scene, the camera's rays, the projector's light, and the poses of
+      the sensor.
+    - ``photons``: their number at each pose, depth and seed.
+    - ``roi``: the region of the image.
     """
     sums = np.zeros((light.codes, len(poses) * roi.height * roi.width))
     at_once = max(1, PHOTONS_AT_ONCE // len(poses))

@@ -41,10 +41,7 @@ def z_positions(column: NDArray[np.integer], row: NDArray[np.integer]) -> NDArra
 
 
 def r3_point(index: Any, seed: Any, stream: int) -> tuple[Any, Any]:
-    """Return a number in [0, 1) and a point of the unit square for the index of a sample (uint32).
-
-    ``seed`` is an opaque uint32. ``stream`` distinguishes uses of one seed.
-    """
+    """Return a number in [0, 1) and a point of the unit square; ``seed`` is opaque, ``stream`` tells uses apart."""
     values = []
     for axis, step in enumerate(_STEPS):
         shift = mi.sample_tea_32(seed, opaque_index(3 * stream + axis), 6)[0]

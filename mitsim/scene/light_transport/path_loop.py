@@ -65,13 +65,9 @@ def launch(
 ) -> list[Any]:
     """Return all images of a region, and the ambient one, as arrays on the device, pose after pose; one kernel.
 
-    Parameters
-    ----------
-    scene, rays, light, poses, paths
-        The scene, the camera's rays, the projector's light, the poses of the sensor, and the light paths.
-    roi, shift
-        The region, and the displacement (2, height, width) [rad] of its codes, as for
-        :func:`~mitsim.scene.light_transport.transport.trace`.
+    ``scene``, ``rays``, ``light``, ``poses``, ``paths``: the scene, the camera's rays, the projector's light, the poses
+    of the sensor, and the light paths. ``roi``, ``shift``: the region, and the displacement (2, height, width) [rad] of
+    its codes, as for :func:`~mitsim.scene.light_transport.transport.trace`.
     """
     side, depth, seed, jitter = paths.side, paths.depth, paths.seed, paths.jitter
     photons = paths.photon_count(rays.camera.width * rays.camera.height)
@@ -257,10 +253,7 @@ class _Pupils:
 
 
 def _displacement(shift: NDArray[np.floating], camera: Eye, index: Any) -> Any:
-    """Return the displacement of the code for each pixel of a region, world frame.
-
-    It is per unit of distance from the camera [rad].
-    """
+    """Return the displacement of the code at each pixel, world frame, per unit of distance from the camera [rad]."""
     along = to_device(np.ravel(shift))
     below = index + opaque_index(shift[0].size)
     return camera.axes[0] * dr.gather(mi.Float, along, index) + camera.axes[1] * dr.gather(mi.Float, along, below)
@@ -278,10 +271,7 @@ def _sampled_emitter_light(scene: Scene, surface: Any, bsdf: Any, random: Any, a
 
 
 def _hit_emitter_light(scene: Scene, surface: Any, origin: Any, pdf: Any) -> Any:
-    """Return the weighted radiance of an emitter that a ray meets [W / (mm^2 sr)].
-
-    ``pdf`` is the density of the ray's direction at its ``origin`` [1/sr], or :data:`_ALONE` for the weight 1.
-    """
+    """Return an emitter's weighted radiance [W / (mm^2 sr)]; ``pdf`` [1/sr] of the ray, or :data:`_ALONE` for 1."""
     emitter = surface.emitter(scene.mitsuba)
     emitted = emitter.eval(surface)[0]
     reference = dr.zeros(mi.Interaction3f)

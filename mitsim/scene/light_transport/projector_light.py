@@ -127,22 +127,10 @@ class ProjectorLight(Eye):
     def emit_photon(self, position: Any, lens: Any) -> tuple[Any, Any, Any, Any]:
         """Return the ray of a photon from one position in the image and one in the aperture.
 
-        Parameters
-        ----------
-        position
-            Position in the unit square, which is mapped to the rectangle in the ideal image plane that photons pass
-            through.
-        lens
-            Position in the unit disc of the aperture.
-
-        Returns
-        -------
-        origin, direction
-            Ray in the world frame [mm, unit].
-        flux
-            Radiant intensity over the density of directions [W]; 0 outside the image.
-        uv
-            Texture coordinate.
+        ``position``: position in the unit square, which is mapped to the rectangle in the ideal image plane that
+        photons pass through. ``lens``: position in the unit disc of the aperture. Returns ``origin``, ``direction``:
+        ray in the world frame [mm, unit]; ``flux``: radiant intensity over the density of directions [W]; 0 outside the
+        image; ``uv``: texture coordinate.
         """
         x, y = (low + p * extent for p, (low, extent) in zip((position.x, position.y), self.extents, strict=True))
         u, v, inside = self.distortion.image(x, y, True)
@@ -176,10 +164,7 @@ class ProjectorLight(Eye):
 def _photon_rectangle(
     distortion: Distortion, projector: Projector, world_from_projector: Transform, bounds: NDArray[np.floating] | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the rectangle (low, high) in the ideal image plane that photons pass through.
-
-    It contains the image, or the scene if that is smaller.
-    """
+    """Return the rectangle (low, high) in the ideal image plane of the image, or of the scene if that is smaller."""
     low, high = distortion.border.min(axis=0), distortion.border.max(axis=0)
     margin = _MARGIN * (high - low)  # the border is computed at 65 points per side and is curved between them
     low, high = low - margin, high + margin

@@ -107,10 +107,7 @@ def bilinear(corners: list[Any], a: Any, b: Any) -> Any:
 
 
 def pixel_area(x: list[Any], y: list[Any]) -> Any:
-    """Return the area of a pixel on the plane z = 1 from its four corners: half the cross product of the diagonals.
-
-    It is positive, also where all corners lie on the fold of a distortion.
-    """
+    """Return the area of a pixel on z = 1, half the cross product of its diagonals; positive also on a fold."""
     return dr.maximum(0.5 * dr.abs((x[3] - x[0]) * (y[2] - y[1]) - (x[2] - x[1]) * (y[3] - y[0])), 1e-20)
 
 

@@ -114,10 +114,7 @@ class Distortion:
 
 
 def _tilt(tx: float, ty: float) -> list[list[float]] | None:
-    """Return the homography of an imager that is tilted by ``tx``, ``ty`` [rad] about x and y.
-
-    OpenCV calls the angles tauX and tauY.
-    """
+    """Return the homography of an imager tilted by ``tx``, ``ty`` [rad] about x and y, OpenCV's tauX and tauY."""
     if tx == 0 and ty == 0:
         return None
     about_x = np.array([[1, 0, 0], [0, np.cos(tx), np.sin(tx)], [0, -np.sin(tx), np.cos(tx)]])

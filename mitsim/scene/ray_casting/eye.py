@@ -16,10 +16,7 @@ _SHADOW_END = 1e-4
 
 
 def shadow_ray(surface: Any, toward: Any, distance: Any) -> Any:
-    """Return the ray from a surface toward an eye, which ends just before the eye.
-
-    ``toward`` is a unit vector, ``distance`` that of the eye [mm].
-    """
+    """Return the ray from a surface along unit ``toward``, which ends just before the eye at ``distance`` [mm]."""
     ray = surface.spawn_ray(toward)
     ray.maxt = distance * (1.0 - _SHADOW_END)
     return ray

@@ -103,16 +103,8 @@ class MapTables:
     def look_up_lay(self, number: Any, distance: Any, normal: Any, along: Any, active: Any) -> tuple[Any, Any]:
         """Return F [1] and sigma [mm], for surfaces with a lay in its direction (:mod:`characterisation.maps.lay`).
 
-        Parameters
-        ----------
-        number, distance, normal, active
-            As for :meth:`look_up`.
-        along
-            Derivative of the point by u, in the view frame; its length does not matter.
-
-        See Also
-        --------
-        look_up : surfaces without a lay
+        ``number``, ``distance``, ``normal``, ``active``: as for :meth:`look_up`. ``along``: derivative of the point by
+        u, in the view frame; its length does not matter.
         """
         mean = self.look_up(number, distance, normal, active)
         directed = active & dr.gather(mi.Bool, self.has_lay, number, active)
@@ -154,10 +146,7 @@ class MapTables:
 
 
 def _rows(surface: Surface, intervals: int) -> NDArray[np.float32]:
-    """Return rows (interval x node, 4): probit of F at the near and far distance, ln sigma at both.
-
-    If there is one distance, it is both.
-    """
+    """Return rows (interval x node, 4): probit of F at near and far distance, ln sigma; a single distance is both."""
     far = min(1, len(surface.knots) - 1)
     probit, log_sigma = surface.fields[:2]
     ends = [field[i : i + intervals] for field in (probit, log_sigma) for i in (0, far)]
@@ -178,10 +167,7 @@ def _rotated_with(vector: Any, start: Any, end: Any) -> Any:
 
 
 def _single_precision_range(knots: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the least and the largest distance [mm] in single precision for which the map has values.
-
-    The map's tolerance is 1e-9 of an interval.
-    """
+    """Return the least and largest single-precision distance [mm] with values, within 1e-9 of an interval."""
     slack = 1e-9 * (np.diff(knots) if len(knots) > 1 else np.ones(1))
     low, high = math.exp(knots[0] - slack[0]), math.exp(knots[-1] + slack[-1])
     least, largest = np.float32(low), np.float32(high)

@@ -52,14 +52,8 @@ def lobe_numbers(
 
     For an elongated lobe the energy is averaged over the azimuth of the light.
 
-    Parameters
-    ----------
-    phase_variance, alpha_u, alpha_v, beckmann, energy_factor
-        Of the lobe, as in :class:`~mitsim.scene.surface.scatter.Scatter`.
-
-    See Also
-    --------
-    coherent_weight : the weight A of pairs of directions
+    ``phase_variance``, ``alpha_u``, ``alpha_v``, ``beckmann``, ``energy_factor``: of the lobe, as in
+    :class:`~mitsim.scene.surface.scatter.Scatter`.
     """
     returned, missing = [], []
     lobes: tuple[tuple[float, float, Distribution], ...] = (

@@ -40,11 +40,8 @@ def coherent_share(sigma_um: float, wavelength_nm: float, incidence: float = 0.0
 def lobe_alpha(autocorrelation: Autocorrelation, sigma_um: float, wavelength_nm: float) -> float:
     """Return alpha [1], in Beckmann's sense, of the incoherent light along the direction of the lags.
 
-    Raises
-    ------
-    ValueError
-        If the autocorrelation never falls far enough (a profile too short for its waviness), or falls within the
-        shortest lag (noise).
+    Raises ValueError if the autocorrelation never falls far enough (a profile too short for its waviness), or falls
+    within the shortest lag (noise).
     """
     g = phase_variance(sigma_um, wavelength_nm)
 

@@ -42,18 +42,8 @@ def directional_albedo(
 
     The quadrature uses midpoints in the cumulative distribution of the slopes, so it covers the whole tail.
 
-    Parameters
-    ----------
-    incidence
-        Of the light [rad].
-    alpha_u, alpha_v, distribution
-        Of the lobe.
-    index
-        n and k of the material [1]; None for a perfect mirror.
-
-    See Also
-    --------
-    compensation : the factor that restores the lost light
+    ``incidence``: of the light [rad]. ``alpha_u``, ``alpha_v``, ``distribution``: of the lobe. ``index``: n and k of
+    the material [1]; None for a perfect mirror.
     """
     counts = _COUNTS if alpha_u == alpha_v else _ELONGATED_COUNTS
     weights, _ = facets(incidence, alpha_u, alpha_v, distribution, counts, index)
@@ -72,12 +62,8 @@ def facets(
 
     The sum of the shares is the :func:`directional_albedo`.
 
-    Parameters
-    ----------
-    incidence, alpha_u, alpha_v, distribution, index
-        As for :func:`directional_albedo`.
-    counts
-        Numbers of the facets' radii and azimuths, and of azimuths of the light for an elongated lobe.
+    ``incidence``, ``alpha_u``, ``alpha_v``, ``distribution``, ``index``: as for :func:`directional_albedo`. ``counts``:
+    numbers of the facets' radii and azimuths, and of azimuths of the light for an elongated lobe.
     """
     radii, azimuths, several = counts
     # an isotropic lobe needs one azimuth, and half of the facets, as the others are their mirror images; an elongated
@@ -137,16 +123,7 @@ def _facets_from(
 def compensation(alpha_u: float, alpha_v: float, distribution: Distribution, reflectance: float) -> float:
     """Return the factor [1] that restores a lobe's lost energy: 1 / E for a perfect mirror, 1 for a black surface.
 
-    Parameters
-    ----------
-    alpha_u, alpha_v, distribution
-        Of the lobe.
-    reflectance
-        F0 at normal incidence [1].
-
-    See Also
-    --------
-    directional_albedo : the share of light that a lobe returns
+    ``alpha_u``, ``alpha_v``, ``distribution``: of the lobe. ``reflectance``: F0 at normal incidence [1].
     """
     kept = directional_albedo(NOMINAL_INCIDENCE, alpha_u, alpha_v, distribution)
     return 1 + reflectance * (1 - kept) / kept

@@ -34,18 +34,8 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(96)
 def lobe_gloss(alpha: float, index: tuple[float, float], distribution: Distribution, angle_deg: int = 60) -> float:
     """Return the gloss [GU] of a lobe alone.
 
-    Parameters
-    ----------
-    alpha, distribution
-        Width [1], in the sense of the distribution.
-    index
-        n and k of the surface [1].
-    angle_deg
-        Of the gloss meter: 20, 60 or 85 deg.
-
-    See Also
-    --------
-    base_gloss : of the body under it
+    ``alpha``, ``distribution``: width [1], in the sense of the distribution. ``index``: n and k of the surface [1].
+    ``angle_deg``: of the gloss meter: 20, 60 or 85 deg.
     """
     theta = np.radians(angle_deg)
     incoming = np.array([np.sin(theta), 0.0, np.cos(theta)])
@@ -88,10 +78,7 @@ def base_gloss(reflectance: float) -> float:
 def alpha_of_gloss(value: float, reading: Callable[[float], float], bounds: tuple[float, float]) -> float:
     """Return alpha [1] between ``bounds`` at which ``reading`` [GU], a falling function of alpha, equals ``value``.
 
-    Raises
-    ------
-    ValueError
-        If no alpha gives it; the message states the possible readings.
+    Raises ValueError if no alpha gives it; the message states the possible readings.
     """
     highest, lowest = (reading(alpha) for alpha in bounds)
     if not lowest <= value <= highest:

@@ -42,10 +42,7 @@ _UM_PER = {"um": 1.0, "mm": 1e3}
 
 @dataclass(frozen=True)
 class Profile:
-    """A trace with its form removed.
-
-    ``Ra``, ``Rq`` [um]; autocorrelation ``rho`` at ``lags`` [um], both (n,).
-    """
+    """A trace without its form: ``Ra``, ``Rq`` [um]; autocorrelation ``rho`` at ``lags`` [um], both (n,)."""
 
     Ra: float
     Rq: float
@@ -61,17 +58,14 @@ class Profile:
 
 @dataclass(frozen=True)
 class HeightMap:
-    """An areal map with its plane removed.
+    """An areal map with its plane removed."""
 
-    - ``Sa``, ``Sq`` [um].
-    - ``lay``: direction of the lay [rad] from the columns' axis (x) towards the rows' (y), -pi/2 to pi/2.
-    - ``rho_along``, ``rho_across``: autocorrelations along and across it at ``lags`` [um], all (n,).
-    """
-
+    #: ``Sa``, ``Sq`` [um]
     Sa: float
     Sq: float
-    lay: float
+    lay: float  # direction of the lay [rad] from the columns' axis (x) towards the rows' (y), -pi/2 to pi/2
     lags: NDArray[np.float64] = field(repr=False)
+    #: ``rho_along``, ``rho_across``: autocorrelations along and across it at ``lags`` [um], all (n,)
     rho_along: NDArray[np.float64] = field(repr=False)
     rho_across: NDArray[np.float64] = field(repr=False)
     name: str = "height map"
@@ -88,15 +82,7 @@ class HeightMap:
 
 
 def profile(spacing_um: float, heights_um: ArrayLike, name: str = "trace") -> Profile:
-    """Evaluate a trace of evenly spaced heights (n,) [um].
-
-    The slope is the seven-point one of ISO 4287.
-
-    Raises
-    ------
-    ValueError
-        If the trace is flat to 0.1 nm.
-    """
+    """Evaluate even heights (n,) [um], with the seven-point slope of ISO 4287; ValueError if flat to 0.1 nm."""
     z = np.asarray(heights_um, float)
     position = np.linspace(-1, 1, len(z))
     z = z - np.polynomial.polynomial.polyval(position, np.polynomial.polynomial.polyfit(position, z, 2))
@@ -115,12 +101,8 @@ def profile(spacing_um: float, heights_um: ArrayLike, name: str = "trace") -> Pr
 def read_profile(path: str | Path, where: str | Path = "", key: str = "profile") -> Profile:
     """Read a trace: a CSV with a header of two columns, x_um or x_mm and z_um or z_mm, evenly spaced.
 
-    ``where`` and ``key`` name the place that refers to the file, for messages.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, is not such a table, is too short, has gaps or is flat.
+    ``where`` and ``key`` name the place that refers to the file, for messages. Raises InputError if the file is
+    missing, is not such a table, is too short, has gaps or is flat.
     """
     path = Path(path)
     lines = _lines(path, where, key)
@@ -150,12 +132,7 @@ def height_map(heights_um: ArrayLike, spacing_um: float, name: str = "height map
     """Evaluate an areal map (rows, columns) [um] of square spacing [um]; rows run along y, columns along x.
 
     The lay is the direction of least rms slope: an eigenvector of the covariance of the gradient. The eigenvalues are
-    the mean square slopes along and across it.
-
-    Raises
-    ------
-    ValueError
-        If the map is flat to 0.1 nm.
+    the mean square slopes along and across it. Raises ValueError if the map is flat to 0.1 nm.
     """
     z = np.asarray(heights_um, float)
     y, x = np.meshgrid(np.linspace(-1, 1, z.shape[0]), np.linspace(-1, 1, z.shape[1]), indexing="ij")
@@ -191,16 +168,8 @@ def height_map(heights_um: ArrayLike, spacing_um: float, name: str = "height map
 def read_height_map(path: str | Path, spacing_um: float, where: str | Path = "") -> HeightMap:
     """Read an areal map [um]: a two-dimensional .npy, or a CSV of numbers without a header, row by row.
 
-    ``spacing_um`` is that of its heights [um]. Messages name ``where``, the place that refers to the file.
-
-    See Also
-    --------
-    read_profile : a trace
-
-    Raises
-    ------
-    InputError
-        If the file is missing, is not such a grid, is too small or too large, has gaps or is flat.
+    ``spacing_um`` is that of its heights [um]. Messages name ``where``, the place that refers to the file. Raises
+    InputError if the file is missing, is not such a grid, is too small or too large, has gaps or is flat.
     """
     path = Path(path)
     if path.suffix.lower() == ".npy":

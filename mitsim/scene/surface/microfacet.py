@@ -29,10 +29,7 @@ def slope_density(q: ArrayLike, distribution: Distribution) -> NDArray[np.float6
 
 
 def shadowing(tangent: ArrayLike, distribution: Distribution) -> NDArray[np.float64]:
-    """Return Smith's G1 [1] at alpha times the tangent of the polar angle, any shape.
-
-    Beckmann uses the rational approximation of Walter et al., as the renderer does.
-    """
+    """Return Smith's G1 [1] at alpha tan(polar angle); Beckmann's rational as Walter et al. and the renderer."""
     t = np.maximum(np.asarray(tangent, float), 1e-12)
     if distribution == "ggx":
         return np.asarray(2 / (1 + np.sqrt(1 + t**2)))

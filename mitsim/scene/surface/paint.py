@@ -51,21 +51,10 @@ def paint(
 ) -> Scatter:
     """Return how ``gloss_paint`` (a Beckmann lobe) or ``powder_coat`` (a GGX lobe) scatters.
 
-    Parameters
-    ----------
-    kind, reflectance
-        Of the coat, and of its base [1].
-    gloss, alpha
-        [GU at 60 deg], or [1] in Beckmann's sense; without either, the default gloss of the coat.
-    where
-        Name of the surface in messages.
-    deviation
-        Of alpha, within the range of the coat; its wide-angle share follows.
-
-    Raises
-    ------
-    InputError
-        If both are given, or no width of that coat has the gloss.
+    ``kind``, ``reflectance``: of the coat, and of its base [1]. ``gloss``, ``alpha``: [GU at 60 deg], or [1] in
+    Beckmann's sense; without either, the default gloss of the coat. ``where``: name of the surface in messages.
+    ``deviation``: of alpha, within the range of the coat; its wide-angle share follows. Raises InputError if both are
+    given, or no width of that coat has the gloss.
     """
     if gloss is not None and alpha is not None:
         raise InputError(where, "alpha", "alpha beside gloss", "one of them", "keep gloss, which can be measured")

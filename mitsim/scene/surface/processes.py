@@ -64,26 +64,17 @@ def moved_odds(share: float, factor: float) -> float:
 
 @dataclass(frozen=True)
 class Process:
-    """Prior of a machining process.
+    """Prior of a machining process."""
 
-    - ``slope`` across the lay relative to the default law (:func:`mitsim.scene.surface.roughness.stylus_slope`).
-    - ``exponent``: C of the power spectral density.
-    - ``lay_ratio``: alpha along the lay over alpha across it, 1 for no lay.
-    - ``usual`` range of Ra [um].
-    - ``wide_angle`` share.
-    - ``lobe``: Beckmann share of the incoherent light, the rest is GGX; None derives it from the exponent.
-    - ``tail``: one-sigma range of that share.
-    - ``feed_marks``: whether Ra is that of regular tool marks.
-    """
-
-    slope: float
-    exponent: float
-    lay_ratio: float
-    usual: tuple[float, float]
-    wide_angle: WideAngle
+    slope: float  # across the lay relative to the default law (:func:`mitsim.scene.surface.roughness.stylus_slope`)
+    exponent: float  # C of the power spectral density
+    lay_ratio: float  # alpha along the lay over alpha across it, 1 for no lay
+    usual: tuple[float, float]  # range of Ra [um]
+    wide_angle: WideAngle  # wide-angle share
+    #: Beckmann share of the incoherent light, the rest is GGX; None derives it from the exponent
     lobe: float | None = None
-    feed_marks: bool = False
-    tail: tuple[float, float] = TAIL_RANGE
+    feed_marks: bool = False  # whether Ra is that of regular tool marks
+    tail: tuple[float, float] = TAIL_RANGE  # one-sigma range of that share
 
     @property
     def beckmann(self) -> float:

@@ -57,23 +57,10 @@ def matern(lag: ArrayLike, nu: float) -> NDArray[np.float64]:
 
 
 def band_limited_slope(sigma_um: float, correlation_um: float, nu: float, cutoff_um: float = STYLUS_CUTOFF_UM) -> float:
-    """Return Sdq [1] of a Matern surface from its longer spatial wavelengths only.
+    """Return Sdq [1] of a Matern surface from its spatial wavelengths above ``cutoff_um`` only.
 
-    Parameters
-    ----------
-    sigma_um, correlation_um, nu
-        Rq [um], lateral scale l [um], and smoothness [1].
-    cutoff_um
-        Shortest wavelength that counts [um].
-
-    See Also
-    --------
-    stylus_slope : the slope as a stylus sees it
-
-    Notes
-    -----
-    The two-dimensional spectrum is S(f) = sigma^2 nu B^2 / pi (1 + B^2 f^2)^-(nu + 1), B = 2 pi l. The slope is the
-    root of the integral of (2 pi f)^2 S over the disc f < 1 / cutoff.
+    Its spectrum is S(f) = sigma^2 nu B^2 / pi (1 + B^2 f^2)^-(nu + 1), B = 2 pi l, with Rq ``sigma_um``, lateral scale
+    l and smoothness ``nu`` [1]. The slope is the root of the integral of (2 pi f)^2 S over the disc f < 1 / cutoff.
     """
     x = (2 * np.pi * correlation_um / cutoff_um) ** 2
 

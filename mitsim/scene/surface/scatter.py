@@ -181,12 +181,8 @@ class Deviation:
     ) -> str:
         """Return the source of alpha and the deviations applied; exactly known properties do not deviate.
 
-        Parameters
-        ----------
-        provenance, factor
-            Source of alpha and its one-sigma factor.
-        ends, tails
-            One-sigma ranges of the wide-angle share and of the Beckmann share; without width if they are known.
+        ``provenance``, ``factor``: source of alpha and its one-sigma factor. ``ends``, ``tails``: one-sigma ranges of
+        the wide-angle share and of the Beckmann share; without width if they are known.
         """
         moved = [f"alpha {self.alpha:+g}"] if self.alpha and factor != 1 else []
         moved += [f"wide angle {self.wide_angle:+g}"] if self.wide_angle and ends[0] != ends[1] else []

@@ -63,17 +63,8 @@ def surface_light(
 ) -> Light:
     """Return the light of a surface, and whether its finish and Ra alone would give the same.
 
-    Parameters
-    ----------
-    kind, reflectance, scatter
-        As for :func:`light_of_scatter`.
-    finish, roughness_um, wavelength_nm
-        As for :func:`nominal_light`.
-
-    See Also
-    --------
-    light_of_scatter : of a kind of surface
-    nominal_light : of finish and Ra alone
+    ``kind``, ``reflectance``, ``scatter``: as for :func:`light_of_scatter`. ``finish``, ``roughness_um``,
+    ``wavelength_nm``: as for :func:`nominal_light`.
     """
     light, usual = light_of_scatter(kind, reflectance, scatter), nominal_light(finish, roughness_um, wavelength_nm)
     return replace(light, as_made=usual is not None and same_light(light, usual))

@@ -86,12 +86,8 @@ def _sensor_texts(sensors: Sequence[str]) -> list[str]:
 def open_candidate(path: Path, file: StudyFile, text: str, ask: Ask | None) -> CandidateSensor | Excluded:
     """Open a study for one sensor; say why if that is impossible.
 
-    Parameters
-    ----------
-    path, file, text
-        Path of the study file, its content, and the sensor, as in :func:`read_candidates`.
-    ask
-        Answers whether finishes that its map lacks may be characterised now; None if nobody can answer.
+    ``path``, ``file``, ``text``: path of the study file, its content, and the sensor, as in :func:`read_candidates`.
+    ``ask``: answers whether finishes that its map lacks may be characterised now; None if nobody can answer.
     """
     sensor, _, map_name = text.partition("=")
     is_file = sensor.lower().endswith(".toml")

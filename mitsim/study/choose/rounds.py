@@ -52,13 +52,9 @@ _MORE = 40
 def state_by_screening(result: SensorResult, count: int, limit: TimeLimit, whole: TimeLimit) -> None:
     """State a sensor from ``count`` trials of the view that screening finds best for all measurements.
 
-    Parameters
-    ----------
-    result, count
-        Results of the sensor so far, which get the statement, and number of trials.
-    limit, whole
-        Time of the sensor, and of the comparison. If that of the sensor ends before there are a few trials, it gets
-        these within ``whole``: the light paths of its view are traced by then.
+    - ``result``, ``count``: results of the sensor so far, which get the statement, and number of trials.
+    - ``limit``, ``whole``: time of the sensor, and of the comparison. If that of the sensor ends before there are a few
+      trials, it gets these within ``whole``: the light paths of its view are traced by then.
     """
     for view in shortlist(result.scores, 1):
         _state(result, view, count, limit)

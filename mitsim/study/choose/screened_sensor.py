@@ -32,13 +32,9 @@ _LONGER = 1.5
 def screen_sensor(candidate: CandidateSensor, session: Session, limit: TimeLimit, equal: float) -> SensorResult:
     """Return the scores of all views, from the folder if they are there, or of those that the limit allows.
 
-    Parameters
-    ----------
-    candidate, session
-        The sensor, with the study for it; its session, with the folder of the sensor.
-    limit, equal
-        Time of the screening of this sensor; its share [s] of the time for screening, before sensors leave some of
-        theirs. Kept scores of fewer views are used again if it is hardly longer than theirs was.
+    - ``candidate``, ``session``: the sensor, with the study for it; its session, with the folder of the sensor.
+    - ``limit``, ``equal``: time of the screening of this sensor; its share [s] of the time for screening, before
+      sensors leave some of theirs. Kept scores of fewer views are used again if it is hardly longer than theirs was.
     """
     study, path = session.study, session.folder / "scores.nc"
     session.folder.mkdir(parents=True, exist_ok=True)

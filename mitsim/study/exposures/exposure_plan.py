@@ -76,27 +76,18 @@ class PlanRules:
 
 @dataclass(frozen=True)
 class ExposurePlan:
-    """Planned exposures of one ``view``, and their results.
-
-    - ``exposure``: the planned exposures and power.
-    - ``added``: exposure [s], and the result of it with all before it, the most useful first; with new noise.
-    - ``default``: result of the sensor's own exposure rule, with the same noise.
-    - ``limits``: most points and smallest u of every feature that can be measured.
-    - ``reached``: whether the plan reached all limits when it was chosen.
-    - ``unseen``: features with too few points at every exposure.
-    - ``sets_tried``: number of decoded sets, single exposures included.
-    - ``finished``: whether time sufficed for sets of several exposures and for the decision among them.
-    """
+    """Planned exposures of one ``view``, and their results."""
 
     view: int
-    exposure: PlannedExposure
+    exposure: PlannedExposure  # the planned exposures and power
+    #: exposure [s], and the result of it with all before it, the most useful first; with new noise
     added: tuple[tuple[float, ExposureResult], ...]
-    default: ExposureResult
-    limits: dict[str, FeatureResult]
-    reached: bool
-    unseen: tuple[str, ...]
-    sets_tried: int
-    finished: bool = True
+    default: ExposureResult  # result of the sensor's own exposure rule, with the same noise
+    limits: dict[str, FeatureResult]  # most points and smallest u of every feature that can be measured
+    reached: bool  # whether the plan reached all limits when it was chosen
+    unseen: tuple[str, ...]  # features with too few points at every exposure
+    sets_tried: int  # number of decoded sets, single exposures included
+    finished: bool = True  # whether time sufficed for sets of several exposures and for the decision among them
 
 
 class _Results:
@@ -129,17 +120,13 @@ def plan_exposures(
 ) -> ExposurePlan:
     """Plan the exposures of one view, or take the best single exposure that was tried when time ends.
 
-    Parameters
-    ----------
-    evaluate
-        Function of a set of exposures, the number of the noise and the number of its samples, which returns the result.
-    default, limits_s
-        The sensor's own exposures, from which the search starts; shortest and longest exposure of the device [s].
-    rules
-        Largest number of exposures, and the share by which a limit may be missed.
-    dimmable, view, over
-        Whether the power may be lowered if the shortest exposure is too bright; number of the view, for the plan;
-        returns whether time is over.
+    - ``evaluate``: function of a set of exposures, the number of the noise and the number of its samples, which returns
+      the result.
+    - ``default``, ``limits_s``: the sensor's own exposures, from which the search starts; shortest and longest exposure
+      of the device [s].
+    - ``rules``: largest number of exposures, and the share by which a limit may be missed.
+    - ``dimmable``, ``view``, ``over``: whether the power may be lowered if the shortest exposure is too bright; number
+      of the view, for the plan; returns whether time is over.
     """
     search, decision, report = (_Results(evaluate, noise, over) for noise in (SEARCH, DECISION, REPORT))
     try:

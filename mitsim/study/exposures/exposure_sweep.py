@@ -46,29 +46,22 @@ _STREAM = 77
 
 @dataclass(frozen=True)
 class FeatureResult:
-    """Result for one feature at one set of exposures.
+    """Result for one feature at one set of exposures."""
 
-    - ``points``: mean number of recovered points; ``fraction``: their share F of the possible points [1].
-    - ``u`` [mm]: standard uncertainty of the surface's position, root mean square over the noise samples. It is
-      infinite if the points are too few or do not determine the surface.
-    - ``scatter`` [mm]: robust standard deviation of the points along the rays, NaN if unknown; of rounded depths, of
-      which most are the same, the standard deviation.
-    - ``error``: relative standard error of u from the finite number of noise samples [1], 0 if unknown.
-    """
-
-    points: float
-    fraction: float
+    points: float  # mean number of recovered points
+    fraction: float  # their share F of the possible points [1]
+    #: [mm]: standard uncertainty of the surface's position, root mean square over the noise samples. It is infinite if
+    #: the points are too few or do not determine the surface
     u: float
+    #: [mm]: robust standard deviation of the points along the rays, NaN if unknown; of rounded depths, of which most
+    #: are the same, the standard deviation
     scatter: float
-    error: float = 0.0
+    error: float = 0.0  # relative standard error of u from the finite number of noise samples [1], 0 if unknown
 
 
 @dataclass(frozen=True)
 class ExposureResult:
-    """Result for all needed features at one set of exposures.
-
-    ``recovered`` are masks of the possible points (n,) in the last noise sample, by feature.
-    """
+    """Result for all needed features at one set of exposures; ``recovered`` (n,) masks of the last noise sample."""
 
     exposure: PlannedExposure
     features: dict[str, FeatureResult]
@@ -77,23 +70,15 @@ class ExposureResult:
 
 @dataclass(frozen=True)
 class _PossiblePoints:
-    """Points of a feature that an ideal sensor would return.
+    """Points of a feature that an ideal sensor would return."""
 
-    - ``pixel`` (n,): flat indices in the grid.
-    - ``derivatives`` (n, p) of the distance along the ray with respect to the surface's parameters.
-    - ``surface`` in the sensor frame [mm].
-    """
-
-    pixel: NDArray[np.int64]
-    derivatives: Floats
-    surface: Surface
+    pixel: NDArray[np.int64]  # (n,) flat indices in the grid
+    derivatives: Floats  # (n, p) of the distance along the ray with respect to the surface's parameters
+    surface: Surface  # in the sensor frame [mm]
 
 
 class ExposureSweep:
-    """Light of one view on the imagers, which can be exposed any number of times.
-
-    ``dimmable``: whether all light is the projector's, so that a lower power reduces all of it.
-    """
+    """Light of one view, exposed any number of times; ``dimmable``: all of it is the projector's."""
 
     def __init__(self, renderer: RenderedMeasurements, view: View) -> None:
         drawn = replace(renderer.unknowns, varied=()).draw(Trial(0))
@@ -130,14 +115,9 @@ def feature_result(
 
     Formulas and source: :mod:`mitsim.study.exposures.exposure_sweep`.
 
-    Parameters
-    ----------
-    cloud, surface
-        Organised cloud, and nominal surface, in the sensor frame [mm].
-    pixel
-        (n,) flat indices of the possible points in the grid.
-    derivatives
-        (n, p) derivatives at the possible points of the distance along the ray with respect to the parameters.
+    ``cloud``, ``surface``: organised cloud, and nominal surface, in the sensor frame [mm]. ``pixel``: (n,) flat indices
+    of the possible points in the grid. ``derivatives``: (n, p) derivatives at the possible points of the distance along
+    the ray with respect to the parameters.
     """
     points = cloud.points.reshape(-1, 3)[pixel].astype(float)
     finite = np.isfinite(points).all(axis=1)

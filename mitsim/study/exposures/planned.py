@@ -54,15 +54,7 @@ def kept_plan(
     digest: str,
     limit: TimeLimit | None = None,
 ) -> PlannedExposure:
-    """Return the planned exposures of a view, and keep a finished plan in a folder for the next call.
-
-    Parameters
-    ----------
-    renderer, view, rules, limit
-        As of :func:`plan_view`.
-    folder, digest
-        Of the plans of a study; of all that determines a trial: a plan of another digest is made again.
-    """
+    """Return the planned exposures of a view, kept in a folder for the ``digest`` of all that determines a trial."""
     path = folder / f"view_{view.number:04d}.json"
     digest_of_plan = with_exposure(digest, None, asdict(rules))
     if path.exists():
@@ -121,10 +113,7 @@ def rendered(measurements: RenderedMeasurements | MappedMeasurements) -> Rendere
 
 
 def stated_exposures(study: Study, exposures_s: Sequence[float], power: float) -> PlannedExposure:
-    """Return the exposures [s] that a study states, checked.
-
-    Raises InputError if the sensor cannot take or merge them.
-    """
+    """Return the exposures [s] that a study states; InputError if the sensor cannot take or merge them."""
     planned = PlannedExposure(tuple(sorted(exposures_s)), power)
     (shortest, longest), sensor = study.sensor.exposure.limits_s, study.sensor.name
     for seconds in planned.exposures_s:

@@ -40,10 +40,7 @@ Stating = Callable[[int, TimeLimit], list[Statement]]
 
 @dataclass(frozen=True)
 class Shortfall:
-    """A stated view whose measurements do not all fit, and what is known of the other views.
-
-    ``search`` finds sets of views by the map.
-    """
+    """A stated view whose measurements do not all fit, and the other views; ``search`` finds sets by the map."""
 
     session: Session
     stated: StatedView
@@ -163,10 +160,7 @@ def possible(now: Shortfall, effect: Effect) -> dict[str, float]:
 
 
 def same_direction(study: Study, view: View) -> View:
-    """Return the view of a study with direction and roll of a view of another.
-
-    Raises InputError if the study has none.
-    """
+    """Return the view of a study with direction and roll of another's view; InputError if it has none."""
     for candidate in study.views:
         if float(candidate.direction @ view.direction) > 1 - 1e-9 and math.isclose(
             candidate.roll_deg, view.roll_deg, abs_tol=1e-6

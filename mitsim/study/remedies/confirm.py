@@ -61,11 +61,7 @@ class TriedChange:
 
 @dataclass
 class Remedies:
-    """What was tried for the measurements that do not fit.
-
-    ``missed`` are their statements by name, ``failed`` the changes that are impossible with the reason. ``untried`` are
-    those for which time did not suffice.
-    """
+    """Statements ``missed`` by name, changes tried, ``failed`` with the reason, and ``untried`` for lack of time."""
 
     missed: dict[str, Statement]
     tried: list[TriedChange] = field(default_factory=list)
@@ -89,17 +85,12 @@ def find_remedies(
 ) -> Remedies:
     """Try changes until every missed measurement fits with one, no change is left, or time is over.
 
-    Parameters
-    ----------
-    missed
-        Statements of the measurements that do not fit, by name.
-    proposed
-        Changes, the least effort first; each is asked for only when those before it do not suffice.
-    trials, trial_s
-        Virtual measurements of a change; a quarter of them can exclude it, and four times as many may decide it.
-        Expected time of one [s]: a change that time does not suffice for the fewest of is not tried.
-    limit, before
-        Time, none by default; what was tried before: it is not tried again, and is part of the result.
+    - ``missed``: statements of the measurements that do not fit, by name.
+    - ``proposed``: changes, the least effort first; each is asked for only when those before it do not suffice.
+    - ``trials``, ``trial_s``: virtual measurements of a change; a quarter of them can exclude it, and four times as
+      many may decide it. Expected time of one [s]: a change that time does not suffice for the fewest of is not tried.
+    - ``limit``, ``before``: time, none by default; what was tried before: it is not tried again, and is part of the
+      result.
     """
     earlier = Remedies(missed) if before is None else before
     remedies, limit = Remedies(missed, list(earlier.tried), list(earlier.failed)), limit or TimeLimit()

@@ -46,12 +46,9 @@ def state_and_mend(
 ) -> tuple[StatedView, Remedies | None]:
     """Try changes for what a statement misses, and go on with the statement in turn with them, within a limit.
 
-    Parameters
-    ----------
-    session, now, clock
-        The study, being measured; the statement of its best view so far; times of the steps of the run.
-    limit
-        Time of all of it; without a limit the statement is finished, and changes have a time of their own.
+    ``session``, ``now``, ``clock``: the study, being measured; the statement of its best view so far; times of the
+    steps of the run. ``limit``: time of all of it; without a limit the statement is finished, and changes have a time
+    of their own.
     """
     made = _trials(now.stated)
     trial_s = clock.steps.get("state", 0.0) / made if made else 0.0

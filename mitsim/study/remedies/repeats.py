@@ -27,12 +27,8 @@ def state_mean(session: Session, view: View, captures: int, count: int, limit: T
 
     Captures without a value are left out of the mean of their day. Days that time does not suffice for are not used.
 
-    Parameters
-    ----------
-    session, view, limit
-        Of the study, the view at its exposures, and the time.
-    captures, count
-        Number of captures of a day, and largest number of days.
+    ``session``, ``view``, ``limit``: of the study, the view at its exposures, and the time. ``captures``, ``count``:
+    number of captures of a day, and largest number of days.
     """
     study, source = session.study, session.trials_of(view)
     trials = source.folder

@@ -89,12 +89,8 @@ def confirmed_set(
     the one of least excess. Trials in the folder are reused. Says of each set which limits it misses, and why no
     further set is tried.
 
-    Parameters
-    ----------
-    session, first
-        The study, with a table ``set``, and the set that is measured first.
-    search, over
-        Finds a set for other limits; returns whether time is over.
+    ``session``, ``first``: the study, with a table ``set``, and the set that is measured first. ``search``, ``over``:
+    finds a set for other limits; returns whether time is over.
     """
     table = session.study.file.set
     assert table is not None
@@ -172,10 +168,7 @@ def _excess(stated: Statement, limit: float) -> float:
 
 
 def state_set(session: Session, chosen: ViewSet, over: Callable[[], bool] = lambda: False) -> list[Statement]:
-    """State every measurement from a set of views together, and reuse trials in the folder of the session.
-
-    ``over`` returns whether to stop after the trial at hand.
-    """
+    """State every measurement from a set of views, reusing trials; ``over`` may stop it after each trial."""
     study, renderer, table = session.study, session.renderer, session.study.file.set
     assert table is not None and renderer is not None  # clouds drawn from a map cannot be joined
     content = ["set", list(chosen.views), table.joining, list(table.pose_known), _JOINING_VERSION]

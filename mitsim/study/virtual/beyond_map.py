@@ -60,19 +60,7 @@ class Sizes(Document):
 
 
 def drawn_sizes(rng: np.random.Generator, count: int, levels: Sequence[float], size: ArrayLike) -> NDArray[np.float64]:
-    """Draw errors (count,) of random sign, whose sizes have the stated quantiles.
-
-    Parameters
-    ----------
-    rng
-        Generator of the draws.
-    count
-        Number of errors.
-    levels
-        Levels of the quantiles, 0..1, ascending.
-    size
-        Quantiles (levels,) of the size of an error; the unit of the errors is that of the quantiles.
-    """
+    """Draw errors (count,) of random sign, sizes by quantiles ``size`` at ascending ``levels`` 0..1, in its unit."""
     quantiles = np.concatenate([[0.0], np.asarray(size, float)])
     magnitudes = np.interp(rng.uniform(0, 1, count), [0.0, *levels], quantiles)
     return np.asarray(magnitudes * rng.choice([-1.0, 1.0], count))

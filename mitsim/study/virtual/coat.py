@@ -71,16 +71,10 @@ def coated_shapes(scene: Scene, table: CoatUnknowns) -> list[int]:
 def coated(points: NDArray[np.float32], seen: SeenFaces, table: CoatUnknowns, seed: int) -> NDArray[np.float32]:
     """Return points (H, W, 3) [mm], sensor frame, displaced along their rays by the coat of their faces.
 
-    Parameters
-    ----------
-    points
-        (H, W, 3) points [mm], sensor frame, NaN where there is none. They are not changed.
-    seen
-        Faces that the pixels meet.
-    table
-        Thickness and spread of the coat.
-    seed
-        Selects the coat.
+    - ``points``: (H, W, 3) points [mm], sensor frame, NaN where there is none. They are not changed.
+    - ``seen``: faces that the pixels meet.
+    - ``table``: thickness and spread of the coat.
+    - ``seed``: selects the coat.
     """
     scene = seen.scene
     here = np.isin(seen.surfaces.shape, coated_shapes(scene, table)) & np.isfinite(points[..., 2])

@@ -53,13 +53,7 @@ def drawn_decoder(sensor: Sensor, unknowns: DecoderUnknowns, seed: int) -> Setti
 
 
 def check_decoder(sensor: Sensor, unknowns: DecoderUnknowns, where: str | Path) -> None:
-    """Check that the costs of OpenCV's SGBM hold every decoder that can be drawn.
-
-    Raises
-    ------
-    InputError
-        If not; it names ``where``.
-    """
+    """Check that the costs of OpenCV's SGBM hold every decoder that can be drawn; InputError at ``where``."""
     settings = sensor.settings
     if not isinstance(settings, MatcherSettings) or not decoder_is_drawn(sensor, unknowns):
         return
@@ -147,10 +141,7 @@ def _matcher(
 
 
 def decoder_numbers(settings: Settings) -> dict[str, float]:
-    """Return the settings that :func:`drawn_decoder` draws as numbers, the same names for all draws of a sensor.
-
-    Choices without an order are 0 or 1. Sizes, penalties and levels are logarithms.
-    """
+    """Return what :func:`drawn_decoder` draws by fixed names: choices 0 or 1; sizes, penalties, levels as logs."""
     level = math.log(max(getattr(settings, settings.level_key), 1e-9)) if settings.level_key else 0.0
     if isinstance(settings, DecoderSettings):
         return {"level": level, "smoothing": settings.smoothing_px}

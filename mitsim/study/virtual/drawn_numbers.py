@@ -82,16 +82,10 @@ def drawn_numbers(
 ) -> dict[str, Floats]:
     """Return the numbers (n, p) that each of the groups drew in trials, and squares of some.
 
-    Parameters
-    ----------
-    study, unknowns
-        The study, and its unknowns prepared for drawing.
-    source
-        How trials are made: ``render`` or ``map``.
-    trials
-        The n trials.
-    groups
-        Groups of unknowns. Those that draw only a seed are not in the result.
+    - ``study``, ``unknowns``: the study, and its unknowns prepared for drawing.
+    - ``source``: how trials are made: ``render`` or ``map``.
+    - ``trials``: the n trials.
+    - ``groups``: groups of unknowns. Those that draw only a seed are not in the result.
     """
     out = {}
     for group in groups:
@@ -110,21 +104,7 @@ def drawn_numbers(
 def named_numbers(
     study: Study, unknowns: Unknowns, trials: Sequence[Trial], groups: Sequence[str]
 ) -> list[DrawnNumber]:
-    """Return the numbers of rendered trials that a user could find out: of finishes, decoder and light.
-
-    Parameters
-    ----------
-    study, unknowns
-        The study, and its unknowns prepared for drawing.
-    trials
-        Trials of a rendered view.
-    groups
-        Groups of unknowns that are drawn.
-
-    See Also
-    --------
-    drawn_numbers : all numbers, without names
-    """
+    """Return what a user could find out of rendered trials, by the ``groups`` drawn: finishes, decoder and light."""
     values: dict[tuple[str, str, str], list[float]] = {}
     for trial in trials:
         drawn = unknowns.draw(trial)

@@ -73,17 +73,7 @@ def form_measurements(task: Task) -> list[str]:
 def measured_with_form(
     task: Task, evaluate: Callable[[Task, bool], dict[str, Result]], deviates: bool
 ) -> dict[str, Result]:
-    """Return all measurements of a cloud; those of form from the cloud without form deviation.
-
-    Parameters
-    ----------
-    task
-        The task.
-    evaluate
-        Measures a task in the cloud with or without form deviation.
-    deviates
-        Whether the cloud has a form deviation at all.
-    """
+    """Return all measurements of a cloud; those of form from ``evaluate`` without form, if the cloud ``deviates``."""
     names = form_measurements(task) if deviates else []
     if not names:
         return evaluate(task, True)
@@ -98,19 +88,13 @@ def measured_with_form(
 
 @dataclass(frozen=True)
 class FaceForm:
-    """Form deviation of a face of any draw: a zone about its least-squares feature.
+    """Form deviation of a face of any draw: a zone about its least-squares feature."""
 
-    - ``name`` of the face, and its nominal ``surface``, part frame.
-    - ``zone``: width [mm], from the lowest to the highest place of the face.
-    - ``extent`` of the face [mm].
-    - ``places`` (n, 3) [mm] all over the face, part frame, and the ``areas`` (n,) that they stand for.
-    """
-
-    name: str
+    name: str  # of the face, and its nominal ``surface``, part frame
     surface: Surface
-    zone: float
-    extent: float
-    places: Floats
+    zone: float  # width [mm], from the lowest to the highest place of the face
+    extent: float  # of the face [mm]
+    places: Floats  # (n, 3) [mm] all over the face, part frame, and the ``areas`` (n,) that they stand for
     areas: Floats
 
     def heights(self, positions: NDArray[np.floating], seed: int) -> Floats:
@@ -155,10 +139,7 @@ class SeenFaces:
     def raised(
         self, points: NDArray[np.float32], here: NDArray[np.bool_], height: NDArray[np.floating]
     ) -> NDArray[np.float32]:
-        """Return points (H, W, 3) [mm], sensor frame, of which some move along their rays.
-
-        Those of the pixels ``here`` (H, W) lie by ``height`` (n,) [mm] farther out along the normal of their face.
-        """
+        """Return points (H, W, 3) [mm], sensor frame, raised along rays ``here`` (H, W) by ``height`` (n,) normally."""
         out = points.copy()
         rows, columns = np.nonzero(here)
         rays = self.grid.rays_at(columns, rows)
@@ -172,16 +153,10 @@ def form_deviation(
 ) -> NDArray[np.float32]:
     """Return points (H, W, 3) [mm], sensor frame, displaced along their rays by the form deviation of their faces.
 
-    Parameters
-    ----------
-    points
-        (H, W, 3) points [mm], sensor frame, NaN where there is none. They are not changed.
-    seen
-        Faces that the pixels meet.
-    forms
-        Forms of the faces that deviate.
-    seed
-        Selects the form; each face has its own field.
+    - ``points``: (H, W, 3) points [mm], sensor frame, NaN where there is none. They are not changed.
+    - ``seen``: faces that the pixels meet.
+    - ``forms``: forms of the faces that deviate.
+    - ``seed``: selects the form; each face has its own field.
     """
     out, pose = points, seen.world_from_sensor
     for form in forms:

@@ -13,11 +13,7 @@ from mitsim.sensor.unknowns import FLIGHT_DRIFT, TRIANGULATION_DRIFT, UnknownsTa
 
 @dataclass(frozen=True)
 class Influence:
-    """One influence: its ``name``, whether it is ``included``, and ``how``, or how to include or reduce it.
-
-    An influence that is not included is fixed at its nominal value if mitsim could vary it (``simulated``), and left
-    out otherwise.
-    """
+    """One influence, ``included`` and ``how``; else fixed at nominal if ``simulated``, or left out."""
 
     name: str
     included: bool

@@ -121,10 +121,7 @@ class MappedMeasurements:
             self._predicted[view.number] = dict(zip(scores["measurement"].values.tolist(), row, strict=True))
 
     def _with_beyond(self, outcome: Outcome, view: View, drawn: DrawnValues) -> Outcome:
-        """Add effects outside the map; NaN if screening rates a measurement as impossible.
-
-        An effect on a value that folds is a deviation in a random direction.
-        """
+        """Add effects outside the map, randomly directed for folded values; NaN for impossible measurements."""
         if self._beyond_sizes is None:
             return outcome
         sizes = self._beyond_sizes.draw(np.random.default_rng(drawn.beyond), len(outcome.errors))
@@ -178,10 +175,7 @@ def drawn_map(performance_map: PerformanceMap, unknowns: Unknowns, finish: int) 
 
 
 def drawn_spread(study: Study, unknowns: Unknowns, finish: int) -> Floats:
-    """Return the numbers (2 s,) that the spread of finishes drew, for the s samples of the map that represent a part.
-
-    Those of the best estimate are 0.
-    """
+    """Return the numbers (2 s,) that the spread of finishes drew for the map's s samples; 0 at the best estimate."""
     performance_map = study.performance_map
     assert performance_map is not None
     used = set[int]()

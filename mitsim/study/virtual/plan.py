@@ -109,25 +109,13 @@ def rendering_of(study: Study) -> Rendering:
 
 
 def race_rendering(study: Study) -> Rendering:
-    """Return the settings for rendering the race of a study, with fewer paths of interreflections.
-
-    See Also
-    --------
-    rendering_of : those of its statements
-    """
+    """Return the settings for rendering the race of a study, with fewer paths of interreflections."""
     is_matcher = isinstance(study.sensor.settings, MatcherSettings)
     return _with_fewer(rendering_of(study), _FEWER_OF_MATCHER_IN_RACE if is_matcher else _FEWER_IN_RACE)
 
 
 def change_rendering(study: Study) -> Rendering:
-    """Return the settings for rendering a change of a study that may make its measurements fit.
-
-    Matchers have the paths of their statements, which are few.
-
-    See Also
-    --------
-    rendering_of : those of its statements
-    """
+    """Return the settings for rendering a change; matchers have the few paths of their statements."""
     is_matcher = isinstance(study.sensor.settings, MatcherSettings)
     return _with_fewer(rendering_of(study), 1 if is_matcher else _FEWER_IN_CHANGES)
 
@@ -165,17 +153,7 @@ def measured_by(study: Study) -> str:
 def measurements_of(
     study: Study, unknowns: Unknowns, separate_light: bool = False, rendering: Rendering | None = None
 ) -> RenderedMeasurements | MappedMeasurements:
-    """Prepare a study's sensor, or its map, for virtual measurements.
-
-    Parameters
-    ----------
-    study, unknowns
-        The study, and its unknowns prepared for drawing.
-    separate_light
-        Whether every trial renders all of its light.
-    rendering
-        By default that of statements.
-    """
+    """Prepare a study's sensor, or its map, for virtual measurements, by default rendered as for statements."""
     if measured_by(study) == "map":
         return MappedMeasurements(study, unknowns)
     return RenderedMeasurements(study, unknowns, rendering or rendering_of(study), separate_light)
@@ -206,20 +184,9 @@ def trial_digest(
     These are sensor, calibration, unknowns, task, views, the scene with its meshes and textures, and, for clouds drawn
     from the map, the map.
 
-    Parameters
-    ----------
-    study, unknowns
-        The study, and its unknowns prepared for drawing.
-    source
-        How trials are made: ``render`` or ``map``.
-    separate_light
-        Whether every trial renders all of its light.
-    rendering
-        By default that of statements.
-
-    See Also
-    --------
-    study_digest : Digest of everything that determines the results of a study.
+    ``study``, ``unknowns``: the study, and its unknowns prepared for drawing. ``source``: how trials are made:
+    ``render`` or ``map``. ``separate_light``: whether every trial renders all of its light. ``rendering``: by default
+    that of statements.
     """
     file = study.file
     content = {

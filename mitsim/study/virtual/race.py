@@ -142,24 +142,12 @@ def run_race(
 ) -> Raced:
     """Race the views on the shortlist, and reuse trials in the folder.
 
-    Parameters
-    ----------
-    views, scores
-        All candidate views, and their scores by the map.
-    runner
-        Makes the virtual measurements.
-    trials
-        Finished trials, to which those of the race are added.
-    rules
-        Shortlist, largest number of trials, and the end of the race.
-    over
-        Returns whether time is over; asked after every trial.
-    after_round
-        Receives the state before the first trial, after every round, and within long rounds.
-
-    See Also
-    --------
-    standings : the state after some trials
+    - ``views``, ``scores``: all candidate views, and their scores by the map.
+    - ``runner``: makes the virtual measurements.
+    - ``trials``: finished trials, to which those of the race are added.
+    - ``rules``: shortlist, largest number of trials, and the end of the race.
+    - ``over``: returns whether time is over; asked after every trial.
+    - ``after_round``: receives the state before the first trial, after every round, and within long rounds.
     """
     numbers = shortlist(scores, rules.shortlist, rules.each)
     if not numbers:
@@ -217,22 +205,9 @@ def standings(
 ) -> Raced:
     """Return the state of the race after some trials of each view.
 
-    Parameters
-    ----------
-    scores
-        Scores of the candidate views, with the variables ``predicted_uncertainty`` and ``chance`` of each measurement.
-    numbers
-        Numbers of the views on the shortlist.
-    trials
-        Folder of the trials.
-    counts
-        Number of trials that are used, by number of a view.
-    rules
-        Margin and loss of the decision.
-
-    See Also
-    --------
-    run_race : the whole race
+    ``scores``: scores of the candidate views, with the variables ``predicted_uncertainty`` and ``chance`` of each
+    measurement. ``numbers``: numbers of the views on the shortlist. ``trials``: folder of the trials. ``counts``:
+    number of trials that are used, by number of a view. ``rules``: margin and loss of the decision.
     """
     names = list(trials.measurements)
     most = max(max(counts.values(), default=0), 1)

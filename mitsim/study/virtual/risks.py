@@ -39,10 +39,7 @@ def combined_cost(cost: Floats, tolerances: Floats) -> Floats:
 
 
 def first_of_each(cost: Floats, count: int) -> set[int]:
-    """Return the indices of the ``count`` views of least cost, for each row of ``cost`` (row, view).
-
-    Views of infinite cost are excluded.
-    """
+    """Return the indices of the ``count`` least finite costs of each row of ``cost`` (row, view)."""
     return {int(i) for row in cost for i in np.argsort(row, kind="stable")[:count] if np.isfinite(row[i])}
 
 

@@ -79,10 +79,7 @@ def effects_of(study: Study, unknowns: Unknowns, limit: TimeLimit | None = None)
 
 
 def shared_errors(study: Study, unknowns: Unknowns) -> SharedErrors:
-    """Return displacement fields of the errors of calibration and sensor temperature, over the volume of the views.
-
-    The misalignment of a sensor file is one more field.
-    """
+    """Return displacement fields of calibration, temperature and misalignment over the volume of the views."""
     sensor, calibration, temperature = study.sensor, unknowns.calibration, unknowns.table.temperature
     points = _places(study)
     values, vectors = np.linalg.eigh(calibration.correlation)

@@ -54,10 +54,7 @@ class TrialOrder:
 
 
 class SpreadMeasurements:
-    """Virtual measurements that workers make.
-
-    Workers prepare the study again for another ``digest``, which identifies everything that determines a trial.
-    """
+    """Virtual measurements by workers, which prepare the study anew for another ``digest`` of all of a trial."""
 
     source = "render"
 

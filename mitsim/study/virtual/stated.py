@@ -69,10 +69,7 @@ _METAL_TAIL = 28.0
 
 @dataclass(frozen=True)
 class TrialsOfView:
-    """What makes the trials of a statement of one view, and where they are kept.
-
-    ``planned`` are the exposures of the trials, None for the sensor's own rule.
-    """
+    """What makes the trials of a view's statement and keeps them; ``planned`` None: the sensor's own exposures."""
 
     runner: TrialRunner
     folder: TrialFolder
@@ -81,10 +78,7 @@ class TrialsOfView:
 
 @dataclass(frozen=True)
 class StatedView:
-    """Statements of every measurement from one view.
-
-    ``planned`` are the exposures that they hold for, None for the sensor's own rule.
-    """
+    """Statements of every measurement from a view at its ``planned`` exposures, None for the sensor's own rule."""
 
     view: View
     statements: list[Statement]
@@ -116,17 +110,14 @@ def state_view(
     settled (JCGM 101:2008, 7.9) or, where the study names no number, every standard uncertainty is known well enough.
     The latter does not count before the default number: few trials of errors with long tails show too little of them.
 
-    Parameters
-    ----------
-    study, unknowns, source, view
-        The study, what is unknown of it, the maker of the trials, and the view.
-    table
-        Replaces the study's number of trials, which are then made whether or not fewer would settle the statement.
-    limit
-        Time of the statement. A study that names no number of trials may make :data:`MOST_WITHIN_A_LIMIT` within it,
-        and does not end at a known uncertainty; without a limit, :data:`MOST`.
-    after_batch
-        Receives the statement, without a budget, after every :data:`BATCH` trials but the last; ends it by True.
+    - ``study``, ``unknowns``, ``source``, ``view``: the study, what is unknown of it, the maker of the trials, and the
+      view.
+    - ``table``: replaces the study's number of trials, which are then made whether or not fewer would settle the
+      statement.
+    - ``limit``: time of the statement. A study that names no number of trials may make :data:`MOST_WITHIN_A_LIMIT`
+      within it, and does not end at a known uncertainty; without a limit, :data:`MOST`.
+    - ``after_batch``: receives the statement, without a budget, after every :data:`BATCH` trials but the last; ends it
+      by True.
     """
     runner, trials, planned = source.runner, source.folder, source.planned
     limit = TimeLimit() if limit is None else limit
@@ -224,10 +215,7 @@ def _settled(stated: Sequence[Statement]) -> bool:
 
 
 def least_trials(study: Study, share: float) -> int:
-    """Return the number of trials after which a standard deviation can be known to a share of it.
-
-    Its relative variance is (k - 1) / 4 n for n errors of kurtosis k.
-    """
+    """Return the n that gives a standard deviation to a share, by its relative variance (k - 1) / 4 n, kurtosis k."""
     scatters = [finish.scatter for finish in finishes_of_features(study).values() if finish is not None]
     bare = any(scatter is not None and not scatter.depolarising for scatter in scatters)
     return math.ceil((_METAL_TAIL if bare else _NORMAL_TAIL) / (4 * share**2))

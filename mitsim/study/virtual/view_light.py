@@ -80,21 +80,7 @@ def regions(
 def seen_surfaces(
     simulated: SimulatedSensor, scene: Scene, pose: Transform, rois: dict[str, Roi]
 ) -> dict[str, SeenSurfaces]:
-    """Return the surfaces that the pixels of each camera's region see, from a pose of the sensor.
-
-    Parameters
-    ----------
-    simulated, scene
-        Sensor and part.
-    pose
-        Sensor to world.
-    rois
-        Region of each camera's image.
-
-    See Also
-    --------
-    regions : the regions
-    """
+    """Return the surfaces that the pixels of each camera's region see, from a pose ``world_from_sensor``."""
     return {name: SeenSurfaces.of(scene, simulated.pixel_rays(name), pose, roi) for name, roi in rois.items()}
 
 

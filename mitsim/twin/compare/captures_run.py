@@ -60,10 +60,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class CaptureValidation:
-    """The ``comparison`` of two captures, its ``table`` and a ``preamble`` in Markdown, and both ``sides``.
-
-    ``fitted`` says so if the simulated sensor was fitted to the real capture, else it is empty.
-    """
+    """The ``comparison`` of two captures, ``table``, ``preamble``, both ``sides``; ``fitted`` says if one is fitted."""
 
     comparison: Comparison
     table: str

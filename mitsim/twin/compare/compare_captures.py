@@ -63,10 +63,7 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class ComparedRow:
-    """A quantity of both captures; ``uncertainty`` (k = 1) and ``margin`` of the difference are in its unit.
-
-    ``why`` is the reason for the verdict. Unknown numbers are NaN; all are NaN if the quantity does not apply.
-    """
+    """A quantity of both captures, unknown numbers NaN; ``uncertainty`` (k = 1), ``margin``, ``why`` of the verdict."""
 
     quantity: str
     unit: str
@@ -81,10 +78,7 @@ class ComparedRow:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All rows, and the patches of both captures.
-
-    ``image_patches`` and ``cloud_patches`` are their numbers; ``window_px`` is the window of the contrast.
-    """
+    """All rows; numbers of the ``image_patches`` and ``cloud_patches``; ``window_px`` of the contrast."""
 
     rows: tuple[ComparedRow, ...]
     image_patches: int
@@ -127,17 +121,12 @@ def compare_captures(
     Raises InputError if the simulated capture has another camera, its specimen is at another distance, or the specimen
     is too small.
 
-    Parameters
-    ----------
-    real, simulated, settings
-        The two captures, and the settings of the decoder for both.
-    specimen
-        Pose and extent of the specimen in the real capture's sensor frame; its pixels are evaluated in both captures.
-    where, seed
-        Name of the simulated capture in messages; selects the draws of the bootstrap.
-    projector_on
-        State of the projector in the real capture. If only one of the captures has a pattern, quantities that need one
-        are not comparable.
+    - ``real``, ``simulated``, ``settings``: the two captures, and the settings of the decoder for both.
+    - ``specimen``: pose and extent of the specimen in the real capture's sensor frame; its pixels are evaluated in both
+      captures.
+    - ``where``, ``seed``: name of the simulated capture in messages; selects the draws of the bootstrap.
+    - ``projector_on``: state of the projector in the real capture. If only one of the captures has a pattern,
+      quantities that need one are not comparable.
     """
     _check(real, simulated, where)
     window = contrast_window(real, specimen)

@@ -53,10 +53,7 @@ class PlainImage:
 
 
 def plain_image(capture: Capture) -> PlainImage:
-    """Select the plain image of a capture.
-
-    Raises InputError if the capture's technology needs a pattern and the settings do not name one.
-    """
+    """Select the plain image of a capture; InputError without a pattern that its technology needs."""
     code = capture_pattern(capture)
     if isinstance(code, AmplitudeModulation):
         return PlainImage(tuple(range(code.count)), "the light of the correlations", False, 2**capture.bits - 1)

@@ -86,13 +86,9 @@ def texture_of(specimen: Specimen, camera: Camera, electrons: Floats, light: Lig
     It is the ratio of the recorded image to that of a white plate. Outside the image of the reference camera, the value
     of the nearest pixel is repeated.
 
-    Parameters
-    ----------
-    specimen, camera, electrons
-        Pose and extent of the plate; the camera, and the plain image (H, W) [e-] that it recorded.
-    light, name
-        Light of a white plate on the imagers, of the region of the image that shows the plate, and name of the camera
-        in it.
+    ``specimen``, ``camera``, ``electrons``: pose and extent of the plate; the camera, and the plain image (H, W) [e-]
+    that it recorded. ``light``, ``name``: light of a white plate on the imagers, of the region of the image that shows
+    the plate, and name of the camera in it.
     """
     roi = light.rois[name]
     inside = roi.slices

@@ -74,16 +74,11 @@ def rebuild(
 
     Raises InputError if the sensor has another technology, or takes other images than the recording.
 
-    Parameters
-    ----------
-    real, where
-        Recorded capture, and its name in messages.
-    sensor
-        Supplies projector, pattern and imager in place of those of the device.
-    specimen
-        Pose and extent of the specimen, from :func:`mitsim.twin.finish.find_specimen.find_specimen`.
-    projector_on, seed
-        If false, the plate has the texture that the reference camera recorded, and even light; selects the noise.
+    - ``real``, ``where``: recorded capture, and its name in messages.
+    - ``sensor``: supplies projector, pattern and imager in place of those of the device.
+    - ``specimen``: pose and extent of the specimen, from :func:`mitsim.twin.finish.find_specimen.find_specimen`.
+    - ``projector_on``, ``seed``: if false, the plate has the texture that the reference camera recorded, and even
+      light; selects the noise.
     """
     check_technology(real, sensor, where)
     twin_sensor = like(real, sensor, where)
@@ -202,10 +197,7 @@ def _scale(
 
 
 def projector_was_on(real: Capture, state: Literal["on", "off"] | None, where: str) -> bool:
-    """Return whether the projector was on: as ``state``, else as in the settings; codes and simulations need it on.
-
-    Raises InputError if the state is unknown for a pair that is matched by its texture.
-    """
+    """Return whether the projector was on: as stated, else by settings; InputError if unknown for a textured pair."""
     if state is not None:
         return state == "on"
     setting = real.settings.get("projector_on")

@@ -91,15 +91,7 @@ class SpecimenPatches:
 def specimen_patches(
     capture: Capture, settings: Settings, geometry: Geometry, specimen: Specimen, window_px: int
 ) -> SpecimenPatches:
-    """Compute the patches of a capture's specimen.
-
-    Parameters
-    ----------
-    capture, settings, geometry
-        Capture of a flat specimen, and settings and geometry of its decoder.
-    specimen, window_px
-        Pose and extent of the specimen, in the sensor frame; side of the window of local mean and deviation [px].
-    """
+    """Return the patches of a flat specimen, sensor frame; ``window_px`` of local mean and deviation."""
     camera, image = capture.rig.reference, reference_levels(capture).astype(float)
     on_image = image_mask(specimen, camera, MARGIN_PX)
     mean = uniform_filter(image, window_px)
@@ -153,12 +145,8 @@ def patch_rows(
 
     Also returns columns and rows of their middles in the right image.
 
-    Parameters
-    ----------
-    capture, settings, geometry
-        Capture of a flat specimen, settings of its decoder, and rectified geometry of its pair of cameras.
-    specimen
-        Pose and extent of the specimen.
+    ``capture``, ``settings``, ``geometry``: capture of a flat specimen, settings of its decoder, and rectified geometry
+    of its pair of cameras. ``specimen``: pose and extent of the specimen.
     """
     cloud, on_grid, corners = _cloud_patches(capture, settings, geometry, specimen)
     valid = _tiles(np.where(on_grid, cloud.valid.astype(float), np.nan), corners)
@@ -203,10 +191,7 @@ def reference_levels(capture: Capture) -> NDArray[np.unsignedinteger[Any]]:
 
 
 def contrast_window(capture: Capture, specimen: Specimen) -> int:
-    """Return the odd side [px] of a window for local means, in which several dots of any size lie.
-
-    It is 2.5 times the mean run of bright and dark pixels in the specimen's rows. The threshold is the mean of 31 px.
-    """
+    """Return the odd side [px] of a window for local means: 2.5 times the mean run about the mean of 31 px."""
     image = reference_levels(capture).astype(float)
     bright = image > uniform_filter(image, _WINDOWS[1])
     there = image_mask(specimen, capture.rig.reference, MARGIN_PX)[:, 1:]

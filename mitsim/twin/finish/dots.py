@@ -28,28 +28,17 @@ _LARGEST_BLUR = 4.0
 
 @dataclass(frozen=True)
 class Dots:
-    """Recorded dots of one view, compared with those of the sensor file.
-
-    - ``contrast``: recorded rms over the mean [1], in all light; ``file_contrast``: that of the file's pattern alone.
-    - ``blur_px``: blur [px] with which the file's dots are as sharp as the recorded ones, 0 if these are sharper.
-    - ``power``: relative power times the albedo [1], from the strength of the dots.
-
-    ``blur_px`` and ``power`` are NaN if there are no dots.
-    """
+    """Recorded dots of one view against those of the sensor file; NaN ``blur_px`` and ``power`` without dots."""
 
     camera: str
-    contrast: float
-    file_contrast: float
-    blur_px: float
-    power: float
+    contrast: float  # recorded rms over the mean [1], in all light
+    file_contrast: float  # that of the file's pattern alone
+    blur_px: float  # blur [px] with which the file's dots are as sharp as the recorded ones, 0 if these are sharper
+    power: float  # relative power times the albedo [1], from the strength of the dots
 
 
 def compare_dots(view: CouponView, renderer: WhiteCouponRenderer) -> Dots:
-    """Compare the dots of a view with those of the first frame of the sensor's own pattern.
-
-    ``view`` comes from :func:`~mitsim.twin.finish.observation.observe` with the pattern ``level``, so that its ``unit``
-    light has no dots.
-    """
+    """Compare the dots of a ``level`` view, whose ``unit`` light has none, with the first frame of the sensor's own."""
     camera = renderer.sensor.rig.cameras[view.camera]
     roi = coupon_roi(camera, view.specimen)
     spectrum = np.fft.fft2(renderer.white(view.specimen, view.camera, roi, "first") * view.exposure_s)

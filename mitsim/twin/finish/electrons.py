@@ -54,14 +54,10 @@ class PixelNoise:
 def pixel_noise(imager: Imager, chip: Imager, count: int, exposure_s: float, ambient: bool) -> PixelNoise:
     """Return the noise of the mean of several images of one exposure; shot noise of the scene's own light is neglected.
 
-    Parameters
-    ----------
-    imager, chip
-        Source of the noise, and the imager with the capture's number of bits (:func:`chip_of`).
-    count, exposure_s
-        Number of images, and their exposure [s].
-    ambient
-        Whether an image with the projector off is subtracted. Its read noise adds, and the fixed pattern cancels.
+    - ``imager``, ``chip``: source of the noise, and the imager with the capture's number of bits (:func:`chip_of`).
+    - ``count``, ``exposure_s``: number of images, and their exposure [s].
+    - ``ambient``: whether an image with the projector off is subtracted. Its read noise adds, and the fixed pattern
+      cancels.
     """
     per_image = 1.0 / count + (1.0 if ambient else 0.0)
     level = 1.0 / chip.gain  # e- of a grey level
@@ -109,10 +105,7 @@ def sensor_of(capture: Capture, name: str | None, where: str | Path, purpose: Pu
 
 
 def chip_of(capture: Capture, imager: Imager, where: str) -> Imager:
-    """Return the imager with the capture's number of bits: the sensor's, or its converter before companding.
-
-    Raises InputError if neither has this number of bits.
-    """
+    """Return the imager, or its converter before companding, with the capture's number of bits; else InputError."""
     for chip in (imager, converter(imager, Noise.without("quantisation"))):
         if chip.bits == capture.bits:
             return chip

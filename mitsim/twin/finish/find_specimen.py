@@ -51,22 +51,14 @@ def find_specimen(capture: Capture, settings: Settings, roi: Roi | None, where: 
 
     Raises InputError if the capture has no images, the region is not in the image, or too few points lie in one plane.
 
-    Parameters
-    ----------
-    capture, settings
-        Capture with images, and the settings of its decoder.
-    roi
-        Region of the reference image [px] that shows only the specimen, also where it has no points. The plane is
-        fitted to its points (:func:`characterisation.features.fits.fit_plane`). Without a region,
-        :func:`mitsim.twin.finish.specimen.specimen_in_cloud` takes the plane of most points, and the outline of the
-        dense ones.
-    where
-        Name of the capture in messages.
+    - ``capture``, ``settings``: capture with images, and the settings of its decoder.
+    - ``roi``: region of the reference image [px] that shows only the specimen, also where it has no points. The plane
+      is fitted to its points (:func:`characterisation.features.fits.fit_plane`). Without a region,
+      :func:`mitsim.twin.finish.specimen.specimen_in_cloud` takes the plane of most points, and the outline of the dense
+      ones.
+    - ``where``: name of the capture in messages.
 
-    Returns
-    -------
-    Specimen
-        Its ``off_plane`` is a robust standard deviation with a region, and the rms distance without one.
+    ``off_plane`` of the result is a robust standard deviation with a region, and the rms distance without one.
     """
     if not capture.images:
         raise InputError(where, "images", "none", "a capture with images, not only a map of the device")
@@ -129,15 +121,11 @@ def find_coupon(
 
     Raises InputError if no plane is found, or the sensor is behind the coupon.
 
-    Parameters
-    ----------
-    capture, sensor, where
-        Capture of the coupon, the sensor whose decoder and imager it is read with, and its name in messages.
-    size
-        Width and height of the coupon [mm].
-    roi
-        Image region that shows the coupon. Without it the coupon follows from the capture's pose, otherwise from the
-        plane of its cloud.
+    - ``capture``, ``sensor``, ``where``: capture of the coupon, the sensor whose decoder and imager it is read with,
+      and its name in messages.
+    - ``size``: width and height of the coupon [mm].
+    - ``roi``: image region that shows the coupon. Without it the coupon follows from the capture's pose, otherwise from
+      the plane of its cloud.
     """
     if roi is not None:
         return find_specimen(capture, sensor.settings, roi, where)
@@ -163,13 +151,9 @@ def _bend_of(specimen: Specimen, points: Floats) -> Bend | None:
 def on_specimen(specimen: Specimen, origin: Floats, rays: Floats, pitch: float, margin_px: float) -> NDArray[np.bool_]:
     """Return which view rays meet the specimen, (...), at least a margin inside its outline.
 
-    Parameters
-    ----------
-    specimen, margin_px
-        Plane and outline of the specimen, and the margin.
-    origin, rays, pitch
-        Common origin (3,) [mm] and unit vectors (..., 3) of the rays, in the sensor frame; angle of neighbouring rays
-        [rad].
+    ``specimen``, ``margin_px``: plane and outline of the specimen, and the margin. ``origin``, ``rays``, ``pitch``:
+    common origin (3,) [mm] and unit vectors (..., 3) of the rays, in the sensor frame; angle of neighbouring rays
+    [rad].
     """
     points, reach, cosine = feet_of(specimen.world_from_sensor, origin, rays)
     down = cosine > GRAZING

@@ -41,18 +41,15 @@ _TABLE_SIZE = 64
 
 @dataclass(frozen=True)
 class MetalFinish:
-    """A machined metal with an unknown width of its lobe.
+    """A machined metal with an unknown width of its lobe."""
 
-    - ``metal``, ``process``, ``wavelength_nm``; ``index`` (n, k): refractive index.
-    - ``normal_reflectance``: F0 [1], which is also the albedo of the wide-angle share.
-    - ``log_alpha``, ``log_ra`` (n,): table of alpha(Ra) where it increases, as natural logarithms; Ra is in um.
-    """
-
+    #: ``metal``, ``process``, ``wavelength_nm``
     metal: str
     process: str
     wavelength_nm: float
-    index: tuple[float, float]
-    normal_reflectance: float
+    index: tuple[float, float]  # (n, k) refractive index
+    normal_reflectance: float  # F0 [1], which is also the albedo of the wide-angle share
+    #: ``log_alpha``, ``log_ra`` (n,): table of alpha(Ra) where it increases, as natural logarithms; Ra is in um
     log_alpha: NDArray[np.float64] = field(repr=False)
     log_ra: NDArray[np.float64] = field(repr=False)
     _along: dict[str, NDArray[np.float64]] = field(repr=False)
@@ -107,10 +104,7 @@ class MetalFinish:
 
 
 def metal_finish(finish: Finish, wavelength_nm: float, where: str) -> MetalFinish:
-    """Return the finishes of all alphas with the metal and process of a scene's coupon; messages name ``where``.
-
-    Raises InputError for a finish that is not a machined metal, or has a lay.
-    """
+    """Return the finishes of all alphas of a coupon's metal and process; InputError if none, or with a lay."""
     metal, _, process = finish.name.partition("/")
     if metal not in CONSTANTS or process not in PROCESSES or finish.scatter is None:
         raise InputError(where, "bsdf", finish.name, "machined_metal, or matt_white for a diffuse sheet")

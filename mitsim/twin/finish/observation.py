@@ -46,40 +46,30 @@ _UNLIT = 1e-3
 
 @dataclass(frozen=True)
 class CouponView:
-    """A coupon in the images of one camera at one exposure: N pixels in ``size`` blocks.
+    """A coupon in the images of one camera at one exposure: N pixels in ``size`` blocks."""
 
-    - ``capture``: index of the capture; ``name``: its name in messages; ``camera``; ``exposure_s`` [s].
-    - ``columns``, ``rows`` (N,) [px] in the camera's image.
-    - ``block`` (N,): index of each pixel's block; ``width``: side of a block [px].
-    - ``grid`` (size, 2): row and column of each block.
-    - ``electrons`` (N,) [e-]: mean over the images.
-    - ``unit`` (N,) [e-]: electrons for pi f = 1 at the power of the sensor file.
-    - ``ambient`` (N,) [s]: electrons from the light of the room, over its e-/s in the middle of the image. It is 0 if
-      there is none, or if it was subtracted.
-    - ``toward_camera``, ``toward_projector`` (N, 3): unit directions, in the frame of the coupon.
-    - ``noise`` of a pixel's mean.
-    - ``whole``: number of blocks on the coupon, saturated ones included; the coupon is the ``specimen``.
-    - ``why_no_block``: reason why there is no block on the coupon, "" otherwise.
-    """
-
-    capture: int
-    name: str
+    capture: int  # index of the capture
+    name: str  # its name in messages; ``camera``; ``exposure_s`` [s]
     camera: str
     exposure_s: float
+    #: ``columns``, ``rows`` (N,) [px] in the camera's image
     columns: NDArray[np.int64]
     rows: NDArray[np.int64]
-    block: NDArray[np.int64]
-    width: int
-    grid: NDArray[np.int64]
-    electrons: Floats = field(repr=False)
-    unit: Floats = field(repr=False)
+    block: NDArray[np.int64]  # (N,) index of each pixel's block
+    width: int  # side of a block [px]
+    grid: NDArray[np.int64]  # (size, 2) row and column of each block
+    electrons: Floats = field(repr=False)  # (N,) [e-]: mean over the images
+    unit: Floats = field(repr=False)  # (N,) [e-]: electrons for pi f = 1 at the power of the sensor file
+    #: (N,) [s]: electrons from the light of the room, over its e-/s in the middle of the image. It is 0 if there is
+    #: none, or if it was subtracted
     ambient: Floats = field(repr=False)
+    #: ``toward_camera``, ``toward_projector`` (N, 3): unit directions, in the frame of the coupon
     toward_camera: Floats = field(repr=False)
     toward_projector: Floats = field(repr=False)
-    noise: PixelNoise = field(repr=False)
-    whole: int
+    noise: PixelNoise = field(repr=False)  # of a pixel's mean
+    whole: int  # number of blocks on the coupon, saturated ones included; the coupon is the ``specimen``
     specimen: Specimen = field(repr=False)
-    why_no_block: str = ""
+    why_no_block: str = ""  # reason why there is no block on the coupon, "" otherwise
 
     @property
     def size(self) -> int:
@@ -130,15 +120,9 @@ def observe(
     Raises InputError if the capture is one of time of flight or has no images, or its exposures or its number of images
     are wrong.
 
-    Parameters
-    ----------
-    coupon_capture, renderer
-        Capture, and the coupon in it; renders the white coupon, its sensor has the cameras of the capture.
-    block_px
-        Side of a block [px].
-    pattern, lit_room
-        ``mean`` if the capture has the sensor's own pattern, otherwise ``level``; whether the images contain other
-        light than that of the projector.
+    ``coupon_capture``, ``renderer``: capture, and the coupon in it; renders the white coupon, its sensor has the
+    cameras of the capture. ``block_px``: side of a block [px]. ``pattern``, ``lit_room``: ``mean`` if the capture has
+    the sensor's own pattern, otherwise ``level``; whether the images contain other light than that of the projector.
     """
     sensor, capture, specimen, where = (
         renderer.sensor,
@@ -199,17 +183,12 @@ def observe(
 
 @dataclass(frozen=True)
 class _CouponRegion:
-    """A coupon in a region (h, w) of a camera's image.
+    """A coupon in a region (h, w) of a camera's image."""
 
-    - ``inside`` (h, w): pixels on the coupon, inside its edge.
-    - ``points`` (h, w, 3) [mm]: where the view rays meet the plane, in the frame of the coupon.
-    - ``white`` (h, w) [e-/s] of a white coupon.
-    - ``camera_centre``, ``projector_centre`` (3,) [mm]: centres of camera and projector, in the frame of the coupon.
-    """
-
-    inside: NDArray[np.bool_]
-    points: Floats
-    white: Floats
+    inside: NDArray[np.bool_]  # (h, w) pixels on the coupon, inside its edge
+    points: Floats  # (h, w, 3) [mm]: where the view rays meet the plane, in the frame of the coupon
+    white: Floats  # (h, w) [e-/s] of a white coupon
+    #: ``camera_centre``, ``projector_centre`` (3,) [mm]: centres of camera and projector, in the frame of the coupon
     camera_centre: Floats
     projector_centre: Floats
 

@@ -90,13 +90,9 @@ def finish_posterior(
 ) -> FinishPosterior:
     """Return the posterior of a coupon's finish.
 
-    Parameters
-    ----------
-    views, finish, fit
-        Views of the coupon, metal and process, and the fit of these views (:func:`fit_views`), whose jackknife bounds
-        the uncertainties at each tail from below.
-    prior, name
-        Scattering of the coupon at the best estimate, which the scene gives; id of the BSDF in the scene.
+    ``views``, ``finish``, ``fit``: views of the coupon, metal and process, and the fit of these views
+    (:func:`fit_views`), whose jackknife bounds the uncertainties at each tail from below. ``prior``, ``name``:
+    scattering of the coupon at the best estimate, which the scene gives; id of the BSDF in the scene.
     """
     assert fit.log_alpha is not None and fit.wide_angle is not None and prior.beckmann_range is not None
     problem = Problem(views, finish)

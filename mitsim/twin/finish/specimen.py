@@ -58,18 +58,14 @@ _LEAST_COSINE = 0.087
 
 @dataclass(frozen=True)
 class Bend:
-    """Heights over the plane z = 0 of a specimen.
+    """Heights over the plane z = 0 of a specimen."""
 
-    - ``middle``, ``half`` (2,) [mm]: centre and half the size of the extent in x and y.
-    - ``coefficients`` (k,) [mm] of the Legendre polynomials up to the total degree ``degree``.
-    - ``rms`` [mm] of the heights at the fitted cells.
-    """
-
+    #: ``middle``, ``half`` (2,) [mm]: centre and half the size of the extent in x and y
     middle: Floats
     half: Floats
     degree: int
-    coefficients: Floats
-    rms: float
+    coefficients: Floats  # (k,) [mm] of the Legendre polynomials up to the total degree ``degree``
+    rms: float  # [mm] of the heights at the fitted cells
 
     def heights(self, xy: Floats) -> Floats:
         """Return heights (...) [mm] at points (..., 2) [mm] of the plane; outside the extent, those of its edge."""
@@ -78,21 +74,14 @@ class Bend:
 
 @dataclass(frozen=True)
 class Specimen:
-    """A flat coupon in the plane z = 0 of its own frame, with the normal +z toward the sensor.
+    """A flat coupon in the plane z = 0 of its own frame, with the normal +z toward the sensor."""
 
-    - ``world_from_sensor``: transform from the sensor frame to the frame of the coupon [mm].
-    - ``occupied`` (R, C): cells of the plane that belong to the coupon.
-    - ``low`` (x, y) [mm]: corner of the first cell; ``cell`` (x, y) [mm]: size of a cell.
-    - ``off_plane`` [mm]: scatter of the cloud's points about the plane, NaN if the pose was known.
-    - ``bend``: heights of the coupon over the plane, None for a flat one.
-    """
-
-    world_from_sensor: Transform
-    low: Floats
-    cell: Floats
-    occupied: NDArray[np.bool_]
-    off_plane: float = float("nan")
-    bend: Bend | None = None
+    world_from_sensor: Transform  # transform from the sensor frame to the frame of the coupon [mm]
+    low: Floats  # (x, y) [mm]: corner of the first cell
+    cell: Floats  # (x, y) [mm]: size of a cell
+    occupied: NDArray[np.bool_]  # (R, C) cells of the plane that belong to the coupon
+    off_plane: float = float("nan")  # [mm]: scatter of the cloud's points about the plane, NaN if the pose was known
+    bend: Bend | None = None  # heights of the coupon over the plane, None for a flat one
 
     @property
     def size(self) -> tuple[float, float]:
@@ -108,10 +97,7 @@ class Specimen:
         return self.world_from_sensor.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1).reshape(-1, 3))
 
     def contains(self, points: NDArray[np.floating], margin: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Return which points (N, 2) [mm] of the plane lie on the coupon, ``margin`` (N,) [mm] or more inside its edge.
-
-        The margin is tested at four positions, in both directions of x and y.
-        """
+        """Return which points (N, 2) [mm] lie ``margin`` (N,) [mm] inside the coupon, tested along x and y."""
         occupied = np.pad(self.occupied, 1)  # all other points lie in its rim
         columns, rows = occupied.shape[1], occupied.shape[0]
 
@@ -188,10 +174,7 @@ def pose_over_coupon(cloud: PointCloud, window: Roi, where: str) -> Transform:
 
 
 def plane_points(points: Floats) -> NDArray[np.bool_]:
-    """Return which points (N, 3) [mm] lie near the plane through most of them, by RANSAC (see the module).
-
-    The points are in the frame of the sensor: the limit grows with their distance from the origin.
-    """
+    """Return which points (N, 3) [mm], sensor frame, lie near the plane of most, within a limit by distance."""
     best = np.zeros(len(points), bool)
     if len(points) < _FEWEST:
         return best

@@ -90,10 +90,7 @@ def pattern_is_known(capture: Capture, sensor: Sensor) -> bool:
 
 
 def with_rig(sensor: Sensor, rig: Rig) -> Sensor:
-    """Return the sensor with the cameras of a capture, and the projector of its own file.
-
-    Recordings do not describe their projector.
-    """
+    """Return the sensor with a recording's cameras, which do not describe their projector, and its own projector."""
     return replace(sensor, rig=replace(rig, projector=sensor.rig.projector))
 
 

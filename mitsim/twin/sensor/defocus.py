@@ -68,10 +68,7 @@ def modulation(blur: float, width: Floats) -> Floats:
 
 
 def fitted_blur(width: Floats, ratio: Floats) -> float:
-    """Return the blur [px] of stripes of widths (n,) [px] with a modulation (n,).
-
-    The fit allows a common loss of modulation, which light scattered far by the lenses causes.
-    """
+    """Return the blur [px] of stripes (n,) [px] with modulation (n,), up to a common loss by far scattered light."""
     fit = least_squares(
         lambda x: x[1] * modulation(float(x[0]), width) - ratio, [1.0, 0.9], bounds=([0.05, 0.3], [20.0, 1.0])
     )
@@ -93,14 +90,9 @@ def fit_defocus(
 ) -> Defocus | None:
     """Fit the focus of a capture's projector; None if there are too few blocks.
 
-    Parameters
-    ----------
-    source, chip
-        Capture of a code with stripes, and the imager by which grey levels were made electrons.
-    white, black
-        (H, W) images of full light and of no light [e-].
-    pairs, widths
-        (n, 2, H, W) images of stripes and of their inverses [e-], and widths (n,) of the stripes [projector px].
+    ``source``, ``chip``: capture of a code with stripes, and the imager by which grey levels were made electrons.
+    ``white``, ``black``: (H, W) images of full light and of no light [e-]. ``pairs``, ``widths``: (n, 2, H, W) images
+    of stripes and of their inverses [e-], and widths (n,) of the stripes [projector px].
     """
     projector = source.capture.rig.projector
     assert projector is not None

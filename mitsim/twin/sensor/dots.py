@@ -66,22 +66,18 @@ _SURE = 2.0
 
 @dataclass(frozen=True)
 class DotsFit:
-    """Result of the fit of ``parameters`` to one capture, started at ``sensor``.
-
-    - ``patches``: number of patches seen.
-    - ``uneven``: standard deviation of the field's terms that no parameter explains [1].
-    - ``undetermined``: parameters that the capture does not determine; they keep the sensor's own values.
-    - ``misfit``: root mean square over the patches of log(recorded / simulated), smooth over the field, of the feature
-      ``worst``, which differs most.
-    """
+    """Result of the fit of ``parameters`` to one capture, started at ``sensor``."""
 
     sensor: Sensor
     parameters: tuple[Parameter, ...]
     moment_fit: MomentFit
-    patches: int
-    uneven: float
+    patches: int  # number of patches seen
+    uneven: float  # standard deviation of the field's terms that no parameter explains [1]
+    #: parameters that the capture does not determine; they keep the sensor's own values
     undetermined: tuple[Parameter, ...] = ()
     worst: str = ""
+    #: root mean square over the patches of log(recorded / simulated), smooth over the field, of the feature ``worst``,
+    #: which differs most
     misfit: float = 0.0
 
     def with_values(self, theta: Floats) -> Sensor:
@@ -89,10 +85,7 @@ class DotsFit:
         return with_values(self.sensor, self.parameters, theta)
 
     def in_file_units(self) -> tuple[Floats, Floats]:
-        """Return the numbers (k,) in the file's units, and their standard uncertainties, each on its scale.
-
-        The covariance is propagated through numerical derivatives of the file's numbers by the varied ones.
-        """
+        """Return the numbers (k,) in the file's units and their uncertainties, by numerical derivatives."""
         theta, spread = self.moment_fit.values, np.sqrt(np.diag(self.moment_fit.covariance))
 
         def numbers(at: Floats) -> Floats:
@@ -142,18 +135,13 @@ def fit_dots(
 
     Raises InputError if too little of the sheet is visible.
 
-    Parameters
-    ----------
-    capture, specimen, where
-        Capture of a flat sheet, pose and extent of the sheet, and name of the capture in messages.
-    sensor
-        With the capture's own cameras and exposure, from :func:`mitsim.twin.compare.rebuild.like`.
-    parameters
-        Parameters to vary or held, without those of the room unless it is known.
-    room
-        Six terms of the irradiance [W/mm^2] of the room, if known from another capture; otherwise they are fitted too.
-    draws
-        Number and seed of the simulations.
+    - ``capture``, ``specimen``, ``where``: capture of a flat sheet, pose and extent of the sheet, and name of the
+      capture in messages.
+    - ``sensor``: with the capture's own cameras and exposure, from :func:`mitsim.twin.compare.rebuild.like`.
+    - ``parameters``: parameters to vary or held, without those of the room unless it is known.
+    - ``room``: six terms of the irradiance [W/mm^2] of the room, if known from another capture; otherwise they are
+      fitted too.
+    - ``draws``: number and seed of the simulations.
     """
     name, camera = next(iter(capture.rig.cameras.items()))
     seed = draws.seed

@@ -79,10 +79,7 @@ class FittedKey:
 
 @dataclass(frozen=True)
 class Undetermined:
-    """A number that no capture determines, its ``value`` in the first file, and a capture that would determine it.
-
-    ``contained``: fitted numbers contain it, so it is 0 in the fitted file, which keeps all others.
-    """
+    """A number that no capture determines, with one that would; ``contained`` in fitted ones, it is 0 in their file."""
 
     key: str
     value: float

@@ -59,18 +59,14 @@ class FieldFigures:
 
 @dataclass(frozen=True)
 class SpecimenField:
-    """Pixels of a camera's image window ``roi`` that show the specimen, divided into patches.
-
-    - ``mask`` (h, w): pixels of the specimen; ``patch_px``: side of a patch.
-    - ``corners`` (P, 2): rows and columns of the patches in the window.
-    - ``basis`` (P, 6): the :data:`TERMS` at the patch centres. x and y are slopes of the view ray from the centre of
-      the specimen, over their largest value. All terms but the first have zero mean.
-    """
+    """Pixels of a camera's image window ``roi`` that show the specimen, divided into patches."""
 
     roi: Roi
-    mask: NDArray[np.bool_]
-    patch_px: int
-    corners: NDArray[np.int64]
+    mask: NDArray[np.bool_]  # (h, w) pixels of the specimen
+    patch_px: int  # side of a patch
+    corners: NDArray[np.int64]  # (P, 2) rows and columns of the patches in the window
+    #: (P, 6) the :data:`TERMS` at the patch centres. x and y are slopes of the view ray from the centre of the
+    #: specimen, over their largest value. All terms but the first have zero mean
     basis: Floats
 
     @classmethod
@@ -101,12 +97,9 @@ def _basis(camera: Camera, corners: NDArray[np.int64], patch_px: int) -> Floats:
 def field_figures(levels: Floats, field: SpecimenField, window_px: int, black: float = 0.0) -> FieldFigures:
     """Return the features of an image over the field of the specimen.
 
-    Parameters
-    ----------
-    levels, black
-        Grey levels (h, w) [DN] of the field's window, and the level that is subtracted first [DN].
-    field, window_px
-        Patches of the specimen; side of the window of local means [px], several run lengths of the pattern wide.
+    ``levels``, ``black``: grey levels (h, w) [DN] of the field's window, and the level that is subtracted first [DN].
+    ``field``, ``window_px``: patches of the specimen; side of the window of local means [px], several run lengths of
+    the pattern wide.
     """
     table = patch_figures(np.asarray(levels, float) - black, field, window_px)
     basis = field.basis if len(table) >= _FEWEST_FOR_TERMS else field.basis[:, :1]

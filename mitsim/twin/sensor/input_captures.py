@@ -56,18 +56,7 @@ class InputCapture:
 def read_input_captures(
     folders: Sequence[Path], off: Sequence[Path], dark: Sequence[Path], sensor: Sensor
 ) -> list[InputCapture]:
-    """Read the captures from which a sensor is fitted.
-
-    Raises InputError if there is none, one is given twice or is a copy of another, or one is of another technology or
-    has no images.
-
-    Parameters
-    ----------
-    folders, off, dark
-        Captures whose settings state their kind; captures with the projector off; captures without any light.
-    sensor
-        Sensor whose technology the captures must have.
-    """
+    """Read the captures of a fit; InputError if none, one twice or copied, of another technology, or no images."""
     requested: list[tuple[Path, Kind | None]] = [(folder, None) for folder in folders]
     requested += [(folder, "off") for folder in off] + [(folder, "dark") for folder in dark]
     if not requested:

@@ -58,10 +58,7 @@ class MomentFit:
 
 @dataclass(frozen=True)
 class Prior:
-    """Prior of parameters (k,): mean, standard deviation, derivative steps, bounds; the fit starts at ``first``.
-
-    Parameters ``held`` stay at their mean.
-    """
+    """Prior of parameters (k,): mean, sigma, steps, bounds, and the ``first``; those ``held`` stay at their mean."""
 
     start: Floats
     spread: Floats
@@ -82,16 +79,10 @@ def match_moments(
 ) -> MomentFit:
     """Find the parameters at which simulations reproduce the features of a recording.
 
-    Parameters
-    ----------
-    real, covariance
-        Features (n,) of the recording, finite, and their covariance (n, n).
-    simulate, draws
-        The forward model, and the number of simulations to average.
-    prior
-        Start, spread, derivative steps and bounds of the parameters.
-    label
-        Name for progress messages; empty for none. The first message states the time of a round.
+    - ``real``, ``covariance``: features (n,) of the recording, finite, and their covariance (n, n).
+    - ``simulate``, ``draws``: the forward model, and the number of simulations to average.
+    - ``prior``: start, spread, derivative steps and bounds of the parameters.
+    - ``label``: name for progress messages; empty for none. The first message states the time of a round.
     """
 
     def figures(theta: Floats) -> tuple[Floats, Floats]:

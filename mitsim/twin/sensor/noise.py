@@ -61,10 +61,7 @@ _LEAST_QUIET = 0.2
 
 @dataclass(frozen=True)
 class ImagerFit:
-    """The fitted ``imager``, ``estimates`` of its numbers, undetermined numbers, and whether its noise is ``known``.
-
-    ``repeated``: it is known from repeats, which separate noise from fixed pattern.
-    """
+    """The fitted ``imager``, its estimates, whether its noise is ``known``, and by repeats, without fixed pattern."""
 
     imager: Imager
     estimates: tuple[FittedKey, ...]

@@ -29,30 +29,22 @@ from mitsim.twin.sensor.estimate import Scale
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number of a sensor file.
+    """A number of a sensor file."""
 
-    - ``key`` as in the file, ``projector.flux_w``; ``unit``.
-    - ``read``: returns the number in the file's unit.
-    - ``get``: returns the varied quantity; ``put`` inserts it.
-    - ``spread`` about the file's value, one sigma; ``step`` for derivatives; ``low`` and ``high``: bounds. All of the
-      varied quantity.
-    - ``scale`` on which the number in the file is approximately normal.
-    - ``determined_by``: the capture that would determine it.
-    - ``held``: stays at the sensor's value, with the uncertainty ``spread``.
-    """
-
-    key: str
+    key: str  # as in the file, ``projector.flux_w``; ``unit``
     unit: str
-    read: Callable[[Sensor], float]
-    get: Callable[[Sensor], float]
+    read: Callable[[Sensor], float]  # returns the number in the file's unit
+    get: Callable[[Sensor], float]  # returns the varied quantity; ``put`` inserts it
     put: Callable[[Sensor, float], Sensor]
+    #: ``spread`` about the file's value, one sigma; ``step`` for derivatives; ``low`` and ``high``: bounds. All of the
+    #: varied quantity
     spread: float
     step: float
     low: float = -np.inf
     high: float = np.inf
-    scale: Scale = "linear"
-    determined_by: str = ""
-    held: bool = False
+    scale: Scale = "linear"  # on which the number in the file is approximately normal
+    determined_by: str = ""  # the capture that would determine it
+    held: bool = False  # stays at the sensor's value, with the uncertainty ``spread``
 
     def held_within(self, uncertainty: float) -> Parameter:
         """Return the parameter, held with an uncertainty of the varied quantity."""

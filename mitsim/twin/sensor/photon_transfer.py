@@ -195,13 +195,9 @@ def fixed_variance(
 ) -> tuple[float, float, float]:
     """Return mean level [e-], variance [e-^2] of the fixed pattern in uniform light, and its uncertainty.
 
-    Parameters
-    ----------
-    images, mask
-        (n, H, W) repeats [DN], and the pixels (H, W) to use.
-    chip, gain
-        Imager by which grey levels are made electrons; the effect of its smoothing is undone, with the variance of the
-        finest detail after it over that before it.
+    ``images``, ``mask``: (n, H, W) repeats [DN], and the pixels (H, W) to use. ``chip``, ``gain``: imager by which grey
+    levels are made electrons; the effect of its smoothing is undone, with the variance of the finest detail after it
+    over that before it.
     """
     electrons = linearised(images, chip)
     mean = electrons.mean(axis=0)

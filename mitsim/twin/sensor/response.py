@@ -116,10 +116,7 @@ class Knee:
 
 
 def quiet_pixels(image: Floats, clean: Floats, mask: Mask) -> Mask:
-    """Return the pixels of ``mask`` (H, W) whose finest detail is noise and not the edge of a print.
-
-    ``clean`` is the image without noise.
-    """
+    """Return the pixels of ``mask`` (H, W) whose finest detail is noise, by the noiseless ``clean``, not a print."""
     return _quiet(noise_of_levels(image, mask), clean, mask)
 
 

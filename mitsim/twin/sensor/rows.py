@@ -36,12 +36,8 @@ def row_turns(
 
     ``row_mrad`` is that about its x axis, ``roll_mrad`` its roll; none for too few patches or no pair.
 
-    Parameters
-    ----------
-    capture, settings, specimen
-        Capture of a pair of cameras, settings of its decoder, and pose and extent of the specimen.
-    prior
-        Standard deviations of rotation and roll before the measurement [mrad].
+    ``capture``, ``settings``, ``specimen``: capture of a pair of cameras, settings of its decoder, and pose and extent
+    of the specimen. ``prior``: standard deviations of rotation and roll before the measurement [mrad].
     """
     geometry = capture_geometry(capture, settings)
     if not isinstance(geometry, StereoGeometry) or capture.technology == "structured_light":

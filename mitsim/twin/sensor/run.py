@@ -52,10 +52,7 @@ from mitsim.twin.sensor.verdict import DotAgreement, Verdict, verdict_of
 
 @dataclass(frozen=True)
 class SensorFit:
-    """Result of a fit: ``estimates``, and numbers that no capture determines (``undetermined``).
-
-    ``agreements`` of the dots of each capture with the best simulation.
-    """
+    """``estimates`` of a fit, numbers left ``undetermined``, and ``agreements`` of each capture with the simulation."""
 
     sensor: Sensor = field(repr=False)
     input_captures: tuple[InputCapture, ...] = field(repr=False)

@@ -51,10 +51,7 @@ _SURE = 2.0
 
 @dataclass(frozen=True)
 class StripeImages:
-    """White, black and pairs of stripes of a capture's first camera [DN]; ``widths`` of the stripes [projector px].
-
-    ``pairs`` (n, 2, H, W): on and off; ``across``: whether the stripes are along the columns.
-    """
+    """White, black and on-off ``pairs`` (n, 2, H, W) [DN] of ``widths`` [projector px]; ``across``: along columns."""
 
     white: Floats
     black: Floats
@@ -64,10 +61,7 @@ class StripeImages:
 
 
 def stripes_of(source: InputCapture) -> StripeImages | None:
-    """Extract the stripes of a capture; None if it has no stripes with their inverse.
-
-    The brightest and the darkest of the stripes replace a missing white or black image.
-    """
+    """Return a capture's stripes, the extremes for a missing white or black; None without inverses."""
     code, projector = capture_pattern(source.capture), source.capture.rig.projector
     if not isinstance(code, LightCode) or projector is None:
         return None

@@ -132,10 +132,7 @@ def _comment(key: FittedKey) -> str:
 
 @dataclass(frozen=True)
 class Entry:
-    """A ``value`` of a key in TOML syntax, and the ``comment`` above its table.
-
-    ``optional``: a file without the key stays without it.
-    """
+    """A ``value`` in TOML with the ``comment`` above its table; ``optional``: not added to a file without the key."""
 
     value: str
     comment: str
