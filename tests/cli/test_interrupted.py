@@ -1,6 +1,7 @@
 """Ctrl-C while worker processes are busy: a word at once, an end within seconds, exit code 130, finished work kept."""
 
 import os
+import runpy
 import signal
 import subprocess
 import sys
@@ -98,3 +99,16 @@ def children_of(parent):
         if int(fields[1]) == parent and "spawn_main" in command:
             found.append(int(stat.parent.name))
     return found
+
+
+def test_ctrl_c_during_the_imports_is_no_traceback(monkeypatch, capsys):
+    class Interrupted:
+        def find_spec(self, name, path=None, target=None):
+            if name == "mitsim.cli.program":
+                raise KeyboardInterrupt
+
+    monkeypatch.delitem(sys.modules, "mitsim.cli.program", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Interrupted(), *sys.meta_path])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module("mitsim", run_name="__main__")
+    assert ended.value.code == 130 and capsys.readouterr().err == "mitsim: interrupted\n"
