@@ -37,8 +37,20 @@ from mitsim.study.statement_file import InfluenceEntry, StatedMeasurement, State
 #: how the software was verified (ISO/TS 15530-4), in words; docs/explanation/validity.md, criteria 10 and 11
 VERIFIED = "closed forms, examples of JCGM 101 and 106, another renderer; not by a metal part with calibrated values"
 
-#: names of the facts about influences
-INFLUENCES = VARIED, SIZES, FIXED, LEFT_OUT = "Varied", "Sizes (σ or range)", "Fixed", "Left out"
+#: name of the fact about the influences that virtual measurements vary
+VARIED = "Varied"
+
+#: name of the fact about the sizes of these influences
+SIZES = "Sizes (σ or range)"
+
+#: name of the fact about the influences that are simulated without variation
+FIXED = "Fixed"
+
+#: name of the fact about the influences that are not simulated
+LEFT_OUT = "Left out"
+
+#: names of all facts about influences
+INFLUENCES = (VARIED, SIZES, FIXED, LEFT_OUT)
 
 #: hexadecimal digits of a digest that are printed
 _DIGITS = 16
