@@ -28,6 +28,9 @@ METRES_UNDER = 20.0
 #: median distance above which the unit is neither metres nor millimetres, or the coordinates have an offset
 NEITHER_ABOVE = 20_000.0
 
+#: median distance [mm] under which a unit that nothing states may be cm or inches; chosen: few sensors are so near
+_NEAR_MM = 100.0
+
 #: coordinates beyond this are not measurements [mm]
 FARTHEST_MM = 1e6
 
@@ -202,6 +205,16 @@ def scale_to_mm(points: NDArray[np.floating], path: Path, unit: str | None = Non
         raise InputError(path, "x, y, z", f"{farthest:.3g} mm", f"up to {FARTHEST_MM:g} mm", hint)
     points *= LENGTHS_MM[unit]
     return unit, distance
+
+
+def near_note(distance: float, option: str) -> str:
+    """Return a warning about a median distance in a file's numbers, taken as mm, that may be cm; empty without doubt.
+
+    ``option`` says how to state the unit: ``--unit cm``.
+    """
+    if not METRES_UNDER <= distance < _NEAR_MM:
+        return ""
+    return f"a median distance of {distance:.4g} is taken as mm, as no unit is stated: if these are cm, say {option}"
 
 
 #: Microsoft's C library writes 1.#QNAN, -1.#IND and 1.#INF, since 2015 -nan(ind) and nan(snan); glibc and BSD add the

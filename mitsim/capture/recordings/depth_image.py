@@ -25,7 +25,7 @@ from mitsim.capture.grey_image import read_depths
 from mitsim.capture.npy import NPY_MAGIC
 from mitsim.capture.recordings.array_file import arrays_in, disparities, is_disparity, map_among, unit_of_depths
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
-from mitsim.capture.recordings.cloud_numbers import FAR_BEYOND, FARTHEST_MM, METRES_UNDER, NEITHER_ABOVE
+from mitsim.capture.recordings.cloud_numbers import FAR_BEYOND, FARTHEST_MM, METRES_UNDER, NEITHER_ABOVE, near_note
 from mitsim.capture.recordings.read_options import ReadOptions
 from mitsim.capture.recordings.recording_files import frame_of
 from mitsim.capture.recordings.stated_scale import check_scale, scale_by_folder, stated_scales
@@ -68,6 +68,8 @@ def read_depth_image(path: str | Path, options: ReadOptions) -> Capture:
     in_metres = image.dtype.kind == "f" and median < METRES_UNDER
     scale_mm, invalid, assumed = scale_mm or (1000.0 if in_metres else 1.0), invalid or 0, scale_mm is None
     settings |= {"depth_scale_mm": float(scale_mm), "depth_invalid": int(invalid)}
+    if assumed and not in_metres and (note := near_note(median, "--scale 10")):
+        warnings.append(note)
     if warnings:
         settings["warnings"] = warnings
     if missing.all():

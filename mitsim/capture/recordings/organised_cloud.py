@@ -31,7 +31,7 @@ from mitsim.capture.decoding import Decoding
 from mitsim.capture.npy import NPY_MAGIC
 from mitsim.capture.recordings.array_file import map_in
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
-from mitsim.capture.recordings.cloud_numbers import leave_out_marks, scale_to_mm
+from mitsim.capture.recordings.cloud_numbers import leave_out_marks, near_note, scale_to_mm
 from mitsim.capture.recordings.nxlib_calibration import NxLibTree, link_of, sensor_from_rectified
 from mitsim.capture.recordings.pcd import decode_pcd
 from mitsim.capture.recordings.pinhole_fit import fit_pinhole, grid_of, off_the_rays
@@ -160,7 +160,7 @@ def read_organised_cloud(path: str | Path | StoredCloud, options: ReadOptions) -
     points, calibrated = _on_grid(stored, options.cameras, camera)
     settings: dict[str, Any] = {"imported_from": path.name, "axes_of_file": axes} | stored.records
     points[points[..., 2] == 0] = np.nan  # in the plane of the optical centre
-    settings["unit_of_file"], _ = scale_to_mm(points, path, options.unit or stored.unit, "check --unit")
+    settings["unit_of_file"], distance = scale_to_mm(points, path, options.unit or stored.unit, "check --unit")
     count = int(np.isfinite(points[..., 0]).sum())
     if count < LEAST_POINTS and calibrated is None:
         raise InputError(path, "", f"{count} points", f"{LEAST_POINTS} or more")
@@ -179,7 +179,8 @@ def read_organised_cloud(path: str | Path | StoredCloud, options: ReadOptions) -
     images = {} if stored.grey is None else {next(iter(rig.cameras)): stored.grey[None]}
     points = rig.reference.sensor_from_camera.points(points).astype(np.float32)
     notes = calibrated.notes if calibrated is not None and "off_the_rays_px" in records else ()
-    if warnings := [note for note in (stored.note, *notes) if note]:
+    near_by = "" if options.unit or stored.unit else near_note(distance, "--unit cm, or inch")
+    if warnings := [note for note in (stored.note, *notes, near_by) if note]:
         settings["warnings"] = warnings
     near, far = (calibrated.range_mm if calibrated else None) or (None, None)
     return Capture(

@@ -64,6 +64,18 @@ def test_disparities_are_told_by_the_folder(tmp_path):
             )
 
 
+@pytest.mark.parametrize("name", ["a.npy", "depth.npy"])
+@pytest.mark.parametrize(("per_mm", "told"), [(0.1, True), (1.0, False), (0.001, False)])
+def test_a_cloud_or_depth_that_may_be_in_cm_is_told(tmp_path, name, per_mm, told):
+    """Before, cm were taken as mm without a word."""
+    np.save(tmp_path / name, (CLOUD if name == "a.npy" else CLOUD[..., 2]) * per_mm)
+    read = read_recording(tmp_path / name, ReadOptions(calibration=pinhole(tmp_path)))
+    assert any("if these are cm, say --" in note for note in read.capture.settings.get("warnings", [])) is told
+    stated = {"unit": "cm"} if name == "a.npy" else {"scale_mm": 10.0}
+    read = read_recording(tmp_path / name, ReadOptions(calibration=pinhole(tmp_path), **stated))
+    assert not any("if these are cm" in note for note in read.capture.settings.get("warnings", []))
+
+
 @pytest.mark.parametrize(
     ("name", "depth", "millimetres"),
     [("depth_cm", 60.0, 600.0), ("depth_m", 25.0, 25000.0), ("depth_mm", 12.0, 12.0), ("depth.um", 6e5, 600.0)],
