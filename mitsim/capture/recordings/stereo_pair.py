@@ -7,7 +7,7 @@ green channel of colour images -> capture for the matcher.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -153,7 +153,8 @@ def pair_files(folder: Path, camera: str, pattern: str | None = None) -> list[Pa
         return sorted((path for path in folder.glob(pattern) if path.is_file()), key=counted)
     inside = [path for path in folder.iterdir() if path.is_file() and path.name.lower().startswith(camera.lower())]
     folders = (path for path in folder.iterdir() if path.is_dir() and path.name.lower() == camera.lower())
-    for files in (inside, *(path.rglob("*") for path in folders)):
+    groups: list[Iterable[Path]] = [inside, *(path.rglob("*") for path in folders)]
+    for files in groups:
         images = sorted((path for path in files if path.suffix.lower() in SUFFIXES and path.is_file()), key=counted)
         if images:
             return images
