@@ -10,7 +10,10 @@ from characterisation.files.documents import Document
 
 
 class EyeKeys(Document):
-    """Names of an eye's values, dots into maps: ``stereo.R``; ``file``: the one with matrix, distortion and size."""
+    """Names of one camera's or the projector's values in the file; dots step into maps: ``stereo.R``.
+
+    ``file``: the one of several files that contains matrix, distortion and size of this eye alone.
+    """
 
     file: str | None = None
     matrix: str | None = None

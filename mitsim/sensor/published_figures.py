@@ -40,7 +40,10 @@ class PublishedNoise(Document):
 
 
 class PublishedAccuracy(Document):
-    """Points' or lengths' accuracy as one figure: ``source`` and what it states; ``sigma_mm``, one sigma."""
+    """Accuracy of points or lengths that the maker states as one figure.
+
+    ``source`` and what exactly it states; ``sigma_mm``: one standard deviation.
+    """
 
     source: str = Field(min_length=1, max_length=200)
     sigma_mm: Positive

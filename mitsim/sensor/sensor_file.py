@@ -143,7 +143,10 @@ class MisalignmentTable(Document):
 
 
 class Bracket(Document):
-    """``count`` exposures merged into a wider range, each ``factor`` times the last, the rule's own in the middle."""
+    """Several exposures of every image, merged into one of a wider range.
+
+    ``count`` exposures, each ``factor`` times the one before; the rule's own exposure is in the middle.
+    """
 
     count: int = Field(ge=2, le=7)
     factor: Annotated[float, Field(gt=1, le=64)]
