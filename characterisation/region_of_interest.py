@@ -98,6 +98,8 @@ class Roi:
 def checked_roi(roi: Roi | None, width: int, height: int, where: str) -> Roi:
     """Return the region, or all of an image of this size if there is none.
 
+    Raises InputError if the region is empty or does not lie in the image.
+
     Parameters
     ----------
     roi
@@ -106,11 +108,6 @@ def checked_roi(roi: Roi | None, width: int, height: int, where: str) -> Roi:
         Of the image [px].
     where
         Name of the file or argument, for the error.
-
-    Raises
-    ------
-    InputError
-        If the region is empty or does not lie in the image.
     """
     if roi is None:
         return Roi.whole(width, height)

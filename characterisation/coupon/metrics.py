@@ -40,28 +40,17 @@ _SMALLEST_DETERMINANT = 1e-10
 
 @dataclass(frozen=True)
 class RayNoise:
-    """Noise along the view ray of one or many patches; every field is an array over the patches (or a 0-d array).
+    """Noise along the view ray of one or many patches; every field is an array over the patches (or a 0-d array)."""
 
-    - ``sigma`` [mm]: standard deviation, NaN with fewer than 4 points.
-    - ``standard_error`` [mm] of sigma, sigma / sqrt(2 (n - 3)), for independent noise.
-    - ``robust`` [mm]: standard deviation from the median absolute deviation.
-    - ``outlier_share`` [1]: share of points beyond 5 robust standard deviations, and 5 steps of depths in steps.
-    - ``inlier_sigma`` [mm]: standard deviation of a second fit without outliers.
-    - ``count``: number of points.
-    - ``normal`` (..., 3): normal of the fitted plane, toward the sensor.
-    - ``distance`` |V| [mm] from the sensor to the plane along the mean ray of the patch.
-    - ``inlier_residual`` (..., n) [mm] along the rays from the plane of the second fit, NaN for outliers and missing
-      points.
-    """
-
-    sigma: Floats
-    standard_error: Floats
-    robust: Floats
-    outlier_share: Floats
-    inlier_sigma: Floats
-    count: NDArray[np.int64]
-    normal: Floats
-    distance: Floats
+    sigma: Floats  # [mm]: standard deviation, NaN with fewer than 4 points
+    standard_error: Floats  # [mm] of sigma, sigma / sqrt(2 (n - 3)), for independent noise
+    robust: Floats  # [mm]: standard deviation from the median absolute deviation
+    outlier_share: Floats  # [1]: share of points beyond 5 robust standard deviations, and 5 steps of depths in steps
+    inlier_sigma: Floats  # [mm]: standard deviation of a second fit without outliers
+    count: NDArray[np.int64]  # number of points
+    normal: Floats  # (..., 3) normal of the fitted plane, toward the sensor
+    distance: Floats  # |V| [mm] from the sensor to the plane along the mean ray of the patch
+    #: (..., n) [mm] along the rays from the plane of the second fit, NaN for outliers and missing points
     inlier_residual: Floats
 
 

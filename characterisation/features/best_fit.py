@@ -96,6 +96,9 @@ def best_fit(
 ) -> list[Floats]:
     """Return the motion (4, 4) of each view, in their order.
 
+    Raises FitError if the views are not all connected by shapes of which two views have :data:`LEAST` points each, or
+    the points do not determine a shape.
+
     Parameters
     ----------
     views
@@ -111,12 +114,6 @@ def best_fit(
     least_scales
         Of each view the least scale [mm] of the residuals of each shape, for rounded points
         (:func:`characterisation.features.starts.rounding_scale`); by default that of exact points.
-
-    Raises
-    ------
-    FitError
-        If the views are not all connected by shapes of which two views have :data:`LEAST` points each, or the points do
-        not determine a shape.
     """
     parts = _parts(views, least_scales or [{}] * len(views), np.random.default_rng(seed))
     _check_connected(parts, len(views))

@@ -84,6 +84,9 @@ def check_surface(
 ) -> None:
     """Check that the fit of a surface is credible.
 
+    Raises UndeterminedError if the points do not determine the surface over these positions. Raises FitError if the fit
+    lies too far from nominal there, or its residuals exceed those of the nominal surface.
+
     Parameters
     ----------
     fit
@@ -96,13 +99,6 @@ def check_surface(
         (k, 3) [mm] on the nominal surface, where the sensor sees it (:func:`places_seen`).
     viewpoint
         (3,) [mm], optical centre of the sensor; None for points of several views.
-
-    Raises
-    ------
-    UndeterminedError
-        If the points do not determine the surface over these positions.
-    FitError
-        If the fit lies too far from nominal there, or its residuals exceed those of the nominal surface.
     """
     array, where = np.asarray(points, float).reshape(-1, 3), np.asarray(positions, float).reshape(-1, 3)
     if not len(where):

@@ -76,6 +76,9 @@ _NONE = Crossings(np.empty((0, 3)), 0.0, 0.0, 0.0, np.empty((0, 3)))
 def fit_circle(cloud: PointCloud, plane: PlaneFit, nominal: Circle, near: float | None = None) -> CircleFit:
     """Fit the circle of a hole in a plane.
 
+    Raises FitError if too little of the edge is visible, or the fit is not credible
+    (:mod:`characterisation.features.credibility`).
+
     Parameters
     ----------
     cloud
@@ -93,12 +96,6 @@ def fit_circle(cloud: PointCloud, plane: PlaneFit, nominal: Circle, near: float 
     See Also
     --------
     fit_edge_point
-
-    Raises
-    ------
-    FitError
-        If too little of the edge is visible, or the fit is not credible
-        (:mod:`characterisation.features.credibility`).
     """
     nominal = nominal.seen_from(cloud.grid.origin).on_moved_plane(plane)
     crossings = _crossings(cloud, plane, nominal, near)

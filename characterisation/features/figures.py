@@ -165,6 +165,8 @@ def edge_covariance(
     - diag(2, 2, 1) s^2 / count for a whole circle;
     - diag(1, 3 / reach^2) s^2 / count for an edge visible up to ``reach`` [mm] on both sides of the point.
 
+    Raises ValueError if the reach of an edge is not given.
+
     Parameters
     ----------
     figure
@@ -178,11 +180,6 @@ def edge_covariance(
         F near the edge, above 0 and up to 1.
     reach
         Visible length of the edge on each side of the point [mm]; not used for a circle.
-
-    Raises
-    ------
-    ValueError
-        If the reach of an edge is not given.
     """
     variance = ACROSS_THE_EDGE * pitch**2 * (1 / 12 + (1 - fraction) / fraction**2) / count
     if isinstance(figure, Circle):

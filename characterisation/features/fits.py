@@ -212,10 +212,7 @@ def fit_surface(
 ) -> PlaneFit | CylinderFit | SphereFit | ConeFit:
     """Fit a surface of the kind of ``nominal``; cylinders and cones start from it.
 
-    Raises
-    ------
-    FitError
-        As the fit of that kind.
+    Raises FitError as the fit of that kind.
     """
     if isinstance(nominal, Plane):
         return fit_plane(points, viewpoint)

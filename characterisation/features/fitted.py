@@ -77,6 +77,8 @@ def with_covariance(
 ) -> Fit:
     """Return a shape, fitted or nominal, with the covariance (p, p) of its parameters, for predicted uncertainties.
 
+    Raises ValueError if the covariance does not have the shape (p, p).
+
     Parameters
     ----------
     shape
@@ -87,11 +89,6 @@ def with_covariance(
         [mm].
     count
         Number of points used.
-
-    Raises
-    ------
-    ValueError
-        If the covariance does not have the shape (p, p).
     """
     matrix = np.asarray(covariance, float)
     if matrix.shape != (shape.parameter_count,) * 2:

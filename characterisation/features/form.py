@@ -75,21 +75,16 @@ LEAST_SHARE = 0.01
 
 @dataclass(frozen=True)
 class Form:
-    """Deviation of a surface from its least-squares plane or cylinder.
+    """Deviation of a surface from its least-squares plane or cylinder."""
 
-    - ``modes`` (n, k): orthogonal distance [mm] at n positions for each coefficient of 1 mm.
-    - ``coefficients`` (k,) [mm] and their ``covariance`` (k, k) [mm^2].
-    - ``residual_std`` [mm] along the rays, of ``count`` points.
-    - ``positions`` (n, 2): coordinates on the surface, -1 to 1 over the points. ``heights`` (n,) [mm] of the
-      form there before its coefficients are shortened, and ``noise`` [mm], the root mean square of the heights that
-      noise alone gives. None and NaN for a predicted form.
-    """
-
-    modes: Array
-    coefficients: Array
+    modes: Array  # (n, k) orthogonal distance [mm] at n positions for each coefficient of 1 mm
+    coefficients: Array  # (k,) [mm] and their ``covariance`` (k, k) [mm^2]
     covariance: Array
-    residual_std: float
+    residual_std: float  # [mm] along the rays, of ``count`` points
     count: int
+    #: ``positions`` (n, 2): coordinates on the surface, -1 to 1 over the points. ``heights`` (n,) [mm] of the form
+    #: there before its coefficients are shortened, and ``noise`` [mm], the root mean square of the heights that noise
+    #: alone gives. None and NaN for a predicted form
     positions: Array | None = None
     heights: Array | None = None
     noise: float = np.nan
@@ -166,25 +161,10 @@ def form_modes(surface: Plane | Cylinder, points: Array, rays: Array | None) -> 
     They are polynomials of total degree :data:`DEGREE` in the two coordinates of the surface, both scaled to -1..1 over
     the points: along the tangents of a plane, or round a cylinder and along its axis.
 
-    Parameters
-    ----------
-    surface
-        On which the points (n, 3) [mm] lie, except for their noise.
-    points
-        (n, 3) [mm].
-    rays
-        (n, 3), or None for orthogonal deviations.
-
-    Returns
-    -------
-    (n, k)
-        Orthonormal columns Q. Coefficients are Q^T residuals; the form along the rays is Q Q^T residuals, and
-        orthogonal to the surface ``slope`` times that (:class:`~characterisation.features.surfaces.Meeting`).
-
-    Raises
-    ------
-    FitError
-        If there are too few points.
+    ``surface``: on which the points (n, 3) [mm] lie, except for their noise. ``points``: (n, 3) [mm]. ``rays``: (n, 3),
+    or None for orthogonal deviations. Returns: orthonormal columns Q. Coefficients are Q^T residuals; the form along
+    the rays is Q Q^T residuals, and orthogonal to the surface ``slope`` times that
+    (:class:`~characterisation.features.surfaces.Meeting`). Raises FitError if there are too few points.
     """
     rows, rigid = _rows(surface, _Points.of(surface, points, rays, surface.meet(points, rays), slice(None)))
     modes: Array = (_combined(rows @ rows.T, rigid).T @ rows).T
@@ -274,19 +254,9 @@ def fit_form(points: ArrayLike, surface: Plane | Cylinder, viewpoint: ArrayLike 
 
     Points at grazing incidence, and outliers about the form, are excluded.
 
-    Parameters
-    ----------
-    points
-        (n, 3) [mm] of the surface.
-    surface
-        Least-squares surface of the same points (:func:`~characterisation.features.fits.fit_surface`).
-    viewpoint
-        (3,) [mm]; without it, residuals are orthogonal.
-
-    Raises
-    ------
-    FitError
-        If there are too few points.
+    ``points``: (n, 3) [mm] of the surface. ``surface``: least-squares surface of the same points
+    (:func:`~characterisation.features.fits.fit_surface`). ``viewpoint``: (3,) [mm]; without it, residuals are
+    orthogonal. Raises FitError if there are too few points.
     """
     points = usable(points, surface.kind, surface.parameter_count)
     rays = rays_from(viewpoint, points)

@@ -94,6 +94,9 @@ def fit_pose(
 ) -> PoseFit:
     """Fit the pose of a part to the points of its features.
 
+    Raises FitError if the points leave a motion undetermined, which the message gives in the part frame; or if there
+    are too few, or all are at grazing incidence.
+
     Parameters
     ----------
     points
@@ -104,12 +107,6 @@ def fit_pose(
         (4, 4) rough pose to start from. It may differ by some degrees and half the size of the smallest round feature.
     viewpoint
         (3,) [mm], optical centre of the sensor, sensor frame.
-
-    Raises
-    ------
-    FitError
-        If the points leave a motion undetermined, which the message gives in the part frame; or if there are too few,
-        or all are at grazing incidence.
 
     See Also
     --------

@@ -41,10 +41,7 @@ _NEIGHBOUR_SHARE = 0.03
 def cylinder_start(points: ArrayLike) -> Cylinder:
     """Estimate a cylinder from points (n, 3) [mm] alone, to within some degrees and a fraction of the radius.
 
-    Raises
-    ------
-    FitError
-        If there are fewer than 6 points, or they lie in a plane.
+    Raises FitError if there are fewer than 6 points, or they lie in a plane.
     """
     points = usable(points, Cylinder.kind, Cylinder.parameter_count)
     count = min(max(_LEAST_NEIGHBOURS, round(_NEIGHBOUR_SHARE * len(points))), _MOST_NEIGHBOURS, len(points))

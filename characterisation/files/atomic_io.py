@@ -44,10 +44,7 @@ _NETCDF_VARIABLE = 4 * 1024
 def atomic_write(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; it is renamed to ``path`` when the block succeeds, and removed otherwise.
 
-    Raises
-    ------
-    OSError
-        If the disk is full: its ``errno`` is in :data:`FULL`, its ``filename`` is ``path``.
+    Raises OSError if the disk is full: its ``errno`` is in :data:`FULL`, its ``filename`` is ``path``.
     """
     target = pointed_to(path)
     partial = target.with_name(f".{target.name}.{os.getpid()}-{HOST}.partial")
@@ -64,10 +61,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 def atomic_write_named(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path of the same name in a folder beside ``path``, for libraries that need the suffix.
 
-    Raises
-    ------
-    OSError
-        As :func:`atomic_write`.
+    Raises OSError as :func:`atomic_write`.
     """
     path, name = pointed_to(path).absolute(), Path(path).name
     ours = f"{os.getpid()}-{HOST}.partial"
@@ -87,10 +81,7 @@ def atomic_write_named(path: str | Path) -> Iterator[Path]:
 def atomic_folder(folder: str | Path) -> Iterator[Path]:
     """Yield a temporary folder beside ``folder``; it is renamed when the block succeeds, and removed otherwise.
 
-    Raises
-    ------
-    OSError
-        As :func:`atomic_write`, or if ``folder`` exists and is not empty.
+    Raises OSError as :func:`atomic_write`, or if ``folder`` exists and is not empty.
     """
     folder = pointed_to(folder).absolute()
     partial = _beside(folder, "partial")
@@ -118,13 +109,8 @@ def write_folder(folder: str | Path, files: Mapping[str, bytes], *, overwrite: b
     """Write a folder of files by their paths in it; after a loss of power it is complete or absent.
 
     The files are written beside the folder, flushed to the disk, and renamed in one step. ``overwrite`` replaces an
-    existing folder.
-
-    Raises
-    ------
-    OSError
-        If the folder cannot be written, or exists already; an existing folder is then unchanged. If the disk is full,
-        ``errno`` is in :data:`FULL` and ``filename`` is ``folder``.
+    existing folder. Raises OSError if the folder cannot be written, or exists already; an existing folder is then
+    unchanged. If the disk is full, ``errno`` is in :data:`FULL` and ``filename`` is ``folder``.
     """
     folder = pointed_to(folder).absolute()
     partial, old = _beside(folder, "partial"), _beside(folder, "old")

@@ -28,6 +28,8 @@ def read_bounded(
 ) -> bytes:
     """Read a plain file of at most ``largest`` bytes.
 
+    Raises InputError if the file is missing, too large, a folder, a pipe or a device, or cannot be read.
+
     Parameters
     ----------
     file
@@ -40,11 +42,6 @@ def read_bounded(
         Largest size [bytes].
     first
         Number of bytes to read from the beginning; by default all.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, too large, a folder, a pipe or a device, or cannot be read.
 
     See Also
     --------
@@ -74,15 +71,12 @@ def read_bounded(
 def read_text_bounded(file: Path, absent: str | None = None, hint: str = "", largest: int = LARGEST_FILE) -> str:
     """Read a plain file of at most ``largest`` bytes as UTF-8, with or without a byte order mark.
 
+    Raises InputError as :func:`read_bounded`, or if the text is not UTF-8.
+
     Parameters
     ----------
     file, absent, hint, largest
         As in :func:`read_bounded`.
-
-    Raises
-    ------
-    InputError
-        As :func:`read_bounded`, or if the text is not UTF-8.
 
     See Also
     --------
@@ -99,10 +93,7 @@ def read_text_bounded(file: Path, absent: str | None = None, hint: str = "", lar
 def read_json_object(file: Path, absent: str | None = None, hint: str = "") -> dict[str, Any]:
     """Read a JSON object from a plain file.
 
-    Raises
-    ------
-    InputError
-        As :func:`read_text_bounded`, or if the text is no JSON object.
+    Raises InputError as :func:`read_text_bounded`, or if the text is no JSON object.
     """
     text = read_text_bounded(file, absent, hint)
     try:

@@ -85,11 +85,8 @@ class Schema:
 def read_dataset(path: str | Path, schema: Schema) -> xr.Dataset:
     """Read a netCDF file and check it against a schema.
 
-    Raises
-    ------
-    InputError
-        If the file is missing, too large, not a plain netCDF file, or changed since it was written; or if a variable
-        violates the schema. The error names the file and the variable.
+    Raises InputError if the file is missing, too large, not a plain netCDF file, or changed since it was written; or if
+    a variable violates the schema. The error names the file and the variable.
     """
     import xarray as xr  # half a second, which commands without a dataset save
 
@@ -122,10 +119,7 @@ def read_dataset(path: str | Path, schema: Schema) -> xr.Dataset:
 def check_dataset(path: str | Path, data: xr.Dataset, schema: Schema) -> None:
     """Check a dataset that was converted from another kind of file.
 
-    Raises
-    ------
-    InputError
-        If a variable violates the schema. The error names the file and the variable.
+    Raises InputError if a variable violates the schema. The error names the file and the variable.
     """
     _check_form(Path(path), data, schema)
     _check_content(Path(path), data, schema)

@@ -42,10 +42,7 @@ LONGEST_NAME = 100
 def checked_name(name: str) -> str:
     """Return a name that may become part of a file's name or of a page.
 
-    Raises
-    ------
-    ValueError
-        If the name is not allowed; pydantic turns it into an :class:`InputError`.
+    Raises ValueError if the name is not allowed; pydantic turns it into an :class:`InputError`.
     """
     # marks belong to the letter before them, as in Thai and Hindi; none is a letter of its own
     letters = name[:1] + "".join(
@@ -66,13 +63,7 @@ Name = Annotated[
 
 
 def read_toml(path: str | Path, model: type[Model]) -> Model:
-    """Read one TOML file into a model.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, is not TOML, or violates the model.
-    """
+    """Read one TOML file into a model. Raises InputError if the file is missing, is not TOML, or violates the model."""
     return validate(path, read_toml_table(path), model)
 
 

@@ -29,10 +29,7 @@ _DECIMAL_COMMA = re.compile(r"=\s*[+-]?\d+,\d")
 def read_toml_table(path: str | Path) -> dict[str, Any]:
     """Read one TOML file as a table, of which only nesting and numbers are checked.
 
-    Raises
-    ------
-    InputError
-        If the file is missing or is not TOML.
+    Raises InputError if the file is missing or is not TOML.
     """
     path = Path(path)
     near = "" if is_file(path) else _neighbours(path)

@@ -45,20 +45,14 @@ MM_STEP = 1e-2
 
 @dataclass(frozen=True)
 class BoardCalibration:
-    """A stage calibrated with a board.
+    """A stage calibrated with a board."""
 
-    - ``axes`` in the sensor frame.
-    - ``zero_pose`` (4, 4): ``sensor_from_board`` at zero [mm].
-    - ``covariance`` of the parameters: four for each axis as in
-      :class:`~characterisation.stage.turning_axes.TurningAxes`; rotation [rad] of the zero pose about the sensor's
-      axes; its shift [mm].
-    - ``residuals`` (n, 6), measured minus fitted: rotation vectors [rad] about the sensor's axes, positions [mm].
-    """
-
-    axes: TurningAxes
-    zero_pose: Floats
+    axes: TurningAxes  # in the sensor frame
+    zero_pose: Floats  # (4, 4) ``sensor_from_board`` at zero [mm]
+    #: of the parameters: four for each axis as in :class:`~characterisation.stage.turning_axes.TurningAxes`; rotation
+    #: [rad] of the zero pose about the sensor's axes; its shift [mm]
     covariance: Floats
-    residuals: Floats
+    residuals: Floats  # (n, 6), measured minus fitted: rotation vectors [rad] about the sensor's axes, positions [mm]
 
     def poses(self, angles: ArrayLike) -> Floats:
         """Return ``sensor_from_board`` (n, 4, 4) at angles (n, k) [rad]."""

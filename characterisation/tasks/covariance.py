@@ -82,34 +82,29 @@ SINGULAR = 1e-9
 
 @dataclass(frozen=True)
 class ExpectedPoints:
-    """Predicted points of one feature: an element for each pixel that shows it, n in all.
+    """Predicted points of one feature: an element for each pixel that shows it, n in all."""
 
-    - ``point`` (n, 3) [mm] and ``ray`` (n, 3), unit, in the frame of the feature's surface.
-    - ``pixel`` (n, 2): row and column; ``normal`` (n, 3) in the view frame.
-    - ``fraction`` F, ``fraction_error`` u(F), never NaN.
-    - ``sigma`` [mm], ``area`` A [px^2], ``persistent`` p [mm], ``displaced`` b [mm]; ``distance`` |V| [mm].
-    - ``thinning``: number of sensor pixels that each element stands for.
-    - ``angular_pitch`` [rad] between neighbouring sensor pixels.
-    - ``shared`` (n, k) [mm]: displacement of the points by one standard deviation of each of k independent errors,
-      which all features share.
-    - ``shown`` (m, 3) [mm]: all places of the surface that every eye sees, also next to its edges, where pixels belong
-      to no feature; by default ``point``.
-    """
-
+    #: ``point`` (n, 3) [mm] and ``ray`` (n, 3), unit, in the frame of the feature's surface
     point: Floats
     ray: Floats
-    pixel: NDArray[np.int64]
-    normal: Floats
+    pixel: NDArray[np.int64]  # (n, 2) row and column
+    normal: Floats  # (n, 3) in the view frame
+    #: ``fraction`` F, ``fraction_error`` u(F), never NaN
     fraction: Floats
     fraction_error: Floats
+    #: ``sigma`` [mm], ``area`` A [px^2], ``persistent`` p [mm], ``displaced`` b [mm]; ``distance`` |V| [mm]
     sigma: Floats
     area: Floats
     persistent: Floats
     displaced: Floats
     distance: Floats
-    thinning: float = 1.0
-    angular_pitch: float = math.nan
+    thinning: float = 1.0  # number of sensor pixels that each element stands for
+    angular_pitch: float = math.nan  # [rad] between neighbouring sensor pixels
+    #: (n, k) [mm]: displacement of the points by one standard deviation of each of k independent errors, which all
+    #: features share
     shared: Floats | None = None
+    #: (m, 3) [mm]: all places of the surface that every eye sees, also next to its edges, where pixels belong to no
+    #: feature; by default ``point``
     shown: Floats | None = None
 
 
@@ -210,12 +205,7 @@ def usable(surface: Surface, expected: ExpectedPoints) -> ExpectedPoints:
     """Return the points that a fit would use if they were recovered: neither at grazing incidence nor false.
 
     A point is false if it is displaced by more than :data:`~characterisation.point_cloud.FALSE_SHARE_OF_DISTANCE` of
-    its distance. It is then not assigned to its feature.
-
-    Raises
-    ------
-    FitError
-        If there are none, or nearly all are false.
+    its distance. It is then not assigned to its feature. Raises FitError if there are none, or nearly all are false.
     """
     if len(expected.point):
         cosine = surface.meet(expected.point, expected.ray).cosine
@@ -258,10 +248,7 @@ def expected_sums(g: Floats, expected: ExpectedPoints, minimum_points: float) ->
 def solved(parts: Sequence[Sums], kind: str) -> ExpectedFit:
     """Solve the least-squares fit to the points of all features together.
 
-    Raises
-    ------
-    FitError
-        If they leave a parameter undetermined.
+    Raises FitError if they leave a parameter undetermined.
     """
     normal = np.sum([p.normal for p in parts], axis=0)
     spread, shared = (np.sum([getattr(p, name) for p in parts], axis=0) for name in ("spread", "shared"))

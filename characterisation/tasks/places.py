@@ -50,12 +50,7 @@ def intersection(features: Sequence[Plane | Axis]) -> Point:
     """Return the point where an axis meets a plane, where three planes meet, or midway between two axes.
 
     The last is the middle of the common perpendicular. All are least-squares common points. The point is NaN where the
-    features are within :data:`PARALLEL` of being parallel.
-
-    Raises
-    ------
-    ValueError
-        If the features are none of the three.
+    features are within :data:`PARALLEL` of being parallel. Raises ValueError if the features are none of the three.
     """
     kinds = sorted("plane" if isinstance(feature, Plane) else "axis" for feature in features)
     if kinds not in (["axis", "plane"], ["plane", "plane", "plane"], ["axis", "axis"]):

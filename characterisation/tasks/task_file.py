@@ -110,12 +110,7 @@ class Feature(Document):
     def nominal(self, sensor_from_part: ArrayLike | None = None) -> Surface:
         """Return the surface in the part frame, or moved to the sensor frame by a (4, 4) matrix.
 
-        :meth:`Task.nominal` returns the geometry of other kinds.
-
-        Raises
-        ------
-        ValueError
-            If the feature is not a surface.
+        :meth:`Task.nominal` returns the geometry of other kinds. Raises ValueError if the feature is not a surface.
         """
         point, direction = np.array(self.point_mm or (0.0, 0.0, 0.0)), np.array(self.direction or (0.0, 0.0, 1.0))
         radius = float(self.radius_mm or 0.0)

@@ -76,10 +76,7 @@ def read_task(path: str | Path) -> Task:
 def check_task(path: str | Path, task: Task) -> None:
     """Check features and measurements of a task against one another.
 
-    Raises
-    ------
-    InputError
-        For the first that does not match; the error names the key.
+    Raises InputError for the first that does not match; the error names the key.
     """
     for name in task.features:
         _check_feature(path, task, name)
@@ -90,10 +87,7 @@ def check_task(path: str | Path, task: Task) -> None:
 def check_features(task: Task, task_path: str | Path, shape_ids: Iterable[str]) -> None:
     """Check that every feature of a task that is a shape exists in the scene.
 
-    Raises
-    ------
-    InputError
-        For the first feature that does not, with the ids of the scene and the most similar of them.
+    Raises InputError for the first feature that does not, with the ids of the scene and the most similar of them.
     """
     names = list(shape_ids)
     for name in task.shapes:
@@ -106,10 +100,8 @@ def check_features(task: Task, task_path: str | Path, shape_ids: Iterable[str]) 
 def check_nominal_values(task: Task, task_path: str | Path) -> None:
     """Check that nominal values are those of the nominal geometry, from which simulated errors are counted.
 
-    Raises
-    ------
-    InputError
-        For the first measurement that states another; the hint gives the same limits about the value of the geometry.
+    Raises InputError for the first measurement that states another; the hint gives the same limits about the value of
+    the geometry.
     """
     for name in task.measurements:
         if fault := misstated(task, name):

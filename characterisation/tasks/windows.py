@@ -64,10 +64,7 @@ LEAST_POINTS = 30
 def window_slices(window: Roi | None, cloud: PointCloud, name: str) -> tuple[slice, slice]:
     """Return rows and columns of a window [px] of a cloud's grid; None is the whole grid.
 
-    Raises
-    ------
-    InputError
-        If the window does not lie in the grid. The error names ``name``, the feature of the window.
+    Raises InputError if the window does not lie in the grid. The error names ``name``, the feature of the window.
     """
     grid = cloud.grid
     if window is None:
@@ -90,22 +87,15 @@ def window_points(window: Roi | None, cloud: PointCloud, name: str) -> NDArray[n
 
 @dataclass(frozen=True)
 class WindowPlan:
-    """Features to measure in windows, and the angles and distances between pairs of them.
+    """Features to measure in windows, and the angles and distances between pairs of them."""
 
-    - ``features``: shape and window by name; a window of None is the whole grid.
-    - ``pairs``: kind of measurement, and the names of two features.
-    """
-
-    features: Mapping[str, tuple[Shape, Roi | None]]
-    pairs: Sequence[tuple[PairKind, str, str]] = ()
+    features: Mapping[str, tuple[Shape, Roi | None]]  # shape and window by name; a window of None is the whole grid
+    pairs: Sequence[tuple[PairKind, str, str]] = ()  # kind of measurement, and the names of two features
 
     def check(self) -> None:
         """Check that every pair names two different features of the plan that have this measurement.
 
-        Raises
-        ------
-        InputError
-            For the first pair that does not.
+        Raises InputError for the first pair that does not.
         """
         for kind, first, second in self.pairs:
             for name in (first, second):
@@ -136,12 +126,8 @@ def measure_windows(cloud: PointCloud, plan: WindowPlan, frame: NDArray[np.float
     standard deviation of the residuals along the view rays. Lengths are in mm, angles in deg.
 
     Standard uncertainties follow from the covariance of the fits by the law of propagation of uncertainty (JCGM 100,
-    5.2). That of the noise is s / sqrt(2 nu), with nu degrees of freedom and normal noise (JCGM 100, E.4.3).
-
-    Raises
-    ------
-    InputError
-        If a window does not lie in the grid, or a pair of features has no such measurement.
+    5.2). That of the noise is s / sqrt(2 nu), with nu degrees of freedom and normal noise (JCGM 100, E.4.3). Raises
+    InputError if a window does not lie in the grid, or a pair of features has no such measurement.
     """
     plan.check()
     results: list[Result] = []
@@ -193,11 +179,8 @@ _PAIR_FUNCTIONS: dict[tuple[PairKind, Shape, Shape], Callable[..., Any]] = {
 def fit_shape(points: NDArray[np.float64], shape: Shape, viewpoint: NDArray[np.float64]) -> ShapeFit:
     """Fit a shape to the points (n, 3) [mm] of a window, seen from a viewpoint (3,) [mm].
 
-    Raises
-    ------
-    FitError
-        If the points do not determine it, fewer than :data:`LEAST_SHARE` of them lie on it, or they scatter about it by
-        more than :data:`MOST_NOISE` of their distance.
+    Raises FitError if the points do not determine it, fewer than :data:`LEAST_SHARE` of them lie on it, or they scatter
+    about it by more than :data:`MOST_NOISE` of their distance.
     """
     if len(points) < LEAST_POINTS:
         raise FitError(f"{len(points)} points in the window, at least {LEAST_POINTS} are needed")

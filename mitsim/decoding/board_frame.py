@@ -43,12 +43,8 @@ def board_frame(
 ) -> tuple[NDArray[np.float64], float, float]:
     """Return the frame of a board (4, 4) from the sensor frame, the scale of the corners, and their rms residual [mm].
 
-    ``image`` (H, W) is grey, on the grid of the organised ``cloud`` that shows the board.
-
-    Raises
-    ------
-    FitError
-        If the image does not show the board, or the cloud has too few points on it.
+    ``image`` (H, W) is grey, on the grid of the organised ``cloud`` that shows the board. Raises FitError if the image
+    does not show the board, or the cloud has too few points on it.
     """
     detected, corners = cv2.findChessboardCornersSB(image, (board.columns, board.rows), flags=cv2.CALIB_CB_ACCURACY)
     if not detected:

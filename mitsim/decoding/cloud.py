@@ -75,11 +75,7 @@ def decoder_settings(
 
     ``sensor``: loaded, or a preset or sensor file. ``range_mm``: nearest and farthest depth [mm], which replace those
     of the settings. Without both, the range that was requested at the import of the capture is used, if there is one.
-
-    Raises
-    ------
-    InputError
-        If the sensor is not known, or the capture's settings or range are invalid.
+    Raises InputError if the sensor is not known, or the capture's settings or range are invalid.
     """
     if range_mm is None and sensor is None:
         range_mm = capture.decoding.range_mm
@@ -165,10 +161,7 @@ def settings_in_words(
 def with_options(settings: Settings, block: int | None, contrast: float | None) -> Settings:
     """Return settings of a decoder with another block size [px] or another least contrast [DN of 8 bit].
 
-    Raises
-    ------
-    InputError
-        If the decoder has no such setting, or does not allow the value.
+    Raises InputError if the decoder has no such setting, or does not allow the value.
     """
     requested = {"--block": ("block_size", block), "--contrast": ("minimum_contrast_dn", contrast)}
     if isinstance(settings, DecoderSettings):
@@ -196,10 +189,7 @@ def sensor_geometry(sensor: Sensor) -> Geometry:
 def capture_geometry(capture: Capture, settings: Settings) -> Geometry:
     """Return the geometry for a capture, from its own rig and technology.
 
-    Raises
-    ------
-    InputError
-        If its technology, pattern or rig is invalid.
+    Raises InputError if its technology, pattern or rig is invalid.
     """
     technology = technology_of(capture.technology)
     return technology.geometry(capture.rig, settings, capture_pattern(capture))
@@ -230,10 +220,7 @@ def unknown_code(where: str, count: int) -> InputError:
 def capture_pattern(capture: Capture) -> Pattern | None:
     """Return the pattern of a capture, or None if its technology does not need one.
 
-    Raises
-    ------
-    InputError
-        If it has no pattern, one of another technology, or images of the user's own in place of a code.
+    Raises InputError if it has no pattern, one of another technology, or images of the user's own in place of a code.
     """
     technology, pattern = technology_of(capture.technology), capture.decoding.pattern
     if not technology.patterns:
@@ -257,6 +244,8 @@ def capture_cloud(
 ) -> PointCloud:
     """Decode a capture to points in the sensor frame [mm].
 
+    Raises InputError if the settings belong to another technology, or the capture is inconsistent.
+
     Parameters
     ----------
     capture, settings
@@ -273,11 +262,6 @@ def capture_cloud(
     coordinates
         Projector coordinates of structured light, if the images are decoded already
         (:class:`mitsim.decoding.coded_images.CodedImages`).
-
-    Raises
-    ------
-    InputError
-        If the settings belong to another technology, or the capture is inconsistent.
     """
     technology = technology_of(capture.technology)
     if not isinstance(settings, accepted_settings(capture.technology)):

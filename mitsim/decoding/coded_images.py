@@ -50,10 +50,7 @@ class CodedImages:
     def of(cls, capture: Capture, settings: Settings, imager: Imager | None = None) -> CodedImages | None:
         """Return the coded images of a capture; None for another technology, a bracket, or too few images.
 
-        Raises
-        ------
-        InputError
-            If the capture has no size of the projector.
+        Raises InputError if the capture has no size of the projector.
         """
         stated, code = capture.decoding, capture.decoding.pattern
         if capture.technology != "structured_light" or not isinstance(settings, DecoderSettings):
@@ -74,10 +71,7 @@ class CodedImages:
     def coordinates(self) -> Coordinates:
         """Projector coordinates (H, W) of each camera, as the cloud is made from them.
 
-        Raises
-        ------
-        InputError
-            If the code is ambiguous over the projector.
+        Raises InputError if the code is ambiguous over the projector.
         """
         out: dict[str, dict[Axis, ProjectorCoordinate]] = {}
         for name, stack in self.stacks.items():

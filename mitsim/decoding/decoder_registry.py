@@ -68,48 +68,27 @@ Coordinates = Mapping[str, Mapping[Axis, ProjectorCoordinate]]
 
 @dataclass(frozen=True)
 class Images:
-    """The images of a capture, ready to be decoded.
+    """The images of a capture, ready to be decoded."""
 
-    - ``capture``: the capture.
-    - ``stacks``: (P, H, W) images [DN] of each camera, that of the reference camera first. Exposures of a bracket are
-      merged.
-    - ``full_scale``: value of a saturated pixel [DN].
-    - ``imager``: the imager, or the noise measured in the images; None if neither is known.
-    - ``roi``: region of the cloud's grid to decode; None for all.
-    - ``read_out``: region that was read out of each camera, without cameras that were read out completely.
-    - ``coordinates``: projector coordinates that structured light was decoded to before; None if it is not decoded yet.
-    - ``share``: as in :class:`mitsim.decoding.image_context.ImageContext`.
-    """
-
-    capture: Capture
+    capture: Capture  # the capture
+    #: (P, H, W) images [DN] of each camera, that of the reference camera first. Exposures of a bracket are merged
     stacks: dict[str, NDArray[np.unsignedinteger[Any]]]
-    full_scale: float
-    imager: Imager | MeasuredNoise | None
-    roi: Roi | None
-    read_out: dict[str, Roi]
+    full_scale: float  # value of a saturated pixel [DN]
+    imager: Imager | MeasuredNoise | None  # the imager, or the noise measured in the images; None if neither is known
+    roi: Roi | None  # region of the cloud's grid to decode; None for all
+    read_out: dict[str, Roi]  # region that was read out of each camera, without cameras that were read out completely
+    #: projector coordinates that structured light was decoded to before; None if it is not decoded yet
     coordinates: Coordinates | None = None
-    share: float = 1.0
+    share: float = 1.0  # as in :class:`mitsim.decoding.image_context.ImageContext`
 
     @property
     def reference(self) -> tuple[str, NDArray[np.unsignedinteger[Any]]]:
-        """Name and stack of the reference camera.
-
-        Raises
-        ------
-        InputError
-            If it has no images.
-        """
+        """Name and stack of the reference camera. Raises InputError if it has no images."""
         (name,) = self._first(1)
         return name, self.stacks[name]
 
     def pair(self) -> tuple[str, str]:
-        """Return the names of the two cameras that are matched.
-
-        Raises
-        ------
-        InputError
-            If one of them has no images.
-        """
+        """Return the names of the two cameras that are matched. Raises InputError if one of them has no images."""
         first, second = self._first(2)
         return first, second
 
@@ -194,10 +173,7 @@ def _reference(
 def projector_size(capture: Capture) -> tuple[int, int]:
     """Return the width and height of the pattern of a structured-light capture [px].
 
-    Raises
-    ------
-    InputError
-        If the capture has neither a projector nor its size.
+    Raises InputError if the capture has neither a projector nor its size.
     """
     projector = capture.rig.projector
     if projector is not None:

@@ -44,18 +44,12 @@ _HEAD = 1 << 20
 
 @dataclass(frozen=True)
 class InputCloud:
-    """A cloud to measure.
+    """A cloud to measure."""
 
-    - ``path`` of its file or capture folder.
-    - ``cloud`` in the sensor frame [mm].
-    - ``capture`` that it was decoded from, None for a cloud file of ``mitsim decode``.
-    - ``margin_px``: pixels beside an edge whose points may mix both sides (:func:`margin_of`).
-    """
-
-    path: Path
-    cloud: PointCloud
-    capture: Capture | None
-    margin_px: int = 0
+    path: Path  # of its file or capture folder
+    cloud: PointCloud  # in the sensor frame [mm]
+    capture: Capture | None  # that it was decoded from, None for a cloud file of ``mitsim decode``
+    margin_px: int = 0  # pixels beside an edge whose points may mix both sides (:func:`margin_of`)
 
 
 def cloud_paths(paths: Iterable[Path]) -> list[Path]:

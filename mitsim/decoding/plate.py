@@ -108,7 +108,8 @@ def measure_plate(name: str, plate: Plate, cloud: PointCloud, image: NDArray[np.
       Its standard uncertainty takes the residuals along the view ray and across it as normal, each of its own size.
     - flatness: range of the dots across the plate.
 
-    If the dots cannot be measured, each result has no value and gives the reason.
+    If the dots cannot be measured, each result has no value and gives the reason. Raises InputError if the window does
+    not lie in the grid.
 
     Parameters
     ----------
@@ -120,11 +121,6 @@ def measure_plate(name: str, plate: Plate, cloud: PointCloud, image: NDArray[np.
         Organised cloud of the plate.
     image
         (H, W) grey image on the grid of the cloud.
-
-    Raises
-    ------
-    InputError
-        If the window does not lie in the grid.
 
     See Also
     --------
@@ -162,7 +158,8 @@ def measure_plate(name: str, plate: Plate, cloud: PointCloud, image: NDArray[np.
 def plate_dots(name: str, plate: Plate, cloud: PointCloud, image: NDArray[np.uint8]) -> PlateDots:
     """Return the dots of a plate in a cloud.
 
-    Of several plates in the window, the one with the most dots is used.
+    Of several plates in the window, the one with the most dots is used. Raises FitError if there are too few dots, or
+    they are not about a pitch apart, or do not form one grid. Raises InputError if the window does not lie in the grid.
 
     Parameters
     ----------
@@ -174,13 +171,6 @@ def plate_dots(name: str, plate: Plate, cloud: PointCloud, image: NDArray[np.uin
         Organised cloud of the plate.
     image
         (H, W) grey image on the grid of the cloud, in which the dots are found.
-
-    Raises
-    ------
-    FitError
-        If there are too few dots, or they are not about a pitch apart, or do not form one grid.
-    InputError
-        If the window does not lie in the grid.
 
     See Also
     --------

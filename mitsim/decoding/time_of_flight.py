@@ -186,6 +186,9 @@ def joint_path(
 ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
     """Return the optical path that fits the phases of all frequencies.
 
+    Returns ``path``, ``sigma``: (H, W) optical path L [mm], 0 to the unambiguous one, and its standard deviation by
+    noise [mm]; ``chi_square``: (H, W) J of the most likely number of turns.
+
     Parameters
     ----------
     phase, variance
@@ -194,13 +197,6 @@ def joint_path(
         Frequencies of the modulation.
     systematic_rad
         Standard deviation of the systematic phase error [rad], which is added to the noise in the weights.
-
-    Returns
-    -------
-    path, sigma
-        (H, W) optical path L [mm], 0 to the unambiguous one, and its standard deviation by noise [mm].
-    chi_square
-        (H, W) J of the most likely number of turns.
 
     See Also
     --------

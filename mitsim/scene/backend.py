@@ -147,14 +147,8 @@ def choose_variant(requested: str | None = None) -> str:
     """Return the Mitsuba variant to run: the requested one, else CUDA if there is a device, else LLVM.
 
     Without a request, the environment variable :data:`VARIANT_VARIABLE` is one. Sets the environment variable
-    ``LLVM_VARIABLE`` for LLVM.
-
-    Raises
-    ------
-    InputError
-        If the variant is not supported. Variants with colour or polarisation would need other materials.
-    MissingEnvironmentError
-        If the variant cannot run on this machine.
+    ``LLVM_VARIABLE`` for LLVM. Raises InputError if the variant is not supported. Variants with colour or polarisation
+    would need other materials. Raises MissingEnvironmentError if the variant cannot run on this machine.
     """
     where = "--variant"
     if requested is None and (asked := os.environ.get(VARIANT_VARIABLE)):
@@ -181,14 +175,8 @@ def activate(requested: str | None = None) -> str:
     """Start Mitsuba in the requested variant, once per process, and return the name of the variant.
 
     It renders with ``OMP_NUM_THREADS`` threads, or with one for each core. Processes that this one starts run the same
-    variant (:data:`VARIANT_VARIABLE`).
-
-    Raises
-    ------
-    InputError
-        If the process already runs another variant, or the variant is not supported.
-    MissingEnvironmentError
-        If the variant cannot run on this machine.
+    variant (:data:`VARIANT_VARIABLE`). Raises InputError if the process already runs another variant, or the variant is
+    not supported. Raises MissingEnvironmentError if the variant cannot run on this machine.
     """
     global _active
     if _active is not None:

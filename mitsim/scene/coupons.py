@@ -72,10 +72,7 @@ class Sample:
 def load_sample(recipe: CouponRecipe, asked: tuple[Path, str] | None = None) -> Sample:
     """Load a coupon from its recipe; ``asked`` is the file and field that name it, for error messages.
 
-    Raises
-    ------
-    InputError
-        If the scene is not a coupon.
+    Raises InputError if the scene is not a coupon.
     """
     path, where = asked or (Path(recipe.scene), "")
     scene = load_scene(recipe.scene, recipe.wavelength_nm, dict(recipe.parameters), recipe.deviation)

@@ -83,17 +83,12 @@ class ShapeFacts:
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """Facts about a scene.
+    """Facts about a scene."""
 
-    - ``shapes`` of the scene; ``bounds`` (2, 3): corners of the bounding box [mm], world frame.
-    - ``merged_mesh``: all meshes as one, without emitters; None if there are none.
-    - ``emitters``: kind and flux [W] of each. The flux is NaN for an emitter without a position (sky, directional
-      light).
-    """
-
-    shapes: tuple[ShapeFacts, ...]
-    bounds: Floats
-    merged_mesh: MeshFacts | None
+    shapes: tuple[ShapeFacts, ...]  # of the scene
+    bounds: Floats  # (2, 3) corners of the bounding box [mm], world frame
+    merged_mesh: MeshFacts | None  # all meshes as one, without emitters; None if there are none
+    #: kind and flux [W] of each. The flux is NaN for an emitter without a position (sky, directional light)
     emitters: tuple[tuple[str, float], ...]
 
 

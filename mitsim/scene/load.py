@@ -191,17 +191,9 @@ def load_scene(
 def scene_from_dict(description: dict[str, Any], wavelength_nm: float, where: str = "scene") -> Scene:
     """Load a scene from a dictionary in Mitsuba's form; its keys are the names of the shapes.
 
-    Parameters
-    ----------
-    description, wavelength_nm
-        Shapes and emitters by name, and wavelength at which the materials are evaluated [nm].
-    where
-        Description of the scene, for messages.
-
-    Raises
-    ------
-    InputError
-        If there is no shape, a part in mm cannot have the size, or a finish is not possible.
+    ``description``, ``wavelength_nm``: shapes and emitters by name, and wavelength at which the materials are evaluated
+    [nm]. ``where``: description of the scene, for messages. Raises InputError if there is no shape, a part in mm cannot
+    have the size, or a finish is not possible.
     """
     _prepare()
     with loading(wavelength_nm, where) as state:

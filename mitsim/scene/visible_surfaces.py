@@ -22,18 +22,14 @@ from mitsim.sensor.transforms import Transform
 
 @dataclass(frozen=True)
 class VisibleSurfaces:
-    """Surfaces that the pixels of the reference camera see.
+    """Surfaces that the pixels of the reference camera see."""
 
-    - ``shape`` (H, W): index of the first shape on the ray, whichever side it shows; -1 for none.
-    - ``front`` (H, W): whether the reflecting side of the shape is seen.
-    - ``normal`` (H, W, 3) toward the camera and ``point`` (H, W, 3) [mm], sensor frame; NaN without a shape.
-    - ``seen_by_all`` (H, W): whether the front is seen and every other camera and the projector has a free line to it.
-    """
-
-    shape: NDArray[np.int16]
-    front: NDArray[np.bool_]
+    shape: NDArray[np.int16]  # (H, W) index of the first shape on the ray, whichever side it shows; -1 for none
+    front: NDArray[np.bool_]  # (H, W) whether the reflecting side of the shape is seen
+    #: ``normal`` (H, W, 3) toward the camera and ``point`` (H, W, 3) [mm], sensor frame; NaN without a shape
     normal: Floats
     point: Floats
+    #: (H, W) whether the front is seen and every other camera and the projector has a free line to it
     seen_by_all: NDArray[np.bool_]
 
 

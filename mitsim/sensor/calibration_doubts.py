@@ -56,6 +56,8 @@ _MOST_TURNED_DEG = 60.0
 def check_unit(where: str | Path, name: str, baseline: float, unit_mm: float | None) -> None:
     """Check that a distance between two eyes is plausible in a unit that the file itself does not state.
 
+    Raises InputError if the distance is too long, or, in mm, too short.
+
     Parameters
     ----------
     where, name
@@ -64,11 +66,6 @@ def check_unit(where: str | Path, name: str, baseline: float, unit_mm: float | N
         As the file has it.
     unit_mm
         The unit that the format implies [mm]; None if nothing tells it: then mm is assumed.
-
-    Raises
-    ------
-    InputError
-        If the distance is too long, or, in mm, too short.
     """
     low = _SHORTEST_MM if unit_mm is None else 0.0
     if baseline == 0 or low <= baseline * (unit_mm or 1.0) <= _LONGEST_MM:

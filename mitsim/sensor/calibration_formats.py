@@ -49,10 +49,7 @@ _DASHES = re.compile(rb"(?:[-?:][ \t]+){40}")
 def read_documents(file: Path) -> list[dict[str, Any]]:
     """Return the names and values of each document of a file.
 
-    Raises
-    ------
-    InputError
-        If it is missing, damaged, too large, or of no known format.
+    Raises InputError if it is missing, damaged, too large, or of no known format.
     """
     data = read_bounded(file, _KINDS, "" if file.exists() else beside(file), largest=_LARGEST)
     if file.suffix.lower() == ".mat":

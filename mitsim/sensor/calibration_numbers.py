@@ -46,6 +46,8 @@ def vector(value: Any, size: int | None = None) -> NDArray[np.float64] | None:
 def numbers_of(value: Any, file: Path, key: str, shapes: tuple[tuple[int, ...], ...]) -> NDArray[np.float64]:
     """Convert a matrix or lists to an array of one of several shapes; row and column vectors are equivalent.
 
+    Raises InputError if it has another shape, or numbers that are not finite.
+
     Parameters
     ----------
     value
@@ -54,11 +56,6 @@ def numbers_of(value: Any, file: Path, key: str, shapes: tuple[tuple[int, ...], 
         File and name of the value, for messages.
     shapes
         Those that are allowed, the vectors first.
-
-    Raises
-    ------
-    InputError
-        If it has another shape, or numbers that are not finite.
     """
     try:
         values = np.asarray(value, float)

@@ -101,10 +101,7 @@ def _cause(focal: tuple[float, float], principal: tuple[float, float]) -> str:
 def check_camera(camera: Camera, where: str | Path, field: str = "") -> None:
     """Check that the matrix of a camera belongs to its images.
 
-    Raises
-    ------
-    InputError
-        If it cannot; the error names the file, the field and the likely cause.
+    Raises InputError if it cannot; the error names the file, the field and the likely cause.
     """
     (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
     try:
@@ -195,10 +192,7 @@ def of_images(
 def unit_mm(table: dict[str, Any], where: str | Path) -> float | None:
     """Return the unit of length [mm] that a table states, else that of its format; None without both.
 
-    Raises
-    ------
-    InputError
-        If the unit is unknown.
+    Raises InputError if the unit is unknown.
     """
     for name in (*UNIT_NAMES, OF_FORMAT):
         text = table.get(name)

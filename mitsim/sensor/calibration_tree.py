@@ -62,10 +62,7 @@ class CalibrationTree:
     def find(self, key: str) -> Found | None:
         """Return the value of a name; dots step into maps, and ``file.yml:name`` searches one file only.
 
-        Raises
-        ------
-        InputError
-            If several files, or several documents of a file, give different values.
+        Raises InputError if several files, or several documents of a file, give different values.
         """
         file, mark, name = key.rpartition(":")
         matches: list[Found] = []
@@ -112,13 +109,7 @@ class CalibrationTree:
 
 
 def read_tree(files: list[Path]) -> CalibrationTree:
-    """Read calibration files.
-
-    Raises
-    ------
-    InputError
-        If a file is missing or cannot be read.
-    """
+    """Read calibration files. Raises InputError if a file is missing or cannot be read."""
     read = [(file, with_usual_names(document)) for file in files for document in read_documents(file)]
     tree = CalibrationTree([file for file, _ in read], [values for _, values in read])
     if len(files) == len(read) == 2:  # of one camera each, as of EuRoC

@@ -319,12 +319,8 @@ def stereo_rectification(left: Camera, right: Camera) -> Rectification:
 
     Where OpenCV has the second camera above, below or to the left, both are rolled until it is to the right (+x).
     OpenCV finds the centre of the rectified image by undistorting its corners, an iteration that can diverge for strong
-    distortion. Rotations and focal length do not depend on it; a diverged centre is replaced.
-
-    Raises
-    ------
-    InputError
-        If both cameras stand in the same place.
+    distortion. Rotations and focal length do not depend on it; a diverged centre is replaced. Raises InputError if both
+    cameras stand in the same place.
     """
     right_from_left = right.sensor_from_camera.inverse() @ left.sensor_from_camera
     if not right_from_left.translation.any():

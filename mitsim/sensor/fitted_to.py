@@ -34,12 +34,8 @@ def images_digest(images: Mapping[str, NDArray[np.generic]]) -> str:
 def note_images(found: dict[str, str], images: Mapping[str, NDArray[np.generic]], where: str | Path) -> None:
     """Add the digest of a capture's images to those ``found``, and reject a copy of one of them.
 
-    Images of one level each may be equal by rounding, in the dark.
-
-    Raises
-    ------
-    InputError
-        If the images are those of another capture.
+    Images of one level each may be equal by rounding, in the dark. Raises InputError if the images are those of another
+    capture.
     """
     if all(stack.min() == stack.max() for stack in images.values()):
         return
@@ -69,10 +65,7 @@ def records_of(fitted_to: Iterable[FittedCapture]) -> dict[str, Any]:
 def recorded_in(settings: Mapping[str, Any], where: str | Path) -> tuple[FittedCapture, ...]:
     """Return the captures that the sensor of a simulated capture was fitted to, by its settings.
 
-    Raises
-    ------
-    InputError
-        If the settings state them in another form.
+    Raises InputError if the settings state them in another form.
     """
     return validate(where, {"fitted_to": settings.get("fitted_to", [])}, _Records).fitted_to
 

@@ -107,6 +107,9 @@ def expose(
 ) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """Convert mean photo-electrons to grey levels [DN].
 
+    Returns: of the same shape, uint8 up to 8 bits, else uint16; bits and full scale are those of :func:`converter`.
+    Raises ValueError for electrons that are not finite, or temporal noise without ``rng``.
+
     Parameters
     ----------
     electrons
@@ -123,16 +126,6 @@ def expose(
         ``rng.spawn(n)`` and n calls give the same images as one call. None is allowed if no temporal source is on.
     exposure_s
         Exposure [s], for the dark current.
-
-    Returns
-    -------
-    numpy.ndarray
-        Of the same shape, uint8 up to 8 bits, else uint16; bits and full scale are those of :func:`converter`.
-
-    Raises
-    ------
-    ValueError
-        For electrons that are not finite, or temporal noise without ``rng``.
 
     See Also
     --------

@@ -94,10 +94,7 @@ class GrayImages(Document):
     def offset(self, extent: int) -> float:
         """Return the offset of the code along an axis of ``extent`` pixels [px].
 
-        Raises
-        ------
-        InputError
-            As for :meth:`stripes`.
+        Raises InputError as for :meth:`stripes`.
         """
         return offset_in_pixels(self.offset_px, *self.stripes(extent), extent)
 
@@ -196,10 +193,7 @@ class ImageSequence(Document):
     def roles(self, width: int, height: int) -> list[Role]:
         """Return one role for each image, in display order; ``width`` and ``height`` are the projector's [px].
 
-        Raises
-        ------
-        InputError
-            If the Gray bits do not cover the projector.
+        Raises InputError if the Gray bits do not cover the projector.
         """
         out: list[Role] = []
         for group in self.images:

@@ -179,12 +179,8 @@ def roles(code: LightCode, width: int, height: int) -> list[Role]:
 
     White and black come first. Then, for each axis (columns first), the Gray bits from the most significant on, each
     followed by its inverse. Then, for each period from the longest on, its N shifts. An image sequence has its own
-    order.
-
-    Raises
-    ------
-    InputError
-        If the Gray bits do not cover the projector, or a Gray code has more of them than the projector needs.
+    order. Raises InputError if the Gray bits do not cover the projector, or a Gray code has more of them than the
+    projector needs.
     """
     if isinstance(code, GrayCode):
         for axis in axes(code):
@@ -219,10 +215,7 @@ def value(code: LightCode, role: Role, coordinate: NDArray[np.floating]) -> NDAr
 def patterns(code: LightCode, width: int, height: int) -> NDArray[np.float32]:
     """Return all images of a code, (P, height, width), values 0..1 in projector pixels, in the order of :func:`roles`.
 
-    Raises
-    ------
-    InputError
-        If the code does not fit the projector.
+    Raises InputError if the code does not fit the projector.
     """
     every = roles(code, width, height)
     out = np.empty((len(every), height, width), np.float32)
@@ -237,10 +230,7 @@ def patterns(code: LightCode, width: int, height: int) -> NDArray[np.float32]:
 def check_stack(stack: NDArray[np.generic], roles: Sequence[Role]) -> None:
     """Reject a stack that cannot be the images of a code.
 
-    Raises
-    ------
-    InputError
-        If it is not (P, H, W) of as many images as the code has, or not of uint8, uint16 or floats.
+    Raises InputError if it is not (P, H, W) of as many images as the code has, or not of uint8, uint16 or floats.
     """
     if stack.ndim != 3 or len(stack) != len(roles):
         raise InputError("image stack", "shape", stack.shape, f"({len(roles)}, rows, columns), as the code defines")

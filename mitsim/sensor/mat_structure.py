@@ -89,6 +89,8 @@ _KIND = "a whole file of MATLAB, level 5"
 def read_mat(file: Path, data: bytes, most: int, **options: bool) -> dict[str, Any]:
     """Return the variables of a file of version 7 or older, without those of SciPy about the file.
 
+    Raises InputError if the file is damaged, larger, or of version 7.3.
+
     Parameters
     ----------
     file
@@ -99,11 +101,6 @@ def read_mat(file: Path, data: bytes, most: int, **options: bool) -> dict[str, A
         Largest number of values in the file.
     options
         Of :func:`scipy.io.loadmat`.
-
-    Raises
-    ------
-    InputError
-        If the file is damaged, larger, or of version 7.3.
     """
     checked = check_mat(file, data, most)
     try:

@@ -160,6 +160,9 @@ def expose_taps(
 ) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """Return the grey levels [DN] of the differences of the taps.
 
+    Returns: (P, H, W), uint8 up to 8 bits, else uint16; bits and black level are those of
+    :func:`mitsim.sensor.image_formation.converter`. Only a pixel with a full tap reaches full scale.
+
     Parameters
     ----------
     electrons
@@ -173,12 +176,6 @@ def expose_taps(
         As for :func:`mitsim.sensor.image_formation.expose`.
     exposure_s
         Of each image [s], for the dark current.
-
-    Returns
-    -------
-    numpy.ndarray
-        (P, H, W), uint8 up to 8 bits, else uint16; bits and black level are those of
-        :func:`mitsim.sensor.image_formation.converter`. Only a pixel with a full tap reaches full scale.
 
     See Also
     --------

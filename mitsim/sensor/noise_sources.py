@@ -48,12 +48,8 @@ class Noise:
     def parse(cls, text: str, where: str = "--noise") -> Noise:
         """Parse noise as written on a command line.
 
-        ``all``; ``none``; ``shot,read`` for these two and no other; ``no-shot,no-read`` for all but these two.
-
-        Raises
-        ------
-        InputError
-            For a name that is no source (it suggests the nearest), or if both forms are mixed.
+        ``all``; ``none``; ``shot,read`` for these two and no other; ``no-shot,no-read`` for all but these two. Raises
+        InputError for a name that is no source (it suggests the nearest), or if both forms are mixed.
         """
         words = [word.strip() for word in text.split(",") if word.strip()]
         if words in (["all"], ["none"]):

@@ -41,7 +41,8 @@ def with_calibration(
     """Return a sensor file's table completed with the optics of its ``[calibration]`` files, and warnings.
 
     Keys that the sensor file itself gives for a camera or the projector, such as its width, take precedence. The
-    warnings name values that look like optics and were not read, and what was made of a part of the imager.
+    warnings name values that look like optics and were not read, and what was made of a part of the imager. Raises
+    InputError if a file cannot be read, or values are missing or invalid; the error names the file and the keys.
 
     Parameters
     ----------
@@ -53,11 +54,6 @@ def with_calibration(
         (width, height) [px] of the cameras' images, if known; cameras without a size get it.
     tree
         Values of the files, if they have been read.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be read, or values are missing or invalid; the error names the file and the keys.
     """
     if "calibration" not in table:
         return _sized(table, size), []
@@ -110,10 +106,7 @@ def _sized(table: dict[str, Any], size: tuple[int, int] | None) -> dict[str, Any
 def has_pair(tree: CalibrationTree) -> bool:
     """Return whether calibration files have matrices of two cameras, and the pose of the second.
 
-    Raises
-    ------
-    InputError
-        If the files contradict one another.
+    Raises InputError if the files contradict one another.
     """
     return all(
         any(tree.find(key) for key in USUAL_NAMES[quantity][1]) for quantity in ("matrix", "rotation", "translation")

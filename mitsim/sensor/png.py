@@ -36,10 +36,7 @@ MOST_PIXELS = 64_000_000
 def encode_png(image: Image) -> bytes:
     """Return an image (H, W), uint8 or uint16, as the bytes of a lossless PNG.
 
-    Raises
-    ------
-    ValueError
-        If OpenCV cannot write the image.
+    Raises ValueError if OpenCV cannot write the image.
     """
     done, data = cv2.imencode(".png", image)
     if not done:
@@ -50,12 +47,8 @@ def encode_png(image: Image) -> bytes:
 def decode_png(data: bytes, where: str | Path, size: tuple[int, int] | None = None) -> Image:
     """Return the image (H, W), uint8 or uint16, in the bytes of a PNG file; messages name ``where``.
 
-    ``size`` is the expected (H, W); None allows any size.
-
-    Raises
-    ------
-    InputError
-        If the bytes are not a complete grey PNG of 8 or 16 bits, or the image has another size than expected.
+    ``size`` is the expected (H, W); None allows any size. Raises InputError if the bytes are not a complete grey PNG of
+    8 or 16 bits, or the image has another size than expected.
     """
     width, height = check_png(data, where)
     depth, colour, _, _, interlace = data[24:29]
@@ -79,10 +72,8 @@ def decode_png(data: bytes, where: str | Path, size: tuple[int, int] | None = No
 def check_png(data: bytes, where: str | Path) -> tuple[int, int]:
     """Return the width and height [px] of a PNG, grey or colour, after a check of its checksums and its size.
 
-    Raises
-    ------
-    InputError
-        If the file is not a PNG, is cut off or damaged, or exceeds :data:`LONGEST_SIDE_PX` or :data:`MOST_PIXELS`.
+    Raises InputError if the file is not a PNG, is cut off or damaged, or exceeds :data:`LONGEST_SIDE_PX` or
+    :data:`MOST_PIXELS`.
     """
     if not data.startswith(PNG_SIGNATURE):
         raise InputError(where, "", "a file that is not a PNG", "a grey PNG of 8 or 16 bits")

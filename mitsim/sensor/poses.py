@@ -68,13 +68,7 @@ def look_at(
 
 
 def as_pose(pose: Transform | ArrayLike, where: str) -> Transform:
-    """Return a pose given as a transform or as a (4, 4) matrix [mm].
-
-    Raises
-    ------
-    InputError
-        If it is not a rigid motion.
-    """
+    """Return a pose given as a transform or as a (4, 4) matrix [mm]. Raises InputError if it is not a rigid motion."""
     matrix = pose.matrix() if isinstance(pose, Transform) else _numbers(pose)
     if matrix is None or matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         found = "no array of numbers" if matrix is None else f"an array {matrix.shape}"

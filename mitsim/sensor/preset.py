@@ -87,10 +87,7 @@ def load_sensor(
 def named_sensor(name: str | Path) -> tuple[str, str]:
     """Return name and technology of a preset or sensor file. Nothing else is checked; its calibration is not read.
 
-    Raises
-    ------
-    InputError
-        For an unknown name, or a file that cannot be read or lacks one of the two.
+    Raises InputError for an unknown name, or a file that cannot be read or lacks one of the two.
     """
     path, table = _written_table(name)
     if not {"name", "technology"} <= set(table):

@@ -15,12 +15,8 @@ from mitsim.sensor.sensor import Sensor
 def preset_covariance(sensor: Sensor, drift: Drift | None = None) -> RigCovariance:
     """Return the covariance of a preset's virtual calibration, plus drift since then.
 
-    ``drift`` None is the default :class:`Drift`; :meth:`Drift.none` adds nothing.
-
-    Raises
-    ------
-    InputError
-        If mitsim has no calibration of this sensor, or the sensor's rig differs from that of the preset.
+    ``drift`` None is the default :class:`Drift`; :meth:`Drift.none` adds nothing. Raises InputError if mitsim has no
+    calibration of this sensor, or the sensor's rig differs from that of the preset.
     """
     path = Path(str(files("mitsim.sensor") / "presets" / "calibrations" / f"{sensor.name}.toml"))
     if not path.is_file():

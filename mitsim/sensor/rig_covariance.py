@@ -116,11 +116,8 @@ class CovarianceFile(Document):
 def read_rig_covariance(path: str | Path, rig: Rig) -> RigCovariance:
     """Read the covariance of a rig's calibration, and check that it belongs to the given rig.
 
-    Raises
-    ------
-    InputError
-        If the file is not such a document, names a parameter that the rig does not have, belongs to a rig with other
-        values, or its correlations are no correlation matrix.
+    Raises InputError if the file is not such a document, names a parameter that the rig does not have, belongs to a rig
+    with other values, or its correlations are no correlation matrix.
     """
     table = read_toml(path, CovarianceFile)
     names = tuple(table.one_sigma)
@@ -140,10 +137,7 @@ def read_rig_covariance(path: str | Path, rig: Rig) -> RigCovariance:
 def write_rig_covariance(path: str | Path, covariance: RigCovariance, rig: Rig) -> None:
     """Write the covariance of a rig's calibration as TOML, atomically.
 
-    Raises
-    ------
-    InputError
-        If the rig lacks one of the parameters.
+    Raises InputError if the rig lacks one of the parameters.
     """
     nominal = parameter_values(rig, covariance.names)
     rounded = [np.round(row[: index + 1], 8) + 0.0 for index, row in enumerate(covariance.correlation)]

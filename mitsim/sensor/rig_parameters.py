@@ -44,12 +44,8 @@ def parameter_names(rig: Rig, projector: bool = True) -> tuple[str, ...]:
     """Return the names of all parameters of a rig: camera by camera, then the projector's if ``projector`` is true.
 
     Of the coefficients after the fifth, a group (rational, thin prism, tilt) is included only if the rig uses it: a
-    calibration does not estimate coefficients that the nominal model fixes at zero.
-
-    Raises
-    ------
-    InputError
-        If a camera is named ``projector`` or ``path``.
+    calibration does not estimate coefficients that the nominal model fixes at zero. Raises InputError if a camera is
+    named ``projector`` or ``path``.
     """
     for name in ("projector", "path"):
         if name in rig.cameras:
@@ -80,12 +76,8 @@ def distortion_names(camera: Camera) -> tuple[str, ...]:
 def parameter_values(rig: Rig, names: Sequence[str]) -> NDArray[np.float64]:
     """Return the nominal values of parameters, (n,); rotations as the rotation vector of ``sensor_from_camera``.
 
-    The two parameters of the light's path are 0, since the decoder assumes the nominal path.
-
-    Raises
-    ------
-    InputError
-        If the rig lacks one of the parameters.
+    The two parameters of the light's path are 0, since the decoder assumes the nominal path. Raises InputError if the
+    rig lacks one of the parameters.
     """
     check_names(rig, names)
     optics = eyes(rig)
@@ -110,14 +102,8 @@ def moved(rig: Rig, names: Sequence[str], values: ArrayLike) -> Rig:
 
     Parameters of the light's path do not change the rig; :func:`path_error` reads them. A ``rectification`` recorded by
     a device also stays, because it is an input of the decoder, not a property of the cameras. A rig without one is
-    rectified anew from its cameras.
-
-    Raises
-    ------
-    InputError
-        If the rig lacks one of the parameters.
-    ValueError
-        If the numbers of values and names differ.
+    rectified anew from its cameras. Raises InputError if the rig lacks one of the parameters. Raises ValueError if the
+    numbers of values and names differ.
     """
     check_names(rig, names)
     steps: dict[str, dict[str, float]] = {}

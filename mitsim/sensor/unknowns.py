@@ -290,10 +290,7 @@ class UnknownsTable(Document):
 def unknowns_of(*tables: UnknownsTable) -> UnknownsTable:
     """Merge tables: a later table's keys override an earlier one's; keys in none have their defaults.
 
-    Raises
-    ------
-    InputError
-        If keys of two tables contradict one another.
+    Raises InputError if keys of two tables contradict one another.
     """
     merged: dict[str, dict[str, Any]] = {}
     for table in tables:

@@ -35,12 +35,7 @@ def camera_illumination(corner: float | None, camera: Camera) -> NDArray[np.floa
     """Return the illumination (H, W) of a camera's pixels relative to the principal point [1], None for no loss.
 
     It is a factor on electrons or on a projector's light. ``corner`` is that of the farthest corner [1]; None, for an
-    unknown lens, is the cos^4 law.
-
-    Raises
-    ------
-    InputError
-        For a corner outside 0 (excluded) to 1.
+    unknown lens, is the cos^4 law. Raises InputError for a corner outside 0 (excluded) to 1.
     """
     corner = cos4_corner(camera) if corner is None else corner
     if not 0 < corner <= 1:

@@ -39,19 +39,8 @@ class NotYamlError(InputError):
 def read_yaml(file: Path, data: bytes, allowed: str) -> list[dict[str, Any]]:
     """Return the documents of a YAML file that are maps, with their matrices as arrays.
 
-    Parameters
-    ----------
-    file
-        Path of the file, for messages.
-    data
-        Content of the file.
-    allowed
-        What the file should be, for the message.
-
-    Raises
-    ------
-    InputError
-        If the text is not YAML, exceeds the bounds, has a key twice, or has no map.
+    ``file``: path of the file, for messages. ``data``: content of the file. ``allowed``: what the file should be, for
+    the message. Raises InputError if the text is not YAML, exceeds the bounds, has a key twice, or has no map.
     """
     try:
         text = data.decode("utf-8-sig")

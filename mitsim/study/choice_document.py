@@ -216,10 +216,7 @@ class ChoiceDocument(PartialDocument):
 def read_choice(folder: Path) -> ChoiceDocument | None:
     """Read ``choice.json`` of a folder; return None if there is none.
 
-    Raises
-    ------
-    InputError
-        If the file is not a valid choice document.
+    Raises InputError if the file is not a valid choice document.
     """
     path = folder / CHOICE
     if not path.exists():
@@ -230,10 +227,7 @@ def read_choice(folder: Path) -> ChoiceDocument | None:
 def best_statement(choice: ChoiceDocument, folder: Path) -> StatementDocument | None:
     """Return the statement of the best sensor of a comparison in ``folder``; None if it was not measured virtually.
 
-    Raises
-    ------
-    InputError
-        If the file is not a valid statement.
+    Raises InputError if the file is not a valid statement.
     """
     best = choice.best
     return read_statement(folder / best.name / "statement.json") if best and best.status == "stated" else None
@@ -242,10 +236,7 @@ def best_statement(choice: ChoiceDocument, folder: Path) -> StatementDocument | 
 def winner_folder(folder: Path) -> Path:
     """Return the folder of the best sensor of a finished comparison; any other folder is returned as it is.
 
-    Raises
-    ------
-    InputError
-        If the comparison is not finished, or no sensor was measured virtually.
+    Raises InputError if the comparison is not finished, or no sensor was measured virtually.
     """
     choice = None if (folder / "run.json").exists() else read_choice(folder)
     if choice is None:

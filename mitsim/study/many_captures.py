@@ -128,6 +128,8 @@ class CaptureJob:
 def read_jobs(plan: str | Path, scene: str | Path, sensor: Sensor, common: CaptureSettings) -> list[CaptureJob]:
     """Return all jobs of a plan, finish by finish, views from the zenith down.
 
+    Raises InputError if the plan or the scene is not valid with any of the finishes, or no view is possible.
+
     Parameters
     ----------
     plan, scene
@@ -136,11 +138,6 @@ def read_jobs(plan: str | Path, scene: str | Path, sensor: Sensor, common: Captu
         The sensor that takes all captures.
     common
         Settings of all captures; each gets a seed of its own.
-
-    Raises
-    ------
-    InputError
-        If the plan or the scene is not valid with any of the finishes, or no view is possible.
     """
     file = read_toml(plan, ManyFile)
     jobs: list[CaptureJob] = []
@@ -167,10 +164,7 @@ def read_jobs(plan: str | Path, scene: str | Path, sensor: Sensor, common: Captu
 def missing_jobs(jobs: Sequence[CaptureJob], output: str | Path) -> list[CaptureJob]:
     """Return the jobs without a finished folder, and remove partial folders of killed processes.
 
-    Raises
-    ------
-    InputError
-        If a folder holds the capture of another job.
+    Raises InputError if a folder holds the capture of another job.
     """
     output = Path(output)
     missing = []

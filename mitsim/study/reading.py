@@ -221,10 +221,7 @@ def with_plan(study: Study, plan: bool) -> Study:
 def read_map(name: str | Path, sensor: Sensor, folder: str | Path = ".") -> PerformanceMap:
     """Read the performance map of a sensor: a file, or a map that comes with mitsim.
 
-    Raises
-    ------
-    InputError
-        If there is no map, or it belongs to another sensor.
+    Raises InputError if there is no map, or it belongs to another sensor.
     """
     file = map_path(name, folder)
     performance_map = PerformanceMap.load(file)

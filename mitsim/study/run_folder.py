@@ -193,10 +193,7 @@ def _cloud_name(kind: str, view: int) -> str:
 def read_run(folder: str | Path) -> Run:
     """Read the folder of a finished run; captures and clouds are read on request.
 
-    Raises
-    ------
-    InputError
-        If a file is missing, damaged or does not belong to the others; the message names the file.
+    Raises InputError if a file is missing, damaged or does not belong to the others; the message names the file.
     """
     folder = Path(folder)
     if not folder.is_dir():

@@ -72,13 +72,7 @@ def write_scene_geometry(folder: Path, scene: Scene, sensor: Sensor) -> None:
 
 
 def read_scene_geometry(folder: Path) -> SceneGeometry | None:
-    """Read ``stand.npz`` of a folder; return None if there is none.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
-    """
+    """Read ``stand.npz`` of a folder; return None if there is none. Raises InputError if the file cannot be read."""
     path = folder / GEOMETRY_FILE
     if not path.exists():
         return None

@@ -185,11 +185,8 @@ class Session:
     def exposures(self, view: View, limit: TimeLimit | None = None) -> PlannedExposure | None:
         """Return the exposures of a view: those of the study, or planned ones; None for the sensor's own rule.
 
-        Raises
-        ------
-        InputError
-            If the sensor cannot take or merge the exposures, or measurements are drawn from a map, which holds only for
-            the exposure that it was made with.
+        Raises InputError if the sensor cannot take or merge the exposures, or measurements are drawn from a map, which
+        holds only for the exposure that it was made with.
         """
         table = self.study.file.exposure
         if table is None:

@@ -158,13 +158,7 @@ class StatementDocument(PartialDocument):
 
 
 def read_statement(path: Path) -> StatementDocument | None:
-    """Read ``statement.json``; return None if there is none.
-
-    Raises
-    ------
-    InputError
-        If the file is not a valid statement.
-    """
+    """Read ``statement.json``; return None if there is none. Raises InputError if the file is not a valid statement."""
     if not os.path.lexists(path):
         return None
     return validate(path, read_json_object(path), StatementDocument)

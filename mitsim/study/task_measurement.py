@@ -155,10 +155,8 @@ class ViewStatement(PartialDocument):
     def check(self, sensor: str, pose: Transform) -> None:
         """Check that a cloud's sensor and its ``pose``, world from sensor, are those of the statement.
 
-        Raises
-        ------
-        InputError
-            If the sensor differs, or the pose by more than :data:`SAME_PLACE_MM` or :data:`SAME_ANGLE_DEG`.
+        Raises InputError if the sensor differs, or the pose by more than :data:`SAME_PLACE_MM` or
+        :data:`SAME_ANGLE_DEG`.
         """
         if sensor != self.sensor:
             raise InputError(self.path, "sensor", self.sensor, f"{sensor}, the sensor of the cloud")
@@ -185,6 +183,9 @@ def measure_task(
 ) -> list[Result]:
     """Measure a task in a cloud of a part whose pose is known within a few mm.
 
+    Returns: one for each measurement of the task, in mm or deg. Raises InputError if the statement is for another
+    sensor or view, or lacks a measurement.
+
     Parameters
     ----------
     cloud
@@ -197,16 +198,6 @@ def measure_task(
         Its biases are subtracted; None subtracts nothing.
     margin_px
         Pixels closer to the edge of a shape than this, and at least 3 px, are not used.
-
-    Returns
-    -------
-    list of Result
-        One for each measurement of the task, in mm or deg.
-
-    Raises
-    ------
-    InputError
-        If the statement is for another sensor or view, or lacks a measurement.
 
     See Also
     --------
@@ -233,12 +224,8 @@ def corrected(result: Result, statement: ViewStatement, most: float = math.inf) 
     """Subtract the bias of a measurement; its uncertainty becomes that of the statement.
 
     A value that folds stays at least 0, and at ``most`` 90 deg for an angle of lines: its bias is that of a part at the
-    limit of the tolerance.
-
-    Raises
-    ------
-    InputError
-        If the statement lacks the measurement, has it in another unit, or has no bias for it.
+    limit of the tolerance. Raises InputError if the statement lacks the measurement, has it in another unit, or has no
+    bias for it.
     """
     if result.name not in statement.measurements:
         names = ", ".join(statement.measurements)
@@ -262,10 +249,7 @@ def corrected(result: Result, statement: ViewStatement, most: float = math.inf) 
 def read_view_statement(path: Path) -> ViewStatement:
     """Read sensor, pose, biases and uncertainties from a ``statement.json``.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or is not a statement.
+    Raises InputError if the file cannot be read, or is not a statement.
     """
     table = read_json_object(path, "a statement.json of mitsim run or mitsim study state")
     return validate(path, table | {"path": path}, ViewStatement)
@@ -274,10 +258,7 @@ def read_view_statement(path: Path) -> ViewStatement:
 def read_pose(path: Path, view: int | None = None) -> Transform:
     """Read ``world_from_sensor`` from a pose.json, a statement.json, one view of a poses.json, or a text of ``import``.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read, has no pose or no such view, or its matrix is not a rigid motion.
+    Raises InputError if the file cannot be read, has no pose or no such view, or its matrix is not a rigid motion.
     """
     if path.suffix.lower() != ".json":
         return read_pose_file(path)

@@ -53,6 +53,8 @@ def checked_cloud(
 ) -> CheckedCloud:
     """Decode a capture, and check its images, its calibration and its range.
 
+    Raises InputError if the settings belong to another technology, or the capture is inconsistent.
+
     Parameters
     ----------
     capture
@@ -63,11 +65,6 @@ def checked_cloud(
         Name of the capture in warnings.
     sensor
         The sensor that the settings belong to; None if they are those of the capture.
-
-    Raises
-    ------
-    InputError
-        If the settings belong to another technology, or the capture is inconsistent.
     """
     pair = _pair_geometry(capture, settings)
     geometry = pair or stored_geometry(capture, settings, sensor)

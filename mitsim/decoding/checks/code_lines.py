@@ -44,10 +44,7 @@ class CodeLines:
     def decoded(self, axis: Axis) -> list[ProjectorCoordinate]:
         """Return the coordinates along an axis of the rows (n, W), and of the columns (H, m).
 
-        Raises
-        ------
-        InputError
-            If the code is ambiguous over the projector.
+        Raises InputError if the code is ambiguous over the projector.
         """
         return [
             decode_coordinates(part, self.code, self.size, self.settings, full_scale=self.full_scale, only=axis)[axis]

@@ -61,18 +61,14 @@ _MESHES = "an STL, OBJ, PLY, OFF, 3MF or glTF file"
 
 @dataclass(frozen=True)
 class Fineness:
-    """How fine a mesh is: the chord error [mm] of its faces.
+    """How fine a mesh is: the chord error [mm] of its faces."""
 
-    - ``chord_mm`` of faces that a task can measure.
-    - ``others_mm`` of tori and free forms; None for the same.
-    - ``most`` triangles of a file, beyond which the largest faces become coarser, measured ones first.
-    - ``fitted_mm2``: chord error [mm] of a sphere or cylinder per standard uncertainty of its fitted radius, for one
-      point of noise 1 on each mm^2. Faces of few points have up to ``others_mm``; None: all have ``chord_mm``.
-    """
-
-    chord_mm: float = CHORD_MM
-    others_mm: float | None = None
+    chord_mm: float = CHORD_MM  # of faces that a task can measure
+    others_mm: float | None = None  # of tori and free forms; None for the same
+    #: triangles of a file, beyond which the largest faces become coarser, measured ones first
     most: int = MOST_TRIANGLES
+    #: chord error [mm] of a sphere or cylinder per standard uncertainty of its fitted radius, for one point of noise 1
+    #: on each mm^2. Faces of few points have up to ``others_mm``; None: all have ``chord_mm``
     fitted_mm2: float | None = None
 
 

@@ -12,25 +12,17 @@ PHOTONS_PER_SAMPLE = 0.25
 
 @dataclass(frozen=True)
 class LightPaths:
-    """The light paths that :func:`trace` follows.
+    """The light paths that :func:`trace` follows."""
 
-    - ``samples`` per pixel, rounded up to a square number, because they form a raster.
-    - ``seed`` of the directions of later bounces, and of the jitter; use another for each camera and pose.
-    - ``depth``: largest number of surfaces on a path: 1 is direct light, 3 adds two interreflections.
-    - ``jitter``: whether the positions are random within their cells and lenses, instead of fixed.
-    - ``photons`` for light of two and more surfaces, rounded up to a square number. By default their number is
-      proportional to the samples of the *whole* image, whatever the region. 0 leaves all light to camera paths.
-    - ``indirect_only``: render only light that has met two surfaces or more, on the same paths.
-    - ``with_ambient``: add a last image, the light of the scene's own emitters alone, with the projector off.
-    """
-
-    samples: int
-    seed: int
-    depth: int = 1
-    jitter: bool = False
+    samples: int  # per pixel, rounded up to a square number, because they form a raster
+    seed: int  # of the directions of later bounces, and of the jitter; use another for each camera and pose
+    depth: int = 1  # largest number of surfaces on a path: 1 is direct light, 3 adds two interreflections
+    jitter: bool = False  # whether the positions are random within their cells and lenses, instead of fixed
+    #: for light of two and more surfaces, rounded up to a square number. By default their number is proportional to the
+    #: samples of the *whole* image, whatever the region. 0 leaves all light to camera paths
     photons: int | None = None
-    indirect_only: bool = False
-    with_ambient: bool = False
+    indirect_only: bool = False  # render only light that has met two surfaces or more, on the same paths
+    with_ambient: bool = False  # add a last image, the light of the scene's own emitters alone, with the projector off
 
     @property
     def side(self) -> int:

@@ -89,12 +89,8 @@ class ProjectedPatterns:
     def showing(self, patterns: NDArray[np.floating]) -> ProjectedPatterns:
         """Return the same projector with other patterns of the same kind, such as the mask of another device.
 
-        Textures have the same shape, so that the kernels of these patterns serve the others.
-
-        Raises
-        ------
-        InputError
-            If the patterns do not have the size of the projector.
+        Textures have the same shape, so that the kernels of these patterns serve the others. Raises InputError if the
+        patterns do not have the size of the projector.
         """
         plain = self.codes == self.count and not self.along_row
         if not plain or patterns.shape != (self.count, self.projector.optics.height, self.projector.optics.width):

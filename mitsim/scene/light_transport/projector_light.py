@@ -69,6 +69,9 @@ class ProjectorLight(Eye):
     ) -> tuple[Any, Any, Any, Any]:
         """Return the light that arrives at a surface from one position in the aperture.
 
+        Returns ``toward``: unit direction to the projector, world frame; ``arriving``: radiant intensity / distance^2
+        [W/mm^2], 0 in shadow; ``uv``: texture coordinate; ``distance``: distance to the position in the aperture [mm].
+
         Parameters
         ----------
         scene
@@ -82,17 +85,6 @@ class ProjectorLight(Eye):
             it.
         active
             Mask of the lanes.
-
-        Returns
-        -------
-        toward
-            Unit direction to the projector, world frame.
-        arriving
-            Radiant intensity / distance^2 [W/mm^2], 0 in shadow.
-        uv
-            Texture coordinate.
-        distance
-            Distance to the position in the aperture [mm].
 
         See Also
         --------

@@ -47,6 +47,8 @@ def trace(
 ) -> NDArray[np.float32]:
     """Return the radiance that one camera sees in each image of a capture.
 
+    Returns: (P, height, width), or (P + 1, height, width), of the region, float32 [W / (mm^2 sr)].
+
     Parameters
     ----------
     scene, rays, world_from_sensor
@@ -61,11 +63,6 @@ def trace(
     shift
         (2, height, width) [rad] of the region, along the x and y axes of the camera. The code of direct light is
         evaluated at this angle, seen from the camera, beside the surface point. Speckle causes it.
-
-    Returns
-    -------
-    numpy.ndarray
-        (P, height, width), or (P + 1, height, width), of the region, float32 [W / (mm^2 sr)].
 
     See Also
     --------

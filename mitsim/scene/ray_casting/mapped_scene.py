@@ -35,20 +35,14 @@ from mitsim.sensor.transforms import Transform
 
 @dataclass(frozen=True)
 class MappedView:
-    """Images (h, w) of the pixels of ``roi``; no pixel outside it shows the scene.
-
-    - ``status``: VALID if all cameras and the projector see the point; else the reason.
-    - ``shape``: index into the names of the scene; -1 without a surface.
-    - ``distance``: |V| [mm]; NaN without a surface.
-    - ``normal`` (3, h, w) in the view frame, if requested.
-    - ``fraction``, ``sigma``: F [1] and sigma [mm]; NaN if the status is not VALID or the map has no value.
-    """
+    """Images (h, w) of the pixels of ``roi``; no pixel outside it shows the scene."""
 
     roi: Roi
-    status: NDArray[np.uint8]
-    shape: NDArray[np.int16]
-    distance: NDArray[np.float32]
-    normal: NDArray[np.float32] | None
+    status: NDArray[np.uint8]  # VALID if all cameras and the projector see the point; else the reason
+    shape: NDArray[np.int16]  # index into the names of the scene; -1 without a surface
+    distance: NDArray[np.float32]  # |V| [mm]; NaN without a surface
+    normal: NDArray[np.float32] | None  # (3, h, w) in the view frame, if requested
+    #: ``fraction``, ``sigma``: F [1] and sigma [mm]; NaN if the status is not VALID or the map has no value
     fraction: NDArray[np.float32]
     sigma: NDArray[np.float32]
 

@@ -29,20 +29,14 @@ from mitsim.sensor.transforms import Transform
 
 @dataclass(frozen=True)
 class Surfaces:
-    """Surfaces that the rays meet, in the sensor frame.
+    """Surfaces that the rays meet, in the sensor frame."""
 
-    - ``distance`` (H, W): |V| [mm]. NaN without a surface, or where only the back of a one-sided face is seen, which
-      renders black.
-    - ``normal`` (H, W, 3) toward the sensor.
-    - ``shape`` (H, W): index into the names of the scene; -1 where the distance is NaN.
-    - ``seen`` (E, H, W): whether each eye is on the front side and has a free line of sight to the point.
-    - ``along`` (H, W, 3): derivative of the point by the surface parameter u; None in a scene without a lay.
-    """
-
+    #: (H, W) |V| [mm]. NaN without a surface, or where only the back of a one-sided face is seen, which renders black
     distance: NDArray[np.float32]
-    normal: NDArray[np.float32]
-    shape: NDArray[np.int16]
-    seen: NDArray[np.bool_]
+    normal: NDArray[np.float32]  # (H, W, 3) toward the sensor
+    shape: NDArray[np.int16]  # (H, W) index into the names of the scene; -1 where the distance is NaN
+    seen: NDArray[np.bool_]  # (E, H, W) whether each eye is on the front side and has a free line of sight to the point
+    #: (H, W, 3) derivative of the point by the surface parameter u; None in a scene without a lay
     along: NDArray[np.float32] | None = None
 
 

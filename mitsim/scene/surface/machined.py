@@ -63,6 +63,8 @@ def machined(
 ) -> Scatter:
     """Return how a face scatters.
 
+    Raises InputError if the properties contradict one another, do not suffice, or would be unused.
+
     Parameters
     ----------
     face, wavelength_nm
@@ -71,11 +73,6 @@ def machined(
         Name of the face in messages.
     deviation
         From the best estimate.
-
-    Raises
-    ------
-    InputError
-        If the properties contradict one another, do not suffice, or would be unused.
     """
     check(face, where)
     process = PROCESSES[face.process_or_default]

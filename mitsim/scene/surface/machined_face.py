@@ -18,34 +18,28 @@ RA_AGREES_WITHIN = 1.25
 
 @dataclass(frozen=True)
 class MachinedFace:
-    """Known properties of a machined face; None if not given.
-
-    - ``Ra``, ``Rq``, ``RSm`` [um]; ``Rdq`` [1].
-    - ``profile`` across the lay and ``profile_along`` it.
-    - ``gloss`` [GU at 60 deg].
-    - ``alpha``, ``alpha_u``, ``alpha_v`` [1] in Beckmann's sense at the sensor's wavelength.
-    - ``lay``: direction of the marks.
-    - ``nose_radius`` of the tool [mm]; ``feed_marks`` "blurred" or "resolved".
-    - ``alpha_factor``: a multiplier on alpha; ``wide_angle`` share.
-    """
+    """Known properties of a machined face; None if not given."""
 
     metal: str = "aluminium"
     process: str | None = None
+    #: ``Ra``, ``Rq``, ``RSm`` [um]; ``Rdq`` [1]
     Ra: float | None = None
     Rq: float | None = None
     Rdq: float | None = None
     RSm: float | None = None
+    #: ``profile`` across the lay and ``profile_along`` it
     profile: Profile | None = None
     profile_along: Profile | None = None
     height_map: HeightMap | None = None
-    gloss: float | None = None
+    gloss: float | None = None  # [GU at 60 deg]
+    #: ``alpha``, ``alpha_u``, ``alpha_v`` [1] in Beckmann's sense at the sensor's wavelength
     alpha: float | None = None
     alpha_u: float | None = None
     alpha_v: float | None = None
-    lay: Lay | None = None
-    nose_radius: float | None = None
+    lay: Lay | None = None  # direction of the marks
+    nose_radius: float | None = None  # of the tool [mm]; ``feed_marks`` "blurred" or "resolved"
     feed_marks: str | None = None
-    alpha_factor: float = 1.0
+    alpha_factor: float = 1.0  # a multiplier on alpha; ``wide_angle`` share
     wide_angle: float | None = None
 
     @property
@@ -77,10 +71,7 @@ class MachinedFace:
 def check(face: MachinedFace, where: str) -> None:
     """Reject properties that contradict one another, do not suffice, or would be unused.
 
-    Raises
-    ------
-    InputError
-        Naming both of two properties that exclude each other.
+    Raises InputError naming both of two properties that exclude each other.
     """
     process_name = face.process_or_default
     process = PROCESSES[process_name]

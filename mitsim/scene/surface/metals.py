@@ -40,10 +40,7 @@ CONSTANTS: dict[str, NDArray[np.float64]] = _read_table()
 def refractive_index(metal: str, wavelength_nm: float) -> tuple[float, float]:
     """Return (n, k) of a metal [1], linear between the source's wavelengths.
 
-    Raises
-    ------
-    InputError
-        Outside 400 to 1000 nm, since extrapolated constants have no source.
+    Raises InputError outside 400 to 1000 nm, since extrapolated constants have no source.
     """
     low, high = WAVELENGTH_RANGE_NM
     if not low <= wavelength_nm <= high:

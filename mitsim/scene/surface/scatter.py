@@ -36,41 +36,30 @@ class Scatter:
     The share ``wide_angle`` of the reflected light is scattered as by a matt surface. Of the rest, the share A is in a
     narrow lobe and the remainder in a lobe of alpha_u, alpha_v, whose share ``beckmann`` is Beckmann and the rest GGX.
     A grows with the angle of incidence (:meth:`coherent_at`).
-
-    - ``phase_variance``: variance g of the phase at normal incidence [rad^2] in A = exp(-g); infinite if A is 0 at
-      every angle.
-    - ``alpha_u``, ``alpha_v``: width of the incoherent lobe along u and v in Beckmann's sense: sqrt(2) times the rms
-      slope. NaN if there is no such lobe.
-    - ``beckmann``: share of Beckmann in the incoherent lobe; ``beckmann_range``: its one-sigma range.
-    - ``turn_deg``: angle of the lobe's u, along the marks, as of :mod:`mitsim.scene.turned_lay` [deg]; None where u is
-      that of the shape.
-    - ``lay_open``: whether there are marks whose direction is not given.
-    - ``height_um``: Rq that determines coherence and speckle [um]; NaN if light is scattered in the volume.
-    - ``wide_angle``: share of all reflected light at wide angles; ``wide_angle_range``: its one-sigma range.
-    - ``alpha_factor``: one-sigma factor of alpha, which lies between alpha / factor and alpha x factor;
-      ``provenance``: source of alpha, in words.
-    - ``lay``: direction of the marks.
-    - ``energy_factor``: factors on the GGX and the Beckmann lobe that compensate the energy lost by single scattering.
-    - ``coherent_alpha``: width of the coherent part along u and v.
-    - ``depolarising``: whether the wide-angle light was scattered inside the material (paint, white).
     """
 
+    #: variance g of the phase at normal incidence [rad^2] in A = exp(-g); infinite if A is 0 at every angle
     phase_variance: float
+    #: ``alpha_u``, ``alpha_v``: width of the incoherent lobe along u and v in Beckmann's sense: sqrt(2) times the rms
+    #: slope. NaN if there is no such lobe
     alpha_u: float
     alpha_v: float
-    beckmann: float
-    height_um: float
-    wide_angle: float
-    wide_angle_range: tuple[float, float]
-    alpha_factor: float
-    provenance: str
-    lay: Lay = "none"
+    beckmann: float  # share of Beckmann in the incoherent lobe
+    height_um: float  # Rq that determines coherence and speckle [um]; NaN if light is scattered in the volume
+    wide_angle: float  # share of all reflected light at wide angles
+    wide_angle_range: tuple[float, float]  # its one-sigma range
+    alpha_factor: float  # one-sigma factor of alpha, which lies between alpha / factor and alpha x factor
+    provenance: str  # source of alpha, in words
+    lay: Lay = "none"  # direction of the marks
+    #: factors on the GGX and the Beckmann lobe that compensate the energy lost by single scattering
     energy_factor: tuple[float, float] = (1.0, 1.0)
-    coherent_alpha: tuple[float, float] = (ALPHA_FORM, ALPHA_FORM)
-    depolarising: bool = False
-    beckmann_range: tuple[float, float] | None = None
+    coherent_alpha: tuple[float, float] = (ALPHA_FORM, ALPHA_FORM)  # width of the coherent part along u and v
+    depolarising: bool = False  # whether the wide-angle light was scattered inside the material (paint, white)
+    beckmann_range: tuple[float, float] | None = None  # its one-sigma range
+    #: angle of the lobe's u, along the marks, as of :mod:`mitsim.scene.turned_lay` [deg]; None where u is that of the
+    #: shape
     turn_deg: float | None = None
-    lay_open: bool = False
+    lay_open: bool = False  # whether there are marks whose direction is not given
 
     @property
     def coherent(self) -> float:
@@ -97,35 +86,29 @@ class Scatter:
 
 @dataclass(frozen=True)
 class Deviation:
-    """Deviation of the unknown properties of a finish from their best estimates, in standard deviations.
+    """Deviation of the unknown properties of a finish from their best estimates, in standard deviations."""
 
-    - ``alpha``: multiplies the width of the lobe by its one-sigma factor to this power.
-    - ``wide_angle``: the wide-angle share w is at the low end of its range at -1, at the high end at +1. The logarithm
-      of its odds w / (0.6 - w) is interpolated and extrapolated.
-    - ``reflectance``: multiplies all reflected light by :data:`REFLECTANCE_FACTOR` to this power.
-    - ``tail``: the Beckmann share of the lobe is at the low end of its range at -1 and at the high end at +1; it is 0
-      at -3 and 1 at +3, linear between. At -3 the tail of the lobe is the longest, that of GGX.
-    - ``lay``: multiplies the ratio of alpha along the marks to alpha across them by
-      :data:`~mitsim.scene.surface.processes.LAY_FACTOR` to this power, up to a ratio of 1.
-    - ``lay_deg``: direction of the marks on faces whose lay is not given: angle to the projected z axis of the part, or
-      to its x axis on a face normal to z [deg]. None leaves such a face round, and then ``lay`` has no effect.
-    """
-
-    alpha: float = 0.0
+    alpha: float = 0.0  # multiplies the width of the lobe by its one-sigma factor to this power
+    #: the wide-angle share w is at the low end of its range at -1, at the high end at +1. The logarithm of its odds w /
+    #: (0.6 - w) is interpolated and extrapolated
     wide_angle: float = 0.0
-    reflectance: float = 0.0
+    reflectance: float = 0.0  # multiplies all reflected light by :data:`REFLECTANCE_FACTOR` to this power
+    #: the Beckmann share of the lobe is at the low end of its range at -1 and at the high end at +1; it is 0 at -3 and
+    #: 1 at +3, linear between. At -3 the tail of the lobe is the longest, that of GGX
     tail: float = 0.0
+    #: multiplies the ratio of alpha along the marks to alpha across them by
+    #: :data:`~mitsim.scene.surface.processes.LAY_FACTOR` to this power, up to a ratio of 1
     lay: float = 0.0
+    #: direction of the marks on faces whose lay is not given: angle to the projected z axis of the part, or to its x
+    #: axis on a face normal to z [deg]. None leaves such a face round, and then ``lay`` has no effect
     lay_deg: float | None = None
 
     @classmethod
     def parse(cls, text: str, where: str = "--deviation") -> Deviation:
         """Parse a deviation as on a command line: ``alpha=1,wide_angle=-1``; properties not named stay at 0.
 
-        Raises
-        ------
-        InputError
-            For an unknown name (it suggests the nearest), a name given twice, or an invalid or too large number.
+        Raises InputError for an unknown name (it suggests the nearest), a name given twice, or an invalid or too large
+        number.
         """
         names, values = [field.name for field in fields(cls)], dict[str, float]()
         for word in filter(None, (word.strip() for word in text.split(","))):

@@ -131,10 +131,7 @@ def _with_fewer(rendering: Rendering, factor: int) -> Rendering:
 def measured_by(study: Study) -> str:
     """Return ``render`` or ``map``: the choice of the study, else the one that fits the source of the map.
 
-    Raises
-    ------
-    InputError
-        If clouds shall be drawn from a map, and the study has no map yet.
+    Raises InputError if clouds shall be drawn from a map, and the study has no map yet.
     """
     choice, performance_map = study.file.measure.by, study.performance_map
     if choice == "map" and performance_map is None:

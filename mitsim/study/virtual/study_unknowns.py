@@ -45,11 +45,8 @@ _USUAL_EXPANSION = 17e-6
 def study_unknowns(study: Study, varied: tuple[str, ...] = GROUPS) -> Unknowns:
     """Prepare the unknowns of a study for drawing.
 
-    Raises
-    ------
-    InputError
-        If a file is missing or belongs to another sensor, if a feature with a form deviation or a measured finish is
-        not in the scene, or if a decoder can be drawn that OpenCV's costs do not hold.
+    Raises InputError if a file is missing or belongs to another sensor, if a feature with a form deviation or a
+    measured finish is not in the scene, or if a decoder can be drawn that OpenCV's costs do not hold.
     """
     table, sensor = study.unknowns, study.sensor
     for name in table.form.features:
