@@ -178,7 +178,30 @@ def lateral_shift_std(contrast: float, wavelength_nm: float, sin_u_observation: 
 def speckle_field(
     shape: tuple[int, int], contrast: float | NDArray[np.floating], size_px: float, rng: np.random.Generator
 ) -> SpeckleField:
-    """Draw one realisation of speckle. Raises InputError for speckle larger than a quarter of the image."""
+    """Draw one realisation of speckle.
+
+    Parameters
+    ----------
+    shape
+        (H, W) of the image.
+    contrast
+        C [1], 0 to 1, of the image or of each of its pixels (H, W). The gain is gamma-distributed with mean 1 and this
+        standard deviation: exactly 1 for C = 0, exponential for C = 1.
+    size_px
+        Size [px] over which pixels correlate, from :func:`correlation_size_px`. Two pixels at distance d have the
+        correlation exp(-pi d^2 / size^2), whose area is size^2; below 0.7 px all pixels are independent.
+    rng
+        Generator of the draws.
+
+    Raises
+    ------
+    InputError
+        For speckle larger than a quarter of the image.
+
+    See Also
+    --------
+    contrast : the contrast of it
+    """
     if size_px > max(0.25 * min(shape), 1):
         raise InputError("speckle", "size_px", size_px, "up to a quarter of the image", "a smaller f-number")
     values = np.asarray(contrast, np.float32)
