@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -19,29 +20,44 @@ pytestmark = [
 SOON_S = 20
 
 
-def started(folder, way, *, until):
-    """A command in its own group of processes, as a terminal starts it, when the files ``until`` exist."""
-    script = Path(__file__).with_name("ordered_work.py")
-    root = str(script.parents[2])
-    process = subprocess.Popen(
-        [sys.executable, str(script), str(folder), way],
-        stderr=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": root},
-        start_new_session=True,
-        text=True,
-    )
-    end = time.monotonic() + 120
-    while not all((folder / name).exists() for name in until):
-        assert process.poll() is None and time.monotonic() < end, process.communicate()
-        time.sleep(0.02)
-    return process
+def heed_ctrl_c():
+    """What tests start ignores SIGINT where a shell runs them in its background."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+@pytest.fixture
+def started():
+    """Start a command in its own group of processes, as a terminal does, when the files ``until`` exist."""
+    groups = []
+
+    def start(folder, way, *, until):
+        script = Path(__file__).with_name("ordered_work.py")
+        process = subprocess.Popen(
+            [sys.executable, str(script), str(folder), way],
+            stderr=subprocess.PIPE,
+            env={**os.environ, "PYTHONPATH": str(script.parents[2])},
+            preexec_fn=heed_ctrl_c,
+            start_new_session=True,
+            text=True,
+        )
+        groups.append(process.pid)
+        end = time.monotonic() + 120
+        while not all((folder / name).exists() for name in until):
+            assert process.poll() is None and time.monotonic() < end
+            time.sleep(0.02)
+        return process
+
+    yield start
+    for group in groups:
+        with suppress(ProcessLookupError):
+            os.killpg(group, signal.SIGKILL)
 
 
 BUSY = ("finished_0", "began_1", "began_2")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_command_with_busy_processes_ends_at_once(tmp_path, number):
+def test_a_command_with_busy_processes_ends_at_once(tmp_path, number, started):
     """Before, it ended only after the orders in work: two minutes here."""
     process = started(tmp_path, "at once", until=BUSY)
     os.killpg(process.pid, number)
@@ -55,7 +71,7 @@ def test_a_command_with_busy_processes_ends_at_once(tmp_path, number):
         time.sleep(0.05)
 
 
-def test_a_command_that_ends_in_order_gives_up_orders_in_work(tmp_path):
+def test_a_command_that_ends_in_order_gives_up_orders_in_work(tmp_path, started):
     process = started(tmp_path, "in order", until=BUSY)
     os.killpg(process.pid, signal.SIGINT)
     _, said = process.communicate(timeout=SOON_S)
@@ -63,7 +79,7 @@ def test_a_command_that_ends_in_order_gives_up_orders_in_work(tmp_path):
     assert said.splitlines()[0].startswith("stopping, and writing what there is") and "Traceback" not in said
 
 
-def test_processes_that_start_do_not_hear_ctrl_c(tmp_path):
+def test_processes_that_start_do_not_hear_ctrl_c(tmp_path, started):
     """Ctrl-C of a terminal goes to all processes: one that still imports modules would print its traceback."""
     process = started(tmp_path, "in order", until=())
     end = time.monotonic() + 120
