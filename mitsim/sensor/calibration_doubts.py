@@ -37,7 +37,7 @@ _STRONG_BARREL = 0.15
 #: widest horizontal field of view of a perspective lens that raises no doubt [deg]; chosen
 _WIDEST_DEG = 100.0
 
-#: least distance at the image's corner between two lens models that matters [px]
+#: least distance at the image's corner between two lens models that matters [px]; chosen
 _LEAST_APART_PX = 0.5
 
 #: words that name a fisheye lens in the names of files and values

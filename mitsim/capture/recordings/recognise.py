@@ -10,6 +10,7 @@ from characterisation.files.errors import InputError
 from characterisation.files.toml_tables import read_toml_table
 from mitsim.capture.exr import EXR_MAGIC
 from mitsim.capture.npy import NPY_MAGIC
+from mitsim.capture.recordings.calibration_file import is_euroc
 from mitsim.capture.recordings.recording_files import BAG_MAGIC, MCAP_MAGIC, SQLITE_MAGIC
 from mitsim.capture.recordings.robi import is_robi
 from mitsim.capture.recordings.zdf import HDF5_MAGIC
@@ -172,7 +173,7 @@ def _kind_of_folder(path: Path, sensor: str | None, calibration: str | None) -> 
         return "ros"
     if recorded or any(name.endswith((".mp4", ".h264", ".h265")) for name in top):
         return "depthai"
-    if calibration is not None or {"cam0/sensor.yaml", "cam1/sensor.yaml"} <= set(names):
+    if calibration is not None or is_euroc(path):
         return "stereo-pair"
     if sensor is not None:
         return "images" if named_sensor(sensor)[1] == "structured_light" else "stereo-pair"

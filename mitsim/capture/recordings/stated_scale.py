@@ -21,8 +21,10 @@ _NAMES = re.compile(
     r"(?:png)?depth(?:map|image|png)?(?:scal(?:e|ing)(?:factor)?|factor|divis(?:or|er)|shift|units?(?:scale)?(?:factor)?)"
 )
 
-#: lists of images beside the folder of an image of TUM's RGB-D data, and its levels per metre
+#: lists of images beside the folder of an image of TUM's RGB-D data
 _OF_TUM = ("depth.txt", "rgb.txt")
+
+#: levels per metre of these images, by the definition of the format
 _LEVELS_OF_TUM = 5000.0
 
 #: smallest number of levels per metre; chosen: smaller ones are mm per level
