@@ -4,7 +4,8 @@ Signal chain: points of the part -> their pixels before and after -> affine map 
 bilinearly, and continued with their border.
 
 Light that trials share is traced at the nominal pose of a view. A part that is placed within 1 mm and 0.3 deg moves by
-1.5 px (N10) to 3.7 px (Zivid), root mean square along each axis, and light at edges and reflections with it.
+1.5 px (N10) to 3.7 px (Zivid), root mean square along each axis, and light at edges and reflections with it. The point
+of the pattern that lights a surface moves as far in the image of the projector.
 """
 
 from __future__ import annotations
@@ -57,6 +58,39 @@ def image_motion(
     known = np.column_stack([second[seen] - corner, np.ones(seen.sum())])
     solved, _, rank, _ = np.linalg.lstsq(known, first[seen] - corner, rcond=None)
     return np.asarray(solved.T) if rank == known.shape[1] else None
+
+
+def code_motion(
+    before: Camera,
+    world_from_sensor: Transform,
+    after: Camera,
+    other_world_from_sensor: Transform,
+    points: NDArray[np.float64],
+) -> NDArray[np.float64] | None:
+    """Return the affine map (2, 3) of the texture coordinates [1] of a projector from before to after a motion.
+
+    Light between surfaces carries the code of the surface that the projector lights, and moves on the pattern with it.
+
+    Parameters
+    ----------
+    before, world_from_sensor
+        Projector and pose of the sensor with which light is known.
+    after, other_world_from_sensor
+        Projector and pose with which it is asked for.
+    points
+        (n, 3) of the part [mm], world frame.
+
+    See Also
+    --------
+    image_motion : the motion in an image; None likewise
+    """
+    whole = Roi(0, 0, before.width, before.height)
+    pixels = image_motion(after, other_world_from_sensor, before, world_from_sensor, points, whole)
+    if pixels is None:
+        return None
+    size = np.array([before.width, before.height])
+    turn = pixels[:, :2] * size / size[:, None]
+    return np.column_stack([turn, (pixels[:, 2] + 0.5 - pixels[:, :2] @ [0.5, 0.5]) / size])
 
 
 def moved_images(images: NDArray[np.float32], motion: NDArray[np.float64] | None) -> NDArray[np.float32]:

@@ -44,14 +44,19 @@ class KeptLight:
         """Memory that it needs."""
         return self.paths.bytes + self.smoothing.bytes
 
-    def images(self, scene: Scene, simulated: SimulatedSensor) -> NDArray[np.float32]:
+    def images(
+        self, scene: Scene, simulated: SimulatedSensor, motion: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float32]:
         """Return the radiance (P, h, w) in the finishes of a scene, before the lens [W / (mm^2 sr)].
+
+        ``motion``: that of the code from where the paths were traced
+        (:func:`~mitsim.capture.simulated.image_motion.code_motion`), None for none.
 
         Like :meth:`~mitsim.capture.simulated.simulate.SimulatedSensor.indirect_radiance`, one more image is the light
         of other sources, if the sensor takes an ambient image.
         """
         light = simulated.patterns
-        codes = self.paths.codes(distinct_bsdfs(scene) or [], light)
+        codes = self.paths.codes(distinct_bsdfs(scene) or [], light, motion)
         in_threads(self.smoothing.apply, codes)
         images = light.images(list(codes))
         if self.ambient_image:

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from characterisation.files.arrays import Singles
 from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
-from mitsim.scene.device import to_device
+from mitsim.scene.device import opaque, to_device
 from mitsim.scene.light_transport.low_discrepancy import z_positions
 from mitsim.scene.light_transport.projected_codes import ProjectedLight
 
@@ -148,10 +148,11 @@ class KeptPaths:
         """Memory that the paths need on the device."""
         return 24 * len(self._vertices) + self.count * (16 + 4 * len(self._indices))
 
-    def codes(self, bsdfs: Sequence[Any], light: ProjectedLight) -> Singles:
+    def codes(self, bsdfs: Sequence[Any], light: ProjectedLight, motion: NDArray[np.float64] | None = None) -> Singles:
         """Return the light (codes, height, width) of each code of a region, for the BSDFs of the drawn finishes.
 
-        Each pixel sums its paths in their order, so that the same paths give the same bytes.
+        Each pixel sums its paths in their order, so that the same paths give the same bytes. ``motion`` is an affine
+        map (2, 3) of texture coordinates from where the paths were traced to where the part is, None for none.
         """
         out = np.zeros((light.codes, self.roi.height * self.roi.width), np.float32)
         if not self.count:
@@ -162,6 +163,7 @@ class KeptPaths:
             radiance = radiance * dr.gather(mi.Float, factors, indices)
         dr.eval(radiance)
         last = self._first + self._counts
+        rows = None if motion is None else [[opaque(float(value)) for value in row] for row in motion]
 
         def running(k: Any, *sums: Any) -> Any:
             return k < last
@@ -169,6 +171,8 @@ class KeptPaths:
         def step(k: Any, *sums: Any) -> Any:
             carried = dr.gather(mi.Float, radiance, k)
             uv, length = dr.gather(mi.Point2f, self._uv, k), dr.gather(mi.Float, self._length, k)
+            if rows is not None:
+                uv = mi.Point2f(*[across * uv.x + down * uv.y + offset for across, down, offset in rows])
             values = light.values(uv, length, mi.Bool(True))
             return (k + 1, *[s + carried * value for s, value in zip(sums, values, strict=True)])
 

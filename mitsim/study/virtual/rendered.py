@@ -7,7 +7,8 @@ temperature and form of the part -> measurement at the assumed pose -> error of 
 
 The paths of interreflections are those of the nominal pose and calibration of the view
 (:mod:`mitsim.capture.simulated.kept_light`). Their images, and those of the room light, move to where the random pose
-and calibration show the part (:mod:`mitsim.capture.simulated.image_motion`). Trials of a view that follow one another
+and calibration show the part, and the code that they carry to where the part is in the pattern
+(:mod:`mitsim.capture.simulated.image_motion`). Trials of a view that follow one another
 trace its paths once. With ``separate_light``, every trial renders all of its light at its own pose and calibration.
 That takes several times as long, and is the reference for this approximation. The interreflections of scenes with
 emitters, or with finishes inside other BSDFs, are rendered anew for every finish.
@@ -33,7 +34,7 @@ from characterisation.tasks.result import Result
 from characterisation.tasks.task_file import Task
 from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.exposing import LightOnImagers
-from mitsim.capture.simulated.image_motion import image_motion, moved_images
+from mitsim.capture.simulated.image_motion import code_motion, image_motion, moved_images
 from mitsim.capture.simulated.indirect_light import IndirectLight
 from mitsim.capture.simulated.kept_light import KeptLight, can_be_kept, keep_light
 from mitsim.capture.simulated.render_residual import RenderResidual, residual_of
@@ -178,17 +179,16 @@ class RenderedMeasurements:
         """Trace the light of one draw in a view, which all of its exposures share."""
         true, assumed = (motion.inverse() @ view.world_from_sensor for motion in (drawn.placed, drawn.assumed))
         sensor = self.simulated.recalibrated(drawn.rig, drawn.unit or None, self._mask(drawn.unit))
-        if self.separate_light:
-            pose, shared = true, self._shared(sensor, true, view, False)
-        else:
-            pose, shared = view.world_from_sensor, self._view_light(view)
+        pose = view.world_from_sensor
+        shared = self._shared(sensor, true, view, False) if self.separate_light else self._view_light(view)
         scene, albedos = self.part.in_finish(drawn.finish)
         motions = {
             name: image_motion(self.simulated.rays[name].camera, pose, sensor.rays[name].camera, true, self.hull, roi)
             for name, roi in (() if self.separate_light else shared.rois.items())
         }
-        images = self._indirect(sensor, scene, pose, view, drawn, shared)
-        images = {name: moved_images(stack, motions.get(name)) for name, stack in images.items()}
+        images = self._indirect(sensor, scene, true, view, drawn, shared)
+        if shared.kept:
+            images = {name: moved_images(stack, motions.get(name)) for name, stack in images.items()}
         room = {}
         for name, surfaces in shared.seen.items():
             image = moved_images(surfaces.room_radiance(albedos)[None], motions.get(name))[0]
@@ -318,13 +318,19 @@ class RenderedMeasurements:
         drawn: DrawnValues,
         shared: ViewLight,
     ) -> dict[str, NDArray[np.float32]]:
-        """Return the interreflections (P, h, w) of a draw by camera: on the kept paths, or rendered from a pose."""
-        images = {}
+        """Return the interreflections (P, h, w) of a draw by camera.
+
+        They are rendered from a pose, or on the kept paths, with the code of the pose in the images of the nominal one.
+        """
+        images, projector = {}, simulated.patterns.projector.optics
+        codes = code_motion(
+            self.simulated.patterns.projector.optics, view.world_from_sensor, projector, pose, self.hull
+        )
         for index, (name, roi) in enumerate(shared.rois.items()):
             if self.rendering.depth == 1:
                 images[name] = np.zeros((0, roi.height, roi.width), np.float32)
             elif shared.kept:
-                images[name] = shared.kept[name].images(scene, simulated)
+                images[name] = shared.kept[name].images(scene, simulated, codes)
             else:
                 seed = drawn.seed if self.separate_light else self.unknowns.seed
                 seed = _seed_of(seed, view.number, drawn.finish + 1, index)

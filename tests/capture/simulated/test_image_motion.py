@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from characterisation.region_of_interest import Roi
-from mitsim.capture.simulated.image_motion import image_motion, moved_images
+from mitsim.capture.simulated.image_motion import code_motion, image_motion, moved_images
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import Transform, look_at
 
@@ -55,3 +55,24 @@ def test_no_motion_without_points_in_sight(camera):
     motion = image_motion(camera, POSE, camera, POSE, points, Roi(0, 0, 6, 5))
     assert motion is None and moved_images(images, motion) is images
     assert moved_images(images[:0], np.eye(2, 3)).shape == (0, 5, 6)
+
+
+@pytest.mark.parametrize(("step_mm", "angle_deg"), [((1.0, -0.7, 0.5), 0.4), ((0.0, 0.0, 3.0), 0.0), ((2, 2, 0), -1.0)])
+def test_the_code_of_a_point_moves_with_it(step_mm, angle_deg):
+    """A map of texture coordinates, from 0 to 1 between the edges of the pattern; parallax within the part remains."""
+    projector = load_sensor("zivid-2-m70").rig.projector
+    other = placed(step_mm, angle_deg)
+
+    def code(pose):
+        return (projector.project(pose.inverse().points(POINTS)) + 0.5) / [projector.width, projector.height]
+
+    motion = code_motion(projector, POSE, projector, other, POINTS)
+    found = code(POSE) @ motion[:, :2].T + motion[:, 2]
+    moved = np.abs(code(other) - code(POSE)).max()
+    assert moved > 5e-4 and np.abs(found - code(other)).max() < 0.2 * moved
+
+
+def test_no_motion_of_the_code_without_points_in_sight():
+    projector = load_sensor("zivid-2-m70").rig.projector
+    points = POSE.points(POSE.inverse().points(POINTS) * [1, 1, -1])
+    assert code_motion(projector, POSE, projector, POSE, points) is None
