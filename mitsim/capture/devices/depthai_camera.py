@@ -42,7 +42,6 @@ class DepthaiShot:
     - ``disparity`` (H, W) of the device's own matcher in its rectified left image [px], NaN where missing, or None.
     - ``calibration``: as stored in the device, in its own JSON.
     - ``settings``: the values set, and those that the frames report, with units in the names.
-    - ``model`` and ``serial``.
     """
 
     images: dict[str, Image]
@@ -107,9 +106,8 @@ class DepthaiCamera(LiveCamera):
                 **frame_settings(frames["left"]),
             }
             images = {name: pixels(frames[name]) for name in _IMAGES}
-            disparity = None
-            if "disparity" in frames:
-                disparity = disparity_of(pixels(frames["disparity"]), self.settings.subpixel_bits)
+            own = frames.get("disparity")
+            disparity = None if own is None else disparity_of(pixels(own), self.settings.subpixel_bits)
             return DepthaiShot(images, disparity, self.calibration, settings, self.model, self.serial)
 
     def _release(self) -> None:
@@ -126,21 +124,15 @@ class DepthaiCamera(LiveCamera):
         return fault_of(error, self._dai, self.where, operation)
 
     def _light(self, dots: float, flood: float) -> None:
-        device = self._device
-        if device is None:
+        if self._device is None:
             return
         for share, switch, name in (
-            (dots, device.setIrLaserDotProjectorIntensity, "dot_projector"),
-            (flood, device.setIrFloodLightIntensity, "flood_light"),
+            (dots, self._device.setIrLaserDotProjectorIntensity, "dot_projector"),
+            (flood, self._device.setIrFloodLightIntensity, "flood_light"),
         ):
             if not switch(share) and share > 0:
-                raise DeviceError(
-                    self.where,
-                    f"set {name}",
-                    "a camera without one",
-                    "one that has it (OAK-D Pro)",
-                    f"Write {name} = 0",
-                )
+                found, expected = "a camera without one", "one that has it (OAK-D Pro)"
+                raise DeviceError(self.where, f"set {name}", found, expected, f"Write {name} = 0")
 
 
 def depthai() -> Any:
@@ -165,9 +157,8 @@ def stereo_pipeline(pipeline: Any, settings: DepthaiSettings, dai: Any) -> Any:
         camera = pipeline.create(dai.node.Camera).build(socket)
         if settings.exposure_s is not None:
             camera.initialControl.setManualExposure(round(1e6 * settings.exposure_s), settings.sensitivity_iso)
-        outputs.append(
-            camera.requestOutput(settings.size_px, type=dai.ImgFrame.Type.GRAY8, fps=settings.frames_per_second)
-        )
+        grey = dai.ImgFrame.Type.GRAY8
+        outputs.append(camera.requestOutput(settings.size_px, type=grey, fps=settings.frames_per_second))
     preset = getattr(dai.node.StereoDepth.PresetMode, settings.preset)
     stereo = pipeline.create(dai.node.StereoDepth).build(*outputs, presetMode=preset)
     configure(stereo.initialConfig, settings, dai)
@@ -181,12 +172,8 @@ def pixels(frame: Any) -> Image:
     """Return a copy of the grey levels or raw disparities (H, W) of an ``ImgFrame``."""
     image = np.array(frame.getFrame())
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
-        raise DeviceError(
-            "camera depthai",
-            "read a frame",
-            f"{image.dtype} {image.shape} of type {frame.getType()}",
-            "a grey image of 8 or 16 bits",
-        )
+        found = f"{image.dtype} {image.shape} of type {frame.getType()}"
+        raise DeviceError("camera depthai", "read a frame", found, "a grey image of 8 or 16 bits")
     return image
 
 
@@ -196,7 +183,7 @@ def disparity_of(raw: Image, subpixel_bits: int) -> NDArray[np.float32]:
 
 
 def frame_settings(frame: Any) -> dict[str, Any]:
-    """Return the values that a frame reports: exposure, sensitivity, temperature, sequence number."""
+    """Return the values that a frame reports."""
     read = {
         "exposure_s": frame.getExposureTime().total_seconds(),
         "sensitivity_iso": frame.getSensitivity(),
@@ -209,18 +196,9 @@ def frame_settings(frame: Any) -> dict[str, Any]:
 def aligned(
     queues: Mapping[str, Any], timeout_s: float, where: str, first: int = 0, now: Callable[[], float] = time.monotonic
 ) -> dict[str, Any]:
-    """Return the next frames of a common sequence number, one from each queue.
+    """Return the next frames of a common sequence number, ``first`` or more, one from each queue.
 
     Raises DeviceError if they do not arrive in time.
-
-    Parameters
-    ----------
-    queues, timeout_s
-        Queues of frames by name, and longest time to wait [s].
-    where, first
-        Name of the camera in messages, and least sequence number.
-    now
-        Returns the time [s].
     """
     deadline = now() + timeout_s
     newest: dict[str, Any] = {}
@@ -231,60 +209,30 @@ def aligned(
                 left = deadline - now()
                 frame = queue.get(timedelta(seconds=left)) if left > 0 else None
                 if frame is None:
-                    raise DeviceError(
-                        where,
-                        "capture",
-                        f"no frame of {name} within {timeout_s:g} s",
-                        "frames",
-                        "Check the cable (USB 3), or lower frames_per_second",
-                    )
+                    found = f"no frame of {name} within {timeout_s:g} s"
+                    hint = "Check the cable (USB 3), or lower frames_per_second"
+                    raise DeviceError(where, "capture", found, "frames", hint)
                 newest[name] = frame
                 wanted = max(wanted, frame.getSequenceNum())
     return newest
 
 
 def fault_of(error: BaseException, dai: Any, where: str, operation: str) -> BaseException:
-    """Return the error to raise instead of an error: a DeviceError for errors of the package, else the error itself.
-
-    Parameters
-    ----------
-    error, dai
-        Caught error, and the package ``depthai``.
-    where, operation
-        Name of the camera in messages, and operation that failed.
-    """
+    """Return the error to raise instead of an error: a DeviceError for errors of the package, else the error itself."""
     if isinstance(error, DeviceError) or not isinstance(error, RuntimeError):
         return error
     message = " ".join(str(error).split())[:200]
-    listed: list[str] = []
-    with suppress(Exception):
-        listed = [str(info.getDeviceId()) for info in dai.Device.getAllAvailableDevices()]
-    there = f"Connected: {', '.join(listed)}" if listed else "None is connected"
-    lowered = message.lower()
-    if "no available devices" in lowered or "cannot find any device" in lowered or "failed to find device" in lowered:
-        return DeviceError(
-            where,
-            operation,
-            f"no such camera ({message})",
-            "one that answers",
-            f"{there}. Check the cable. On Linux its udev rule is needed: docs.luxonis.com",
-        )
-    if "already_in_use" in lowered or "already used" in lowered:
-        return DeviceError(
-            where, operation, f"the camera in use ({message})", "a free camera", "Close the other program"
-        )
-    if "permission" in lowered:
-        return DeviceError(
-            where,
-            operation,
-            f"permission denied ({message})",
-            "a camera that you may open",
-            "On Linux its udev rule is needed: docs.luxonis.com",
-        )
-    return DeviceError(
-        where,
-        operation,
-        f"the camera disconnected or failed ({message})",
-        "a connected camera",
-        "Check the cable and the power, then open it again",
-    )
+    lowered, rule = message.lower(), "On Linux its udev rule is needed: docs.luxonis.com"
+    found, expected = "the camera disconnected or failed", "a connected camera"
+    hint = "Check the cable and the power, then open it again"
+    if any(words in lowered for words in ("no available devices", "cannot find any device", "failed to find device")):
+        listed: list[str] = []
+        with suppress(Exception):
+            listed = [str(info.getDeviceId()) for info in dai.Device.getAllAvailableDevices()]
+        there = f"Connected: {', '.join(listed)}" if listed else "None is connected"
+        found, expected, hint = "no such camera", "one that answers", f"{there}. Check the cable. {rule}"
+    elif "already_in_use" in lowered or "already used" in lowered:
+        found, expected, hint = "the camera in use", "a free camera", "Close the other program"
+    elif "permission" in lowered:
+        found, expected, hint = "permission denied", "a camera that you may open", rule
+    return DeviceError(where, operation, f"{found} ({message})", expected, hint)

@@ -136,10 +136,8 @@ class EnsensoCamera(LiveCamera):
                 points = np.asarray(camera.compute_point_map().get_binary_data(), np.float32)
             node = camera.get_node().value()
             if (node.get("Link") or {}).get("Target"):
-                found = "a Link that cannot be removed"
-                raise DeviceError(
-                    self.where, "capture", found, "points in the camera's frame", "Clear the camera's Link in NxView"
-                )
+                found, hint = "a Link that cannot be removed", "Clear the camera's Link in NxView"
+                raise DeviceError(self.where, "capture", found, "points in the camera's frame", hint)
             if self._link is not None:
                 node["Link"] = self._link
             return EnsensoShot(node, self._images(), disparity, points, self._source(node))
@@ -176,13 +174,8 @@ class EnsensoCamera(LiveCamera):
         if not item.exists():
             if value is False:  # it cannot be switched on, so it is off
                 return
-            raise DeviceError(
-                self.where,
-                f"set {path}",
-                "no such parameter",
-                f"a camera with this parameter, to set it to {value}",
-                "Leave it out of the settings",
-            )
+            expected = f"a camera with this parameter, to set it to {value}"
+            raise DeviceError(self.where, f"set {path}", "no such parameter", expected, "Leave it out of the settings")
         before = self._before.setdefault(path, item.value())
         # older trees have a number for FlexView
         _write(item, 0 if value is False and not isinstance(before, bool) else value)
@@ -245,8 +238,7 @@ def open_ensenso(serial: str, settings: EnsensoSettings) -> EnsensoCamera:
     """Open a camera by its serial number, and configure it.
 
     NxLib's shared library is that of the SDK, or of ``NXLIB_LIBRARY_PATH``. Raises MissingEnvironmentError without the
-    package ``ensenso-nxlib``. Raises DeviceError without the manufacturer's SDK, or if the camera cannot be opened or
-    rejects the settings.
+    package ``ensenso-nxlib``, DeviceError without the SDK, or if the camera cannot be opened or rejects the settings.
     """
     try:
         nxlib = import_module("nxlib")

@@ -41,7 +41,7 @@ from mitsim.capture.devices.grbl_reports import (
     parse_version,
 )
 from mitsim.capture.devices.serial_line import PortGoneError, SerialLine, shown
-from mitsim.capture.devices.stage_connection import StageConnection, check_model, check_steps
+from mitsim.capture.devices.stage_connection import StageConnection
 
 #: longest command line that GRBL accepts (else error:11) [characters]
 LONGEST_COMMAND = 78
@@ -64,14 +64,10 @@ _REFUSED = "Correct the setting with a terminal; the board stores it"
 
 
 class Grbl:
-    """GRBL on a serial line; a :class:`~mitsim.capture.devices.stage.Controller`.
-
-    Raises DeviceError if the device does not answer as GRBL 1.1, or is not the one of the connection. Raises InputError
-    if its settings do not allow the connection's values.
-    """
+    """GRBL on a serial line; a :class:`~mitsim.capture.devices.stage.Controller`."""
 
     def __init__(self, connection: StageConnection, line: SerialLine) -> None:
-        self._line, self._connection = line, connection
+        self._line, self._connection, self._fault = line, connection, connection.fault
         self._columns = tuple("XYZ".index(axis.channel) for axis in connection.axes)
         self._offset: tuple[float, ...] | None = None
         self._homing = False
@@ -82,7 +78,7 @@ class Grbl:
             version = versions[0][1] if versions else " ".join(about)
             raise self._fault("identify ($I)", shown(version), "GRBL 1.1")
         self.identity = versions[0][1]
-        check_model(connection, self.identity)
+        connection.check_model(self.identity)
         settings = dict(setting for setting in map(parse_setting, self._ask("$$")) if setting)
         options = next((line for line in about if line.startswith("[OPT:")), "[OPT:]")[5:-1].partition(",")[0]
         self._read(settings, "Z" in options)
@@ -193,28 +189,20 @@ class Grbl:
         if settings.get(13, 0) != 0:
             raise self._setting(13, settings[13], "0: positions in mm, which stand for degrees")
         if self._connection.homing == "device" and settings.get(22, 0) == 0:
-            raise self._setting(
-                22,
-                settings.get(22, 0),
-                '1, with limit switches; or homing = "none", with the stage set to zero by hand before it is opened',
-            )
+            by_hand = 'homing = "none", with the stage set to zero by hand before it is opened'
+            raise self._setting(22, 0, f"1, with limit switches; or {by_hand}")
         rates, accelerations, travel, resolution = [], [], [], []
         for index, (column, axis) in enumerate(zip(self._columns, self._connection.axes, strict=True)):
             steps, rate, slope, length = (settings.get(group + column, math.nan) for group in (100, 110, 120, 130))
             for number, value in ((100, steps), (110, rate), (120, slope)):
                 if not value > 0:
                     raise self._setting(number + column, value, "more than 0")
-            check_steps(self._connection, index, steps)
+            self._connection.check_steps(index, steps)
             resolution.append(1 / steps)
             speed = (self._connection.speed_deg_s or math.inf) * abs(axis.gear)
             if self._connection.speed_deg_s is not None and speed > rate / 60 * (1 + 1e-9):
-                raise InputError(
-                    "stage.connection",
-                    "speed_deg_s",
-                    f"{self._connection.speed_deg_s:g}",
-                    f"at most {rate / 60 / abs(axis.gear):.4g} for axis {axis.name}",
-                    f"the board's ${110 + column}",
-                )
+                allowed = f"at most {rate / 60 / abs(axis.gear):.4g} for axis {axis.name}"
+                raise self._connection.speed_fault(allowed, f"the board's ${110 + column}")
             rates.append(min(speed, rate / 60))
             accelerations.append(slope)
             low_end = int(settings.get(23, 0)) >> column & 1
@@ -232,11 +220,10 @@ class Grbl:
         for _ in range(REPORTS_FOR_OFFSET):
             status = self._status()
             if status.state not in IN_USE:
-                detail = f":{status.detail}" if status.detail else ""
-                hint = (
-                    "Its position may be lost" if status.state == "Alarm" else "Check for a feed hold or an open door"
-                )
-                raise self._fault("status (?)", f"state {status.state}{detail}", " or ".join(IN_USE), hint)
+                state = f"state {status.state}" + (f":{status.detail}" if status.detail else "")
+                lost = status.state == "Alarm"
+                hint = "Its position may be lost" if lost else "Check for a feed hold or an open door"
+                raise self._fault("status (?)", state, " or ".join(IN_USE), hint)
             self._offset = status.offset or self._offset
             machine = status.machine
             if machine is None and status.work is not None and self._offset is not None:
@@ -249,9 +236,7 @@ class Grbl:
 
     def _status(self) -> StatusReport:
         """Request a status report, and wait for it."""
-        if stray := [line for line in self._line.unread().splitlines() if line.strip()]:
-            for line in stray:
-                self._passing(line.strip(), "status (?)", "silence before a query")
+        self._check_silence("status (?)", "silence before a query")
         self._line.send(_STATUS)
         deadline = self._line.clock.now() + self._connection.reply_timeout_s
         while True:
@@ -262,9 +247,7 @@ class Grbl:
 
     def _ask(self, command: str, timeout_s: float | None = None) -> list[str]:
         """Send a line and return the lines before its ``ok``."""
-        for line in self._line.unread().splitlines():
-            if line.strip():
-                self._passing(line.strip(), command, "silence before a command")
+        self._check_silence(command, "silence before a command")
         self._line.send(command.encode() + b"\n")
         deadline = self._line.clock.now() + (timeout_s or self._connection.reply_timeout_s)
         lines: list[str] = []
@@ -275,23 +258,19 @@ class Grbl:
                 self._passing(line, command, "ok")
         return lines
 
+    def _check_silence(self, operation: str, expected: str) -> None:
+        for line in filter(str.strip, self._line.unread().splitlines()):
+            self._passing(line.strip(), operation, expected)
+
     def _passing(self, line: str, operation: str, expected: str) -> None:
         """Ignore a message that is not a reply, and raise an error for an unexpected one."""
         if refusal := parse_refusal(line):
             raise self._fault(operation, refusal, expected)
         if is_welcome(line):
-            raise self._fault(
-                operation,
-                f"a board that has restarted, {shown(line)}",
-                expected,
-                "Its position is lost. Check its power and its reset line",
-            )
-        message = line.startswith(("[MSG:", ">")) or parse_status(line) is not None
-        if not message:
+            hint = "Its position is lost. Check its power and its reset line"
+            raise self._fault(operation, f"a board that has restarted, {shown(line)}", expected, hint)
+        if not line.startswith(("[MSG:", ">")) and parse_status(line) is None:
             raise self._fault(operation, shown(line), expected, "Check that this is GRBL, and the baud rate")
 
     def _setting(self, number: int, value: float, allowed: str) -> InputError:
         return InputError(self._connection.where, f"GRBL setting ${number}", f"{value:g}", allowed, _REFUSED)
-
-    def _fault(self, operation: str, found: str, expected: str, hint: str = "") -> DeviceError:
-        return DeviceError(self._connection.where, operation, found, expected, hint)

@@ -26,10 +26,9 @@ import math
 import re
 from collections.abc import Sequence
 
-from characterisation.files.errors import InputError
 from mitsim.capture.devices.device_error import DeviceError
 from mitsim.capture.devices.serial_line import PortGoneError, SerialLine, shown
-from mitsim.capture.devices.stage_connection import StageConnection, check_model, check_steps
+from mitsim.capture.devices.stage_connection import StageConnection
 
 #: silence after which all replies to an earlier session have arrived [s]; assumed
 QUIET_S = 0.3
@@ -45,25 +44,21 @@ _NUMBER = re.compile(r"[-+]?\d{1,9}(\.\d{0,9})?")
 
 
 class PanTiltUnit:
-    """A PTU on a serial line; a :class:`~mitsim.capture.devices.stage.Controller`.
-
-    Raises DeviceError if the device does not answer as a PTU, or is not the one of the connection. Raises InputError if
-    its speeds do not include the connection's.
-    """
+    """A PTU on a serial line; a :class:`~mitsim.capture.devices.stage.Controller`."""
 
     def __init__(self, connection: StageConnection, line: SerialLine) -> None:
-        self._line, self._connection = line, connection
+        self._line, self._connection, self._fault = line, connection, connection.fault
         self._channels = tuple(axis.channel for axis in connection.axes)
         line.send(b" H ")  # stop a motion left by an earlier program
         self._make_terse()
         self.identity = self._identity()
-        check_model(connection, self.identity)
+        connection.check_model(self.identity)
         arc = [self._number(f"{channel}R") for channel in self._channels]
         if bad := [value for value in arc if not 0 < value < 3600]:
             raise self._fault("resolution", f"{bad[0]:g} seconds of arc", "more than 0, less than 3600")
         self.resolution: tuple[float, ...] = tuple(value / 3600 for value in arc)
         for index, step in enumerate(self.resolution):
-            check_steps(connection, index, 1 / step)
+            connection.check_steps(index, 1 / step)
         self.travel = tuple(self._travel(channel, step) for channel, step in self._by_channel())
         self._paces = [self._pace(index) for index in range(len(arc))]
 
@@ -142,12 +137,8 @@ class PanTiltUnit:
     def _travel(self, channel: str, step: float) -> tuple[float, float]:
         low, high = self._count(f"{channel}N"), self._count(f"{channel}X")
         if low >= high:
-            raise self._fault(
-                f"bounds, channel {channel}",
-                f"{low} to {high}",
-                "the lower before the upper",
-                "Reset the unit after power-up",
-            )
+            expected, hint = "the lower before the upper", "Reset the unit after power-up"
+            raise self._fault(f"bounds, channel {channel}", f"{low} to {high}", expected, hint)
         return low * step, high * step
 
     def _pace(self, index: int) -> tuple[float, float]:
@@ -157,13 +148,9 @@ class PanTiltUnit:
             steps = round(self._connection.speed_deg_s * abs(axis.gear) / step)
             low, high = self._count(f"{channel}L"), self._count(f"{channel}U")
             if not low <= steps <= high:
-                raise InputError(
-                    "stage.connection",
-                    "speed_deg_s",
-                    f"{self._connection.speed_deg_s:g}",
-                    f"{low * step / abs(axis.gear):.3g} to {high * step / abs(axis.gear):.3g} for axis {axis.name}",
-                    "the unit's own limits",
-                )
+                slowest, fastest = (steps * step / abs(axis.gear) for steps in (low, high))
+                allowed = f"{slowest:.3g} to {fastest:.3g} for axis {axis.name}"
+                raise self._connection.speed_fault(allowed, "the unit's own limits")
             self._order(f"{channel}S{steps}")
         speed, acceleration = self._count(f"{channel}S"), self._count(f"{channel}A")
         if speed <= 0 or acceleration <= 0:
@@ -195,12 +182,11 @@ class PanTiltUnit:
     def _reply(self, command: str) -> str:
         """Send a command and return its reply, which begins with a star or an exclamation mark."""
         if stray := self._checked(self._line.unread(), command).strip():
-            raise self._fault(
-                command,
+            found, hint = (
                 f"an unexpected line, {shown(stray)}",
-                "silence before a command",
                 "Check for another program on this line, or a late reply",
             )
+            raise self._fault(command, found, "silence before a command", hint)
         self._line.send(command.encode() + b" ")
         deadline = self._line.clock.now() + self._connection.reply_timeout_s
         while True:
@@ -213,20 +199,13 @@ class PanTiltUnit:
     def _checked(self, answer: str, command: str) -> str:
         """Return a text if it has no sign that an axis has hit its end; raise an error otherwise."""
         if hit := _LIMIT.search(answer):
-            raise self._fault(
-                f"{command}, channel {hit[1]}",
-                f"!{hit[1]}: the {_NAMES[hit[1]]} axis has hit its end",
-                "an axis within its travel",
-                "Its position is lost. Remove the obstacle",
-            )
+            found = f"!{hit[1]}: the {_NAMES[hit[1]]} axis has hit its end"
+            expected, hint = "an axis within its travel", "Its position is lost. Remove the obstacle"
+            raise self._fault(f"{command}, channel {hit[1]}", found, expected, hint)
         return answer
 
     def _not_terse(self, command: str, answer: str, expected: str) -> DeviceError:
-        words = re.match(r"[A-Za-z]{1,2}[-+\d]* ?[*!]|[A-Za-z]+[- ][A-Za-z]+", answer)
-        if words:
+        if re.match(r"[A-Za-z]{1,2}[-+\d]* ?[*!]|[A-Za-z]+[- ][A-Za-z]+", answer):
             hint = "It has restarted and lost its position. Check its power"
             return self._fault(command, f"verbose replies again, {shown(answer)}", expected, hint)
         return self._fault(command, shown(answer), expected, "Check that this is a PTU, and the baud rate")
-
-    def _fault(self, operation: str, found: str, expected: str, hint: str = "") -> DeviceError:
-        return DeviceError(self._connection.where, operation, found, expected, hint)

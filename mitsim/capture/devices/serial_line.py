@@ -79,10 +79,7 @@ class SerialLine:
         self._buffer = bytearray()
 
     def send(self, data: bytes) -> None:
-        """Send bytes.
-
-        Raises DeviceError if the port failed, or accepts no data.
-        """
+        """Send bytes."""
         with self._port_there("send"):
             self._port.write(data)
 
@@ -116,22 +113,18 @@ class SerialLine:
         with self._port_there("read"):
             while self._port.in_waiting and self.clock.now() < end:
                 self._buffer += self._port.read(min(self._port.in_waiting, LONGEST_LINE))
-        text = text_of(self._buffer)
-        self._buffer.clear()
-        return text
+        return self._emptied()
 
     def drain(self, quiet_s: float, longest_s: float) -> str:
         """Read until nothing arrives for ``quiet_s``, at most ``longest_s``; return the last part of the data."""
-        end = quiet = self.clock.now()
-        end, quiet = end + longest_s, quiet + quiet_s
-        while self.clock.now() < min(end, quiet):
+        began = self.clock.now()
+        quiet = began + quiet_s
+        while self.clock.now() < min(began + longest_s, quiet):
             if data := self._read():
                 self._buffer += data
                 del self._buffer[:-LONGEST_LINE]
                 quiet = self.clock.now() + quiet_s
-        text = text_of(self._buffer)
-        self._buffer.clear()
-        return text
+        return self._emptied()
 
     def close(self) -> None:
         """Close the port, even after a failure."""
@@ -141,6 +134,12 @@ class SerialLine:
         if socket is not None:  # pyserial leaves it open if the other end has closed first
             with suppress(OSError):
                 socket.close()
+
+    def _emptied(self) -> str:
+        """Return the data in the buffer, and empty it."""
+        text = text_of(self._buffer)
+        self._buffer.clear()
+        return text
 
     def _read(self) -> bytes:
         with self._port_there("read"):
@@ -160,22 +159,19 @@ class SerialLine:
         try:
             yield
         except OSError as error:  # includes pyserial's SerialException
-            raise PortGoneError(
-                self.where,
-                operation,
+            found, hint = (
                 f"the port disconnected ({error})",
-                "a connected port",
                 "Check the cable and the device's power, then open it again",
-            ) from None
+            )
+            raise PortGoneError(self.where, operation, found, "a connected port", hint) from None
 
 
 def open_line(port: str, baud: int, where: str) -> SerialLine:
     """Open a port exclusively, 8 data bits, no parity, 1 stop bit.
 
     ``port`` is a device (``/dev/ttyUSB0``, ``COM3``) or a URL of pyserial (``socket://host:4000``,
-    ``rfc2217://host:port``), for which ``baud`` may have no effect. Messages name ``where``. Raises
-    MissingEnvironmentError without pyserial. Raises DeviceError if there is no such port, another program uses it, or
-    the user lacks permission. Raises InputError if the name of the port is invalid.
+    ``rfc2217://host:port``), for which ``baud`` may have no effect. Raises DeviceError if the port does not open,
+    InputError if its name is invalid, MissingEnvironmentError without pyserial.
     """
     serial = pyserial()
     try:
@@ -215,9 +211,8 @@ def _not_opened(port: str, where: str, error: Exception) -> DeviceError:
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO) or "filenotfound" in message:
         there = ", ".join(known_ports()) or "none"
         return DeviceError(where, "open", "no such port", "an existing port", f"Ports of this machine: {there}")
-    hint = (
-        "Check that the device is on and has no other connection" if "://" in port else "Unplug it and plug it in again"
-    )
+    remote = "Check that the device is on and has no other connection"
+    hint = remote if "://" in port else "Unplug it and plug it in again"
     return DeviceError(where, "open", f"a port that does not open ({error})", "an open port", hint)
 
 

@@ -138,7 +138,7 @@ class LiveStage:
         """
         with self._stopped_on_error("stop"):
             if not self._halt():
-                raise DeviceError(self.connection.where, "stop", "no confirmation", "axes that stand")
+                raise self.connection.fault("stop", "no confirmation", "axes that stand")
 
     def close(self) -> None:
         """Stop the axes if they are not stopped yet, and close the port; further calls do nothing."""
@@ -173,13 +173,8 @@ class LiveStage:
 
     def _check_homed(self, operation: str) -> None:
         if not self._homed and not self._fault and not self._closed:
-            raise DeviceError(
-                self.connection.where,
-                operation,
-                "a stage that has not been homed",
-                "home() first",
-                "Its zero is unknown after power-up and after every fault",
-            )
+            hint = "Its zero is unknown after power-up and after every fault"
+            raise self.connection.fault(operation, "a stage that has not been homed", "home() first", hint)
 
     def _halt(self) -> bool:
         self._halted = self._controller.halt()
@@ -190,21 +185,13 @@ class LiveStage:
         for index, (axis, step) in enumerate(zip(self.connection.axes, self.resolution, strict=True)):
             low, high = sorted(axis.angle(reading) for reading in self._controller.travel[index])
             if axis.limits_deg[0] < low - step or axis.limits_deg[1] > high + step:
-                raise InputError(
-                    "stage.connection",
-                    f"axes.{index}.limits_deg",
-                    list(axis.limits_deg),
-                    f"between {low:.6g} and {high:.6g} deg",
-                    f"this is the range of the device's channel {axis.channel}, converted by zero_deg and gear",
-                )
-            if self.connection.tolerance_deg < step / 2:
-                raise InputError(
-                    "stage.connection",
-                    "tolerance_deg",
-                    f"{self.connection.tolerance_deg:g}",
-                    f"at least {step / 2:.4g}",
-                    f"the steps of axis {axis.name} are {step:.4g} deg",
-                )
+                field, found = f"axes.{index}.limits_deg", list(axis.limits_deg)
+                allowed = f"between {low:.6g} and {high:.6g} deg"
+                hint = f"this is the range of the device's channel {axis.channel}, converted by zero_deg and gear"
+                raise InputError("stage.connection", field, found, allowed, hint)
+            if (tolerance := self.connection.tolerance_deg) < step / 2:
+                allowed, hint = f"at least {step / 2:.4g}", f"the steps of axis {axis.name} are {step:.4g} deg"
+                raise InputError("stage.connection", "tolerance_deg", f"{tolerance:g}", allowed, hint)
 
     def _await_rest(self, targets: Sequence[float], deadline: float) -> None:
         """Return once all axes stand, wherever that is."""
@@ -222,27 +209,17 @@ class LiveStage:
                 return
             if now >= deadline:
                 angles = zip(self.axes, self._angles(readings), strict=True)
-                at = ", ".join(f"{name} {angle:.3f}" for name, angle in angles)
+                found = f"axes that still move, at {', '.join(f'{name} {angle:.3f}' for name, angle in angles)} deg"
                 expected = "arrival in the time that follows from distance and speed"
-                raise DeviceError(
-                    self.connection.where,
-                    "move",
-                    f"axes that still move, at {at} deg",
-                    expected,
-                    "Check for a blocked axis",
-                )
+                raise self.connection.fault("move", found, expected, "Check for a blocked axis")
             self._clock.sleep(POLL_S)
 
     def _check_arrival(self, requested: Sequence[float], position: Angles) -> None:
         for name, target, angle in zip(self.axes, requested, position, strict=True):
             if not abs(angle - target) <= self.connection.tolerance_deg:
-                raise DeviceError(
-                    f"{self.connection.where}, axis {name}",
-                    "move",
-                    f"an axis that stands at {angle:.3f} deg",
-                    f"{target:.3f} deg within {self.connection.tolerance_deg:g}",
-                    "Check for a blocked axis, or a manual stop",
-                )
+                found, hint = f"an axis that stands at {angle:.3f} deg", "Check for a blocked axis, or a manual stop"
+                expected = f"{target:.3f} deg within {self.connection.tolerance_deg:g}"
+                raise self.connection.fault("move", found, expected, hint, name)
 
     @contextmanager
     def _stopped_on_error(self, operation: str) -> Iterator[None]:
@@ -258,10 +235,9 @@ class LiveStage:
                 end = _BEYOND_REACH
             if not isinstance(error, DeviceError):
                 raise
-            hint = error.hint + ("" if error.hint[-1:] in ("", "?") else ".")
-            raise DeviceError(
-                error.where, error.operation, error.found, error.expected, f"{hint} {end}. To go on, {_AGAIN}".lstrip()
-            ) from error
+            stop = "" if error.hint[-1:] in ("", "?") else "."
+            hint = f"{error.hint}{stop} {end}. To go on, {_AGAIN}".lstrip()
+            raise DeviceError(error.where, error.operation, error.found, error.expected, hint) from error
 
 
 def open_stage(connection: StageConnection) -> LiveStage:

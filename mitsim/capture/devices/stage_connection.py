@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator, model_validator
 
 from characterisation.files.documents import Document
+from characterisation.files.errors import InputError
 from mitsim.capture.devices.device_error import DeviceError
 
 Kind = Literal["ptu", "grbl"]
@@ -114,34 +115,24 @@ class StageConnection(Document):
         """Return the baud rate; by default that of the kind."""
         return self.baud if self.baud is not None else BAUD[self.kind]
 
+    def fault(self, operation: str, found: str, expected: str, hint: str = "", axis: str = "") -> DeviceError:
+        """Return an error of the stage, or of one ``axis`` of it."""
+        return DeviceError(f"{self.where}, axis {axis}" if axis else self.where, operation, found, expected, hint)
 
-def check_model(connection: StageConnection, identity: str) -> None:
-    """Reject a device that is not the ``model`` of the connection.
+    def speed_fault(self, allowed: str, hint: str) -> InputError:
+        """Return the error of a ``speed_deg_s`` that the device does not have."""
+        return InputError("stage.connection", "speed_deg_s", f"{self.speed_deg_s:g}", allowed, hint)
 
-    Raises DeviceError with the device's self-description.
-    """
-    if connection.model.lower() not in identity.lower():
-        raise DeviceError(
-            connection.where,
-            "identify",
-            f"{identity!r}",
-            f"a device whose name contains {connection.model!r}",
-            "Check the port, or correct stage.connection.model",
-        )
+    def check_model(self, identity: str) -> None:
+        """Reject a device that is not the ``model`` of the connection."""
+        if self.model.lower() not in identity.lower():
+            expected = f"a device whose name contains {self.model!r}"
+            raise self.fault("identify", repr(identity), expected, "Check the port, or correct stage.connection.model")
 
-
-def check_steps(connection: StageConnection, index: int, steps_per_deg: float) -> None:
-    """Reject a device whose steps differ from the connection's: the angles would be wrong by the ratio.
-
-    Raises DeviceError with both numbers.
-    """
-    axis = connection.axes[index]
-    wanted = axis.steps_per_deg
-    if wanted is not None and not math.isclose(steps_per_deg, wanted, rel_tol=1e-3):
-        raise DeviceError(
-            f"{connection.where}, axis {axis.name}",
-            "identify",
-            f"{steps_per_deg:.6g} steps in a degree",
-            f"{wanted:.6g}",
-            "Check the device, or correct steps_per_deg or the device's setting",
-        )
+    def check_steps(self, index: int, steps_per_deg: float) -> None:
+        """Reject a device whose steps differ from the connection's: the angles would be wrong by the ratio."""
+        axis = self.axes[index]
+        wanted = axis.steps_per_deg
+        if wanted is not None and not math.isclose(steps_per_deg, wanted, rel_tol=1e-3):
+            hint = "Check the device, or correct steps_per_deg or the device's setting"
+            raise self.fault("identify", f"{steps_per_deg:.6g} steps in a degree", f"{wanted:.6g}", hint, axis.name)
