@@ -109,13 +109,11 @@ class PoseDocument(Document):
 
 def calibration_table(rig: Rig) -> dict[str, Any]:
     """Return the content of ``calibration.json`` for a rig, not yet checked."""
-    pair = rig.rectification
+    pair = {} if rig.rectification is None else vars(rig.rectification)
     return {
         "cameras": [_camera_table(name, camera) for name, camera in rig.cameras.items()],
         "projector": None if rig.projector is None else _camera_table("projector", rig.projector),
-        "rectification": None
-        if pair is None
-        else {key: np.asarray(value).tolist() for key, value in vars(pair).items()},
+        "rectification": {key: np.asarray(value).tolist() for key, value in pair.items()} or None,
     }
 
 

@@ -1,8 +1,7 @@
 """Describe what decoding a capture needs besides its images and calibration, as one checked type.
 
-Signal chain: ``settings.json`` -> keys that decoding reads -> :class:`Decoding`; the other keys are records, which no
-decoder reads. A simulation and an import make a :class:`Decoding` directly, and :func:`settings_table` writes it back
-beside the records.
+Of a ``settings.json``, :class:`Decoding` has the keys that decoding reads; the others are records, which no decoder
+reads.
 """
 
 from __future__ import annotations
@@ -109,8 +108,7 @@ class Decoding(Document):
 def read_settings(where: str | Path, table: dict[str, Any], technology: str) -> tuple[Decoding, dict[str, Any]]:
     """Split the table of a ``settings.json`` into what decoding reads and the records.
 
-    ``technology``, that of the capture, determines the type of ``decoder``. Messages name the file ``where``. Raises
-    InputError if the technology is unknown, or a value that decoding reads is invalid.
+    ``technology``, that of the capture, determines the type of ``decoder``.
     """
     if technology not in SETTINGS_OF:
         raise InputError("capture", "technology", repr(technology), ", ".join(SETTINGS_OF))
@@ -120,10 +118,7 @@ def read_settings(where: str | Path, table: dict[str, Any], technology: str) -> 
 
 
 def settings_table(decoding: Decoding, records: dict[str, Any]) -> dict[str, Any]:
-    """Return the table of ``settings.json``: all that decoding reads and that is not a default, then the records.
-
-    Raises InputError if a record has the name of a value that decoding reads.
-    """
+    """Return the table of ``settings.json``: all that decoding reads and that is not a default, then the records."""
     both = set(records) & set(Decoding.model_fields)
     if both:
         raise InputError("capture", "settings", ", ".join(sorted(both)), "records; Capture.decoding has these values")

@@ -19,10 +19,7 @@ _DEPTHS = ("Z", "depth.Z", "depth.V", "depth.Y", "Depth.Z", "Depth.V")
 
 
 def exr_depths(path: Path) -> NDArray[Any]:
-    """Return the depths (H, W) of an image: of the channel of a depth, else the one that it has, or equal ones.
-
-    Raises InputError if the image is damaged, or has several channels that differ and none of a depth.
-    """
+    """Return the depths (H, W) of an image: of the channel of a depth, else the one that it has, or equal ones."""
     try:
         with OpenEXR.File(str(path), separate_channels=True) as image:
             channels = {name: np.array(channel.pixels) for name, channel in image.channels().items()}

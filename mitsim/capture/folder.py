@@ -46,6 +46,9 @@ from mitsim.sensor.transforms import Transform
 #: largest allowed size of all files of a capture [bytes]
 LARGEST_CAPTURE = 8 * 1024**3
 
+#: values of a capture that its index has
+_KEPT = ("sensor", "technology", "source", "serial", "bits")
+
 
 def write_capture(
     capture: Capture,
@@ -108,9 +111,8 @@ def write_packed(files: Mapping[str, bytes], folder: str | Path, *, overwrite: b
     except OSError as error:
         if error.errno in FULL:
             raise
-        raise InputError(
-            folder, "", f"a folder that cannot be written ({error})", "a folder with write permission"
-        ) from None
+        found = f"a folder that cannot be written ({error})"
+        raise InputError(folder, "", found, "a folder with write permission") from None
     return folder
 
 
@@ -127,8 +129,7 @@ def is_written(capture: Capture, folder: str | Path, vendor: Mapping[str, bytes]
     own_index = json.loads(files["capture.json"])
     found_index = _read_index(folder)[0].model_dump(mode="json")
     paths = [{entry["path"]: entry["sha256"] for entry in index["files"]} for index in (own_index, found_index)]
-    compared = ("sensor", "technology", "source", "serial", "bits")
-    if paths[0] != paths[1] or any(own_index[key] != found_index[key] for key in compared):
+    if paths[0] != paths[1] or any(own_index[key] != found_index[key] for key in _KEPT):
         return False
     read_capture(folder)
     return True
@@ -195,25 +196,20 @@ def read_capture(path: str | Path) -> Capture:
             continue
         if entry.camera not in frames:
             raise InputError(where, f"files.{number}.camera", entry.camera, f"one of {', '.join(frames)}")
-        if entry.frame != len(frames[entry.camera]):
-            allowed = f"{len(frames[entry.camera])}: frames in order from 0"
-            raise InputError(where, f"files.{number}.frame", entry.frame, allowed)
+        if entry.frame != (count := len(frames[entry.camera])):
+            raise InputError(where, f"files.{number}.frame", entry.frame, f"{count}: frames in order from 0")
         frames[entry.camera].append(number)
-    images = {}
-    for name, numbers in frames.items():
-        if numbers:
-            images[name] = _read_stack(rig.cameras[name], numbers, document, data, folder)
     return Capture(
-        sensor=document.sensor,
-        technology=document.technology,
-        source=document.source,
+        **{name: getattr(document, name) for name in _KEPT},
         rig=rig,
-        images=images,
-        bits=document.bits,
+        images={
+            name: _read_stack(rig.cameras[name], numbers, document, data, folder)
+            for name, numbers in frames.items()
+            if numbers
+        },
         decoding=decoding,
         settings=records,
         world_from_sensor=pose.transform(),
-        serial=document.serial,
         derived=derived,
     )
 
@@ -292,9 +288,8 @@ def _read_index(folder: Path) -> tuple[CaptureDocument, Path]:
     table = _parse(read_bounded(where, "a complete capture folder", hint), where)
     version = table.get("schema_version")
     if type(version) is int and version > SCHEMA_VERSION:
-        raise InputError(
-            where, "schema_version", version, f"up to {SCHEMA_VERSION}", "update mitsim to read this capture"
-        )
+        of_newer = "update mitsim to read this capture"
+        raise InputError(where, "schema_version", version, f"up to {SCHEMA_VERSION}", of_newer)
     document = validate(where, table, CaptureDocument)
     if document.checksum != content_checksum(table):
         raise InputError(where, "checksum", "content that differs from what was written", "an unchanged file")
@@ -311,9 +306,8 @@ def _read_checked(folder: Path, entry: FileEntry, field: str, where: Path) -> by
         raise InputError(where, f"{field}.path", repr(entry.path), "a file inside the folder, not a link")
     data = read_bounded(file, "a complete capture folder")
     if hashlib.sha256(data).hexdigest() != entry.sha256:
-        raise InputError(
-            file, "sha256", "content that differs from what was written", "an unchanged file: copy the capture again"
-        )
+        found = "content that differs from what was written"
+        raise InputError(file, "sha256", found, "an unchanged file: copy the capture again")
     return data
 
 

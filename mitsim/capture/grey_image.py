@@ -53,10 +53,7 @@ CHANNELS = {"blue": 0, "green": 1, "red": 2}
 
 
 def channel_of(name: str | None) -> int:
-    """Return the number of a channel by its name; None is green, which has half of the pixels of a Bayer pattern.
-
-    Raises InputError for an unknown name.
-    """
+    """Return the number of a channel by its name; None is green, which has half of the pixels of a Bayer pattern."""
     if name is not None and name not in CHANNELS:
         raise InputError("--channel", "", repr(name), " | ".join(CHANNELS))
     return CHANNELS[name or "green"]
@@ -100,10 +97,7 @@ def page_labels(path: str | Path, count: int) -> list[str]:
 
 
 def page_count(path: Path) -> int:
-    """Return the number of images in a file.
-
-    Raises InputError if the file cannot be read, or is a damaged TIFF.
-    """
+    """Return the number of images in a file."""
     begin = read_bounded(path, first=4)
     return len(_tiff_pages(_bytes_of(path), path)) if begin in _TIFF_MARKS else 1
 
@@ -141,9 +135,8 @@ def _tiff_pages(data: bytes, where: str | Path) -> list[int]:
                 images.append(len(seen) - 1)
             at = following
     except (struct.error, OverflowError):
-        raise InputError(
-            where, "", f"a TIFF cut off in page {len(seen) + 1}", "a complete TIFF: copy it again"
-        ) from None
+        found = f"a TIFF cut off in page {len(seen) + 1}"
+        raise InputError(where, "", found, "a complete TIFF: copy it again") from None
     return images or list(range(len(seen)))
 
 
@@ -158,14 +151,12 @@ def read_depths(path: Path) -> NDArray[Any]:
 
 def _check_scale(data: bytes, where: str | Path) -> None:
     """Check that a PFM has a scale of 1 or -1: OpenCV divides by another one, and most programs do not."""
-    head = _PFM.match(data)
-    if head is None:
+    if (head := _PFM.match(data)) is None:
         return
-    try:
-        is_one = abs(float(head[1])) == 1
-    except ValueError:
-        return  # OpenCV refuses it
-    if not is_one:
+    scale = 1.0
+    with suppress(ValueError):  # OpenCV refuses it
+        scale = float(head[1])
+    if abs(scale) != 1:
         hint = "programs differ on whether it divides the numbers: save them with a scale of -1"
         raise InputError(where, "scale", head[1].decode("ascii", "replace"), "1 or -1 in a PFM", hint)
 
@@ -178,23 +169,17 @@ def _bytes_of(path: Path) -> bytes:
 
 
 def decode_grey(data: bytes, where: str | Path, *, channel: int | None = None) -> Image:
-    """Read a grey image from the bytes of a file, as :func:`read_grey` does.
-
-    ``channel`` is the number of the channel to take of a colour image (:data:`CHANNELS`). Messages name ``where``.
-    """
+    """Read a grey image from the bytes of a file, as :func:`read_grey` does."""
     return _checked(_decoded(data, where, channel), where)
 
 
 def _decoded(data: bytes, where: str | Path, channel: int | None, page: int | None = None) -> NDArray[Any]:
-    """Return the numbers (H, W) of an image: its only channel, or the requested ``channel``.
-
-    ``page`` is its number in the file; by default the file has one.
-    """
+    """Return the numbers (H, W) of a ``page``, by default the only one: its only channel, or the requested one."""
     if page is None:
-        page, *other_pages = _pages(data, where)
-        if other_pages:
-            found, hint = f"{1 + len(other_pages)} pages", "save the page that is meant as a file of its own"
-            raise InputError(where, "pages", found, "one image", hint)
+        page, *others = _pages(data, where)
+        if others:
+            hint = "save the page that is meant as a file of its own"
+            raise InputError(where, "pages", f"{1 + len(others)} pages", "one image", hint)
     if data.startswith(PNG_SIGNATURE):
         check_png(data, where)  # OpenCV would decode the undamaged part of a damaged PNG
         if is_grey_png(data):
@@ -225,6 +210,13 @@ def _checked(image: NDArray[Any], where: str | Path) -> Image:
     if max(image.shape) > LONGEST_SIDE_PX:
         raise InputError(where, "size", f"{image.shape[1]} x {image.shape[0]} px", f"up to {LONGEST_SIDE_PX} px a side")
     return np.asarray(image)
+
+
+def check_size(image: Image, size: tuple[int, int], where: str | Path, reason: str) -> None:
+    """Check that an image has the ``size`` (width, height) [px]; the error at ``where`` says its ``reason``."""
+    if image.shape != size[::-1]:
+        found = f"{image.shape[1]} x {image.shape[0]} px"
+        raise InputError(where, "size", found, f"{size[0]} x {size[1]} px, {reason}")
 
 
 def bits_of(images: Iterable[Image]) -> int:

@@ -47,11 +47,7 @@ def numbers_of_npy(data: bytes, where: str | Path, *, tables: bool = False) -> N
 
 
 def decode_npy(data: bytes, where: str | Path) -> NDArray[Any]:
-    """Return the map (H, W) or (H, W, channels) in the bytes of an ``.npy`` file; messages name ``where``.
-
-    Raises InputError if the bytes are not a complete file, the values are not of :data:`DTYPES`, little-endian, or a
-    side is longer than :data:`~mitsim.sensor.png.LONGEST_SIDE_PX`.
-    """
+    """Return the map (H, W) or (H, W, channels), of little-endian :data:`DTYPES`, in the bytes of an ``.npy`` file."""
     values = numbers_of_npy(data, where)
     if values.dtype.newbyteorder("=").name not in DTYPES or values.dtype.byteorder == ">":
         raise InputError(where, "dtype", values.dtype.str, ", ".join(DTYPES))

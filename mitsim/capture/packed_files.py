@@ -1,8 +1,4 @@
-"""Make the files of a capture's folder in memory: their bytes by path, and the index with their checksums.
-
-Signal chain: capture -> documents of calibration, settings and pose; images as PNG; maps as ``.npy`` -> SHA-256 of each
-file -> ``capture.json``, the index.
-"""
+"""Make the files of a capture's folder in memory: their bytes by path, and the index with their SHA-256."""
 
 from __future__ import annotations
 
@@ -48,10 +44,8 @@ def packed(
 
     Parameters
     ----------
-    capture, folder, vendor
-        Capture to write, folder that messages name, and the maker's files by name.
-    truth
-        True values by camera.
+    capture, folder, vendor, truth
+        Capture to write, folder that messages name, the maker's files by name, and true values by camera.
     """
     folder = Path(folder)
     extra = {("vendor", name): data for name, data in (vendor or {}).items()}
@@ -69,9 +63,8 @@ def packed(
     for camera, stack in capture.images.items():
         _check_name(camera, folder, "images", "the name of a camera")
         if stack.dtype not in (np.uint8, np.uint16) or stack.size == 0 or len(stack) > 1000:
-            raise InputError(
-                folder, f"images.{camera}", f"{stack.dtype} {stack.shape}", "1 to 1000 uint8 or uint16 images"
-            )
+            found = f"{stack.dtype} {stack.shape}"
+            raise InputError(folder, f"images.{camera}", found, "1 to 1000 uint8 or uint16 images")
         paths = [f"images/{camera}_{frame:03d}.png" for frame in range(len(stack))]
         for path, image in zip(paths, stack, strict=True):
             check_image(image, [], capture.bits, folder / path)
@@ -83,12 +76,9 @@ def packed(
             )
     for name, values in capture.derived.items():
         if np.isinf(values).any() or values.size == 0 or max(values.shape) > LONGEST_SIDE_PX:
-            raise InputError(
-                folder,
-                f"derived.{name}",
-                f"shape {values.shape}, empty, too large or with infinite numbers",
-                f"a map of finite numbers or NaN, up to {LONGEST_SIDE_PX} a side",
-            )
+            found = f"shape {values.shape}, empty, too large or with infinite numbers"
+            allowed = f"a map of finite numbers or NaN, up to {LONGEST_SIDE_PX} a side"
+            raise InputError(folder, f"derived.{name}", found, allowed)
         path = f"derived/{name}.npy"
         files[path] = encode_npy(values)
         entries.append(
@@ -113,12 +103,8 @@ def packed(
         "bits": capture.bits,
         "units": UNITS,
         "frame": FRAME,
-        "software": {
-            "mitsim": __version__,
-            "python": platform.python_version(),
-            "numpy": np.__version__,
-            "opencv": cv2.__version__,
-        },
+        "software": {"mitsim": __version__, "python": platform.python_version()}
+        | {"numpy": np.__version__, "opencv": cv2.__version__},
         "files": entries,
     }
     index["checksum"] = content_checksum(index)
@@ -130,17 +116,7 @@ def packed(
 def check_image(
     image: NDArray[np.unsignedinteger[Any]], frames: list[NDArray[np.unsignedinteger[Any]]], bits: int, where: Path
 ) -> None:
-    """Check that an image has the type of the earlier images, and no value above its bits.
-
-    Raises InputError if it does not; the error names the file ``where``.
-
-    Parameters
-    ----------
-    image
-        (H, W) [DN].
-    frames, bits, where
-        Earlier images of the camera, bits of a grey level, and file that messages name.
-    """
+    """Check that an image [DN] has the type of the earlier images ``frames``, and no value above its bits."""
     if frames and frames[0].dtype != image.dtype:
         raise InputError(where, "dtype", image.dtype, f"{frames[0].dtype}, as in the first frame")
     if image.max() > 2**bits - 1:
@@ -159,6 +135,5 @@ def _json(value: Any, folder: Path, field: str) -> bytes:
             raise ValueError("tuples, or keys that are not text")
         return (text + "\n").encode()
     except (TypeError, ValueError, RecursionError) as error:
-        raise InputError(
-            folder, field, f"a value that JSON cannot hold ({error})", "texts, finite numbers, lists, tables, null"
-        ) from None
+        found = f"a value that JSON cannot hold ({error})"
+        raise InputError(folder, field, found, "texts, finite numbers, lists, tables, null") from None

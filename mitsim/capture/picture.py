@@ -44,16 +44,8 @@ def draw_images(
 ) -> NDArray[np.object_]:
     """Draw one image of every camera, all of one scale; return their axes.
 
-    Raises InputError if there is no such image, or another number of axes.
-
-    Parameters
-    ----------
-    stacks, full_scale
-        By camera name, (frames, H, W) [DN]; value of a saturated pixel [DN].
-    caption, ax
-        Sensor and source, for the titles; axes, one for each camera, None for those of a new figure.
-    image
-        Number of the image, from 0; negative numbers count from the last.
+    ``stacks`` are (frames, H, W) [DN] by camera name, ``full_scale`` the value of a saturated pixel [DN], and ``ax``
+    the axes for the cameras, None for those of a new figure. Negative numbers of an ``image`` count from the last.
     """
     count = min(len(stack) for stack in stacks.values())
     if not -count <= image < count:
@@ -71,12 +63,7 @@ def draw_images(
                 mask = np.ma.masked_equal(saturated, False)
                 axes.imshow(mask, cmap=ListedColormap([VERMILION]), interpolation="nearest")
                 label = f"saturated, {full_scale} DN: {percent(float(saturated.mean()))} of the pixels"
-                layout = {
-                    "loc": "upper left",
-                    "bbox_to_anchor": (0.0, -0.02),
-                    "borderaxespad": 0.0,
-                    "handlelength": 1.1,
-                }
+                layout = {"loc": "upper left", "bbox_to_anchor": (0.0, -0.02), "borderaxespad": 0, "handlelength": 1.1}
                 axes.legend(handles=[Patch(facecolor=VERMILION, label=label)], **layout)
             number = f", image {image % count + 1} of {count}" if count > 1 else ""
             _title(axes, f"{name}{number}: {caption}")
@@ -87,25 +74,14 @@ def draw_images(
 def draw_maps(
     maps: Mapping[str, NDArray[np.float32]], units: Mapping[str, str], caption: str, ax: Any
 ) -> NDArray[np.object_]:
-    """Draw maps in colours; return their axes.
-
-    Raises InputError if the number of axes is another.
-
-    Parameters
-    ----------
-    maps, units
-        By name, (H, W), NaN where a value is missing, and their units.
-    caption, ax
-        As of :func:`draw_images`.
-    """
+    """Draw maps (H, W), NaN where a value is missing, in colours as :func:`draw_images` does; return their axes."""
     rows, columns = next(iter(maps.values())).shape
     size = ((_WIDTH_IN + _SCALE_IN) * len(maps), _WIDTH_IN * rows / columns + _LABELS_IN)
     with axes_for(ax, (1, len(maps)), size) as grid:
         for axes, (name, values) in zip(grid[0], maps.items(), strict=True):
             low, high = depth_limits(values)
-            shown = axes.imshow(
-                np.ma.masked_invalid(values), cmap=SEQUENTIAL, vmin=low, vmax=high, interpolation="nearest"
-            )
+            known = np.ma.masked_invalid(values)
+            shown = axes.imshow(known, cmap=SEQUENTIAL, vmin=low, vmax=high, interpolation="nearest")
             side_bar(axes, shown, f"{name} [{units[name]}]")
             _title(axes, f"{name} by the device: {caption}")
     return np.asarray(grid[0])

@@ -8,6 +8,7 @@ from __future__ import annotations
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -54,18 +55,10 @@ class Truth:
 
 def encode_exr(truth: Truth) -> bytes:
     """Return an OpenEXR image of 32-bit float channels; the header has the names of the features and the units."""
-    channels = {
-        "distance": truth.distance,
-        "Z": truth.depth,
-        "feature": truth.feature,
-        "normal.X": truth.normal[..., 0],
-        "normal.Y": truth.normal[..., 1],
-        "normal.Z": truth.normal[..., 2],
-        "projector.U": truth.projector[..., 0],
-        "projector.V": truth.projector[..., 1],
-        "lit": truth.lit,
-        "indirect": truth.indirect,
-    }
+    channels: dict[str, NDArray[Any]] = {"distance": truth.distance, "Z": truth.depth, "feature": truth.feature}
+    channels |= {f"normal.{axis}": truth.normal[..., index] for index, axis in enumerate("XYZ")}
+    channels |= {f"projector.{axis}": truth.projector[..., index] for index, axis in enumerate("UV")}
+    channels |= {"lit": truth.lit, "indirect": truth.indirect}
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
@@ -122,16 +115,10 @@ def _read_exr(file: Path) -> Truth:
         feature = known["feature"].astype(np.int16)
         if feature.max(initial=-1) >= len(names):
             raise InputError(file, "feature", int(feature.max()), f"-1 to {len(names) - 1}, a line of `features`")
-        return Truth(
-            known["distance"],
-            known["Z"],
-            np.stack([known["normal.X"], known["normal.Y"], known["normal.Z"]], axis=-1),
-            feature,
-            names,
-            np.stack([known["projector.U"], known["projector.V"]], axis=-1),
-            known["lit"] > 0,
-            known["indirect"],
-        )
+        normal = np.stack([known[f"normal.{axis}"] for axis in "XYZ"], axis=-1)
+        projector = np.stack([known[f"projector.{axis}"] for axis in "UV"], axis=-1)
+        distance, depth, lit, indirect = known["distance"], known["Z"], known["lit"] > 0, known["indirect"]
+        return Truth(distance, depth, normal, feature, names, projector, lit, indirect)
     except KeyError as error:
         raise InputError(file, "", f"no {error}", "a true image of mitsim render --truth") from None
     except RuntimeError as error:

@@ -34,17 +34,16 @@ def written_frame(capture: Capture, frame: str, where: str | Path) -> WrittenFra
         raise InputError("--points-in", "", repr(frame), " | ".join(FRAMES))
     if frame == "sensor":
         return None
-    allowed = "a rigid transform, 4 x 4 by rows [mm]"
-    hint = "import a recording whose Link has a target, or omit --points-in"
+    field, allowed = f"settings.{_KEY}", "a rigid transform, 4 x 4 by rows [mm]"
     stored = capture.settings.get(_KEY)
     if stored is None:
-        raise InputError(where, f"settings.{_KEY}", "none: no workspace is known", allowed, hint)
+        hint = "import a recording whose Link has a target, or omit --points-in"
+        raise InputError(where, field, "none: no workspace is known", allowed, hint)
     try:
         matrix = _RIGID.validate_python(stored)
     except ValidationError:
-        raise InputError(
-            where, f"settings.{_KEY}", "a matrix that is not a rigid transform", allowed, "import the recording again"
-        ) from None
+        found = "a matrix that is not a rigid transform"
+        raise InputError(where, field, found, allowed, "import the recording again") from None
     target = ascii(str(capture.settings.get("link_target") or "workspace")[:80])  # one line of the header
     name = f"of the workspace {target} of the device's Link"
     return WrittenFrame(name, Transform.from_matrix(matrix).inverse().matrix())

@@ -73,8 +73,7 @@ class Cluster:
         Parameters
         ----------
         items, order, work, prepared
-            As of :meth:`~mitsim.running.executor.Executor.distribute`. The scheduler chooses
-            the worker, whatever it has prepared.
+            As of :meth:`~mitsim.running.executor.Executor.distribute`. The scheduler chooses the workers.
         """
         if not items:
             return
@@ -102,23 +101,17 @@ class Cluster:
 
 
 def connected(address: str) -> Any:
-    """Return a client of the Dask scheduler at an address.
-
-    Raises InputError if the address is not valid. Raises MissingEnvironmentError if ``distributed`` is not installed,
-    certificates are missing, or no scheduler answers.
-    """
+    """Return a client of the Dask scheduler at an address."""
     match = _ADDRESS.fullmatch(address)
     if match is None or not 0 < int(match[2]) < 65536:
-        raise InputError(
-            "--scheduler", "", repr(address), "tcp://HOST:PORT or tls://HOST:PORT, as dask scheduler prints"
-        )
+        allowed = "tcp://HOST:PORT or tls://HOST:PORT, as dask scheduler prints"
+        raise InputError("--scheduler", "", repr(address), allowed)
     try:
         import dask
         from distributed import Client
     except ImportError:
-        raise MissingEnvironmentError(
-            "--scheduler needs Dask, which is not installed: pip install 'mitsim[cluster]'"
-        ) from None
+        missing = "--scheduler needs Dask, which is not installed: pip install 'mitsim[cluster]'"
+        raise MissingEnvironmentError(missing) from None
     if match[1] == "tls":
         _check_certificates(address, dask.config.get("distributed.comm.tls", {}))
     try:
@@ -133,13 +126,12 @@ def _check_certificates(address: str, named: dict[str, Any]) -> None:
     """Reject a configuration of Dask without the files that TLS needs."""
     client = named.get("client") or {}
     files = {"ca-file": named.get("ca-file"), "client.cert": client.get("cert"), "client.key": client.get("key")}
-    missing = [
-        f"{key} ({value})" if value else key for key, value in files.items() if not value or not is_file(str(value))
-    ]
-    if missing:
+    absent = {key: value for key, value in files.items() if not value or not is_file(str(value))}
+    if absent:
+        missing = ", ".join(f"{key} ({value})" if value else key for key, value in absent.items())
         raise MissingEnvironmentError(
             f"--scheduler {address}: Dask has no certificates: its configuration distributed.comm.tls has no file as "
-            + ", ".join(missing)
+            f"{missing}"
         )
 
 

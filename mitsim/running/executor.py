@@ -1,8 +1,7 @@
 """Distribute independent orders to processes on this machine or to the workers of a Dask scheduler.
 
 Signal chain: items -> orders, which are plain values -> each is worked on separately, anywhere and in any sequence ->
-items with results, as they are finished. Campaigns, many captures, virtual measurements, data sheets, validations of
-views and comparisons of sensors all use it.
+items with results, as they are finished.
 
 A result depends on its order alone, so the whole is the same for any number of workers. The caller keeps each result
 before it asks for the next, so a stop loses only the orders in work. A dead worker is replaced and its orders are
@@ -130,15 +129,9 @@ def finished_orders(
 ) -> Iterator[tuple[Item, Result]]:
     """Submit waiting items while there is room, and yield each with its result as it is finished.
 
-    Parameters
-    ----------
-    waiting, running
-        Items that wait, and those in work by their futures; both are changed. After an error, or when given up,
-        ``running`` has the items without a result. Their futures are cancelled.
-    submit, next_of
-        Start the work on an item; return the index of the next among those that wait, None without room.
-    given_up, idle_s, idle
-        When no item was finished for ``idle_s`` [s], ends if given up, and else calls ``idle``.
+    ``next_of`` returns the index of the next among those that wait, None without room. When no item was finished for
+    ``idle_s`` [s], ends if given up, and else calls ``idle``. After that, or an error, the futures in ``running`` are
+    cancelled, and it has the items without a result.
     """
     try:
         while waiting or running:
@@ -182,11 +175,10 @@ class Pool:
         items, order, work, prepared
             As of :meth:`Executor.distribute`.
         """
-        name_of, deaths = prepared or (lambda _: (None, None)), 0
+        name_of, deaths, chosen = prepared or (lambda _: (None, None)), 0, 0
         waiting: deque[Item] = deque(items)
         running: dict[Future[Result], Item] = {}
         worker_of: dict[Future[Result], int] = {}
-        chosen = 0
 
         def next_of() -> int | None:
             nonlocal chosen
@@ -214,10 +206,9 @@ class Pool:
                     running.clear()
                     deaths += 1
                     if deaths > DEATHS:
-                        raise MissingEnvironmentError(
-                            f"--processes {self.processes}: {deaths} of them died in a row, maybe for lack of memory; "
-                            "finished work is kept: use fewer, and run the same command again"
-                        ) from None
+                        found = f"{deaths} of them died in a row, maybe for lack of memory"
+                        hint = "finished work is kept: use fewer, and run the same command again"
+                        raise MissingEnvironmentError(f"--processes {self.processes}: {found}; {hint}") from None
                     say("a worker process died; its work is repeated")
         except KeyboardInterrupt:
             self._end()
@@ -235,9 +226,7 @@ class Pool:
 
     def close(self, wait: bool = True) -> None:
         """End the processes after their current orders; ``wait`` for these."""
-        workers = list(self._workers.values())
-        self._workers.clear()
-        self._prepared.clear()
+        workers, self._workers, self._prepared = list(self._workers.values()), {}, {}
         for worker in workers:
             worker.shutdown(wait=False, cancel_futures=True)
         for worker in workers if wait else ():

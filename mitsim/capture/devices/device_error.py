@@ -10,14 +10,8 @@ from characterisation.files.errors import MissingEnvironmentError
 class DeviceError(MissingEnvironmentError):
     """A connected device that fails, or that disappears while it is used.
 
-    Parameters
-    ----------
-    where, operation
-        The device, its port and, if it applies, the axis; the request to it.
-    found, expected
-        Its reaction, and the correct one.
-    hint
-        What to do about it.
+    ``where`` names the device, its port and, if it applies, the axis; ``operation`` is the request to it, ``found`` its
+    reaction, ``expected`` the correct one, and ``hint`` what to do about it.
     """
 
     def __init__(self, where: str, operation: str, found: str, expected: str, hint: str = "") -> None:
@@ -30,17 +24,7 @@ class DeviceError(MissingEnvironmentError):
 
 
 def check_open(where: str, operation: str, closed: bool, fault: str, again: str = "Open it again") -> None:
-    """Reject a device that was closed, or that failed.
-
-    Raises DeviceError, naming the rejected operation.
-
-    Parameters
-    ----------
-    where, operation
-        Name of the device in messages, and operation that is requested.
-    closed, fault, again
-        Whether it was closed; operation at which it failed, "" for no failure; what to do.
-    """
+    """Reject an operation of a device that was ``closed``, or failed at the operation ``fault``, "" for none."""
     if closed or fault:
         found = f"a device that has failed, at {fault}" if fault else "a device that was closed"
         raise DeviceError(where, operation, found, "an open device", again)

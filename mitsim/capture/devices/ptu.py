@@ -182,11 +182,8 @@ class PanTiltUnit:
     def _reply(self, command: str) -> str:
         """Send a command and return its reply, which begins with a star or an exclamation mark."""
         if stray := self._checked(self._line.unread(), command).strip():
-            found, hint = (
-                f"an unexpected line, {shown(stray)}",
-                "Check for another program on this line, or a late reply",
-            )
-            raise self._fault(command, found, "silence before a command", hint)
+            hint = "Check for another program on this line, or a late reply"
+            raise self._fault(command, f"an unexpected line, {shown(stray)}", "silence before a command", hint)
         self._line.send(command.encode() + b" ")
         deadline = self._line.clock.now() + self._connection.reply_timeout_s
         while True:

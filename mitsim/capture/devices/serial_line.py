@@ -159,10 +159,8 @@ class SerialLine:
         try:
             yield
         except OSError as error:  # includes pyserial's SerialException
-            found, hint = (
-                f"the port disconnected ({error})",
-                "Check the cable and the device's power, then open it again",
-            )
+            hint = "Check the cable and the device's power, then open it again"
+            found = f"the port disconnected ({error})"
             raise PortGoneError(self.where, operation, found, "a connected port", hint) from None
 
 

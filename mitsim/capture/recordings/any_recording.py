@@ -1,9 +1,7 @@
 """Read any supported recording as a capture.
 
-Signal chain: path -> kind (:mod:`mitsim.capture.recordings.recognise`) -> the kind's reader -> capture, and the
-original files unchanged.
-
-A kind is one entry of :data:`KINDS`.
+Signal chain: path -> kind (:mod:`mitsim.capture.recordings.recognise`) -> its reader in :data:`KINDS` -> capture, and
+the original files unchanged.
 """
 
 from __future__ import annotations
@@ -62,15 +60,9 @@ def _read_ensenso(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, 
 
 
 def _read_images(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
-    if options.sensor is None:
-        raise InputError(
-            path,
-            "",
-            "a folder of images",
-            "the rig that took them: --sensor my.toml",
-            "for a plain stereo pair --calibration suffices",
-        )
-    source = options.sensor
+    if (source := options.sensor) is None:
+        hint = "for a plain stereo pair --calibration suffices"
+        raise InputError(path, "", "a folder of images", "the rig that took them: --sensor my.toml", hint)
     rig = at_size_of_images(path, lambda size: load_sensor(source, "decoding", size))
     if options.images:
         rig = replace(rig, images={**(rig.images or {}), **options.images})
@@ -97,8 +89,7 @@ def _read_cloud(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, by
 def _read_array(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
     """Read an array of rows x columns as depths, and one of rows x columns x 3 as points."""
     is_depth = map_in(read_bounded(path), path, frame_of(options.frame, path)).ndim == 2
-    unused = ("unit", "axes", "link") if is_depth else ("scale_mm", "invalid", "along", "frame")
-    for name in unused:
+    for name in ("unit", "axes", "link") if is_depth else ("scale_mm", "invalid", "along", "frame"):
         if getattr(options, name) is not None:
             found = f"{_option(name)} for an array of {'depths' if is_depth else 'points'}"
             allowed = "--scale, --invalid, --along and --frame of depths; --unit, --axes and --link of points"

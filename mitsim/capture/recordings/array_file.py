@@ -43,7 +43,6 @@ def arrays_of_npz(data: bytes, where: str | Path) -> dict[str, NDArray[Any]]:
 
     Raises InputError if the bytes are not a complete archive, or too large.
     """
-    allowed = "an .npz file of NumPy"
     try:
         with ZipFile(io.BytesIO(data)) as packed:
             unpacked = sum(entry.file_size for entry in packed.infolist())
@@ -54,19 +53,16 @@ def arrays_of_npz(data: bytes, where: str | Path) -> dict[str, NDArray[Any]]:
         raise
     except Exception as error:  # a damaged archive raises many types of errors
         reason = " ".join(str(error).split())[:120] or type(error).__name__
-        raise InputError(where, "", f"an unreadable file ({reason})", allowed) from None
-    out: dict[str, NDArray[Any]] = {}
-    for name, member in members.items():
-        if member.startswith(NPY_MAGIC) and b"'|O'" not in member[:200]:
-            out[name.removesuffix(".npy")] = numbers_of_npy(member, f"{where}: {name}", tables=True)
-    return out
+        raise InputError(where, "", f"an unreadable file ({reason})", "an .npz file of NumPy") from None
+    return {
+        name.removesuffix(".npy"): numbers_of_npy(member, f"{where}: {name}", tables=True)
+        for name, member in members.items()
+        if member.startswith(NPY_MAGIC) and b"'|O'" not in member[:200]
+    }
 
 
 def arrays_in(data: bytes, where: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of an ``.npy`` or ``.npz`` file by name; that of the first has none.
-
-    Raises InputError if the file cannot be read.
-    """
+    """Return the arrays of an ``.npy`` or ``.npz`` file by name; that of the first has none."""
     return {"": numbers_of_npy(data, where, tables=True)} if data.startswith(NPY_MAGIC) else arrays_of_npz(data, where)
 
 
@@ -78,8 +74,7 @@ def map_in(data: bytes, where: Path, frame: int | None = None) -> NDArray[Any]:
 def map_among(arrays: dict[str, NDArray[Any]], where: Path, frame: int | None = None) -> NDArray[Any]:
     """Return the points (rows, columns, 3), or else the depths (rows, columns), among arrays.
 
-    ``frame`` is the number, from 0, of one of several images of depths, (frames, rows, columns). Raises InputError if
-    the file has neither, several arrays of depths of which none is named so, or no such frame.
+    ``frame`` is the number, from 0, of one of several images of depths, (frames, rows, columns).
     """
     arrays = _large(arrays)
     points = points_among(arrays, where)
@@ -93,11 +88,9 @@ def map_among(arrays: dict[str, NDArray[Any]], where: Path, frame: int | None = 
     called = {name: array for name, array in depths.items() if "depth" in name.lower()}
     named = called or depths
     if len(named) != 1 or (points is not None and not called):
-        shapes = ", ".join(f"{name} {' x '.join(map(str, array.shape))}".strip() for name, array in arrays.items())[
-            :300
-        ]
+        shapes = ", ".join(f"{name} {' x '.join(map(str, array.shape))}".strip() for name, array in arrays.items())
         allowed = "points of rows x columns x 3, or depths of rows x columns"
-        raise InputError(where, "shape", shapes or "no arrays", allowed)
+        raise InputError(where, "shape", shapes[:300] or "no arrays", allowed)
     depth = next(iter(named.values()))
     images = depth if depth.ndim == 3 else depth[None]
     return np.asarray(images[chosen_frame(frame, len(images), where, "images of depths")])
@@ -128,13 +121,8 @@ def points_among(arrays: dict[str, NDArray[Any]], where: str | Path) -> NDArray[
     numbers of rows or colours precede x, y and z in the array; the error names the file ``where``.
     """
     arrays = _large(arrays)
-    fields = {
-        name: array[name]
-        for array in arrays.values()
-        if array.dtype.names
-        for name in array.dtype.names
-        if name in "xyzXYZ"
-    }
+    tables = [array for array in arrays.values() if array.dtype.names]
+    fields = {name: table[name] for table in tables for name in table.dtype.names or () if name in "xyzXYZ"}
     real = {name: array for name, array in (arrays | fields).items() if array.dtype.kind in "fiu"}
     named = [next((array for name, array in real.items() if name.lower() == axis), None) for axis in "xyz"]
     first = named[0]

@@ -152,10 +152,7 @@ def _repeated(values: NDArray[np.floating], seen: NDArray[np.bool_]) -> NDArray[
 
 
 def _is_no_depth(z: float, others: NDArray[np.floating]) -> bool:
-    """Return whether a z that is repeated is none of a surface, beside the z of the ``others``.
-
-    A face of a part in the part's own frame may lie at z = 0.
-    """
+    """Return whether a repeated z is none of a surface, beside the z of the ``others``: a face may lie at z = 0."""
     if not len(others):
         return False
     behind = z < 0 < float(np.percentile(others, 1))
@@ -196,9 +193,8 @@ def scale_to_mm(points: NDArray[np.floating], path: Path, unit: str | None = Non
     if unit is None and distance > NEITHER_ABOVE:
         found = f"points at a median distance of {distance:.4g}, in a unit that the file does not state"
         allowed = f"up to {METRES_UNDER:g} in m, or {NEITHER_ABOVE:g} in mm, from the sensor at the origin"
-        raise InputError(
-            path, "x, y, z", found, allowed, "name the unit: --unit um; or subtract an offset of the coordinates"
-        )
+        of_unit = "name the unit: --unit um; or subtract an offset of the coordinates"
+        raise InputError(path, "x, y, z", found, allowed, of_unit)
     unit = unit or ("m" if distance < METRES_UNDER else "mm")
     farthest = float(np.abs(seen).max()) * LENGTHS_MM[unit]
     if farthest > FARTHEST_MM:
@@ -208,10 +204,7 @@ def scale_to_mm(points: NDArray[np.floating], path: Path, unit: str | None = Non
 
 
 def near_note(distance: float, option: str) -> str:
-    """Return a warning about a median distance in a file's numbers, taken as mm, that may be cm; empty without doubt.
-
-    ``option`` says how to state the unit: ``--unit cm``.
-    """
+    """Return a warning about a median distance, taken as mm, that may be cm, and its ``option``; else nothing."""
     if not METRES_UNDER <= distance < _NEAR_MM:
         return ""
     return f"a median distance of {distance:.4g} is taken as mm, as no unit is stated: if these are cm, say {option}"
@@ -225,22 +218,17 @@ _INFINITE = re.compile(rb"(?i)([-+]?)1\.#inf[0-9]*")
 
 
 def number_words(text: bytes) -> list[str]:
-    """Return the words of a text of numbers, which ``float`` reads.
-
-    Raises UnicodeDecodeError if the text is not ASCII; it is a ``ValueError``.
-    """
+    """Return the words of a text of numbers, which ``float`` reads; raise a ValueError if it is not ASCII."""
     if b"#" in text or b"(" in text:
         text = _INFINITE.sub(rb"\1inf", _NAN.sub(b"nan", text))
     return text.decode("ascii").split()
 
 
 def check_points_first(table: NDArray[Any], path: str | Path, hint: str) -> None:
-    """Check that a table (n, columns) without names has x, y and z first.
+    """Check that a table (n, columns) without names has x, y and z first, not counts or colours; ``hint`` if not.
 
     Numbers of a row, or of a row and a column, are whole, and three of a colour up to 255; three columns after them
-    that are not, or that do not vary, are x, y and z. A table of very many columns is a map of depths. Raises
-    InputError if the first one or two columns count, the first three are colours, or the columns are too many. ``hint``
-    says what to do about the first two.
+    that are not, or that do not vary, are x, y and z. A table of very many columns is a map of depths.
     """
     if table.shape[1] > _MOST_COLUMNS:
         found = f"{table.shape[1]} columns without names, as of a map of depths"
@@ -253,9 +241,8 @@ def check_points_first(table: NDArray[Any], path: str | Path, hint: str) -> None
     for count in (1, 2, 3):
         if table.shape[1] < count + 3:
             continue
-        if count == 3 and not (
-            ((sample[:, :3] >= 0) & (sample[:, :3] <= 255)).all() and np.abs(sample[:, 3:6]).max() > 1
-        ):
+        of_colour = ((sample[:, :3] >= 0) & (sample[:, :3] <= 255)).all()
+        if count == 3 and not (of_colour and np.abs(sample[:, 3:6]).max() > 1):
             continue  # whole coordinates, or normals after them
         lengths = (~whole)[count : count + 3].sum() >= 2 and not (whole & varies)[count : count + 3].any()
         if whole[:count].all() and varies[:count].any() and lengths:

@@ -54,8 +54,7 @@ _SAMPLE = 200
 def points_of_text(data: bytes, path: Path) -> tuple[NDArray[np.float64], str | None]:
     """Return the points (n, 3) of a text, and their unit of length if the text states one.
 
-    Raises InputError if the lines are not equally many numbers, three or more, their names lack x, y or z, or columns
-    without names seem to count rows.
+    Raises InputError if lines differ in their numbers, names lack x, y or z, or columns without names seem to count.
     """
     if len(data) > _LARGEST:
         raise InputError(path, "", f"{len(data):,} bytes of text", f"at most {_LARGEST:,}", "save it as PLY")
@@ -70,21 +69,17 @@ def points_of_text(data: bytes, path: Path) -> tuple[NDArray[np.float64], str | 
         if rows and len(number_words(rows[0].translate(_SPACES))) == 1:  # the number of points
             rows = rows[1:]
         rows = _with_points(rows)
-        mixed = next((row for row in rows[:_SAMPLE] if _OTHER_MARK.search(row)), quoted and quoted[0])
-        if mixed:
-            raise ValueError(
-                f"{mixed[:60].decode('ascii', 'replace')!r}: a comma that is no separator, as of thousands"
-            )
+        if mixed := next((row for row in rows[:_SAMPLE] if _OTHER_MARK.search(row)), quoted and quoted[0]):
+            row = mixed[:60].decode("ascii", "replace")
+            raise ValueError(f"{row!r}: a comma that is no separator, as of thousands")
         columns = len(number_words(rows[0].translate(_SPACES))) if rows else 0
         words = number_words(b"\n".join(rows).translate(_SPACES))
         if columns < 3 or len(words) != columns * len(rows):
             raise ValueError(f"{len(words)} numbers in {len(rows)} lines")
         table = np.array(words, np.float64).reshape(len(rows), columns)
     except ValueError as error:
-        reason = " ".join(str(error).split())[:120]
-        raise InputError(
-            path, "", f"text that is no cloud ({reason})", "lines of x, y and z, and equal columns"
-        ) from None
+        found = f"text that is no cloud ({' '.join(str(error).split())[:120]})"
+        raise InputError(path, "", found, "lines of x, y and z, and equal columns") from None
     names = next((titles for line in heads if (titles := _names(line, columns))), [])
     unit = _unit(heads, path)
     if not names:
@@ -110,8 +105,7 @@ def _names(line: str, columns: int) -> list[str]:
     text = _BRACKETS.sub("", line).lower()
     comment = text.startswith(("#", "/"))
     text = text.strip("#/ \t")
-    words = _words(text)
-    if comment and len(words) != columns:
+    if len(words := _words(text)) != columns and comment:
         words = _words(_BEFORE_NAMES.sub("", text))
     names = [match[1] if (match := _NAME.fullmatch(word)) else word for word in words]
     if len(set("xyz") & set(names)) < 2:
@@ -126,17 +120,11 @@ def _words(text: str) -> list[str]:
 
 
 def _unit(heads: list[str], path: Path) -> str | None:
-    """Return the unit of length that the lines before the numbers state; None without one.
-
-    Raises InputError if x, y and z have several.
-    """
+    """Return the unit of length, the same of x, y and z, that the lines before the numbers state; None without one."""
     for line in heads:
         below = [word.strip("[]()") for word in _words(line.lower())]
-        stated = (
-            below
-            if set(below) <= set(UNITS_MM)
-            else [remark or suffix for remark, suffix in _OF_AXIS.findall(line.lower())]
-        )
+        of_axes = [remark or suffix for remark, suffix in _OF_AXIS.findall(line.lower())]
+        stated = below if set(below) <= set(UNITS_MM) else of_axes
         units = {unit_named(word) for word in stated if word in UNITS_MM}
         if len(units) > 1:
             raise InputError(path, "", f"coordinates in {' and '.join(sorted(units))}", "one unit of length")
@@ -150,9 +138,8 @@ def _with_points(rows: list[bytes]) -> list[bytes]:
     sample = rows[:_SAMPLE]
     if _has_decimal_commas(sample):
         rows = [row.replace(b",", b".") for row in rows]
-    mark = next(
-        (separator for separator in (b";", b",", b"\t") if any(separator in row for row in rows[:_SAMPLE])), None
-    )
+    separators = (b";", b",", b"\t")
+    mark = next((one for one in separators if any(one in row for row in rows[:_SAMPLE])), None)
     if mark is None or not any(mark + mark in row or row.startswith(mark) or row.endswith(mark) for row in rows):
         return rows
     count = max(row.rstrip(mark).count(mark) for row in sample)

@@ -56,17 +56,15 @@ def read_depth_image(path: str | Path, options: ReadOptions) -> Capture:
     if of_disparities or is_disparity(path.stem):
         raise disparities(path)
     image, beside, unit_mm = _levels(path, frame)
-    scale_mm, invalid = options.scale_mm or unit_mm, options.invalid
+    scale_mm, invalid = options.scale_mm or unit_mm, options.invalid or 0
     if image.dtype == np.uint8:
         hint = "an 8-bit picture has lost its depths: save the device's 16 bits"
         raise InputError(path, "depth", "8 bits", "16 bits", hint)
-    settings: dict[str, Any] = {"imported_from": path.name}
-    if image.dtype.kind == "f":
-        invalid = 0 if invalid is None else invalid
-    missing, warnings = missing_depths(image, invalid or 0)
+    missing, warnings = missing_depths(image, invalid)
     median = 0.0 if missing.all() else float(np.median(image[~missing]))
     in_metres = image.dtype.kind == "f" and median < METRES_UNDER
-    scale_mm, invalid, assumed = scale_mm or (1000.0 if in_metres else 1.0), invalid or 0, scale_mm is None
+    scale_mm, assumed = scale_mm or (1000.0 if in_metres else 1.0), scale_mm is None
+    settings: dict[str, Any] = {"imported_from": path.name}
     settings |= {"depth_scale_mm": float(scale_mm), "depth_invalid": int(invalid)}
     if assumed and not in_metres and (note := near_note(median, "--scale 10")):
         warnings.append(note)
@@ -89,7 +87,7 @@ def read_depth_image(path: str | Path, options: ReadOptions) -> Capture:
         check_scale(read.depth_scales, calibration)
         if not beside and not read.depth_scales:
             check_scale(scale_by_folder(path), path.parent.parent)
-    return depth_capture(depth, read, path, settings, camera=options.camera, sensor=options.named)
+    return depth_capture(depth, read, path, settings, options)
 
 
 def missing_depths(image: NDArray[Any], invalid: int = 0) -> tuple[NDArray[np.bool_], list[str]]:
@@ -118,12 +116,9 @@ def missing_depths(image: NDArray[Any], invalid: int = 0) -> tuple[NDArray[np.bo
         seen = image[~missing]
         farthest = seen.max()
         same = (image == farthest) & ~missing
-        nearer_depths = seen[seen < farthest]
-        if (
-            nearer_depths.size
-            and same.sum() >= _MARKED * image.size
-            and float(farthest) > FAR_BEYOND * float(np.median(nearer_depths)) > 0
-        ):
+        nearer = seen[seen < farthest]
+        many = nearer.size and same.sum() >= _MARKED * image.size
+        if many and float(farthest) > FAR_BEYOND * float(np.median(nearer)) > 0:
             leave_out(same, f"the same depth of {farthest:g}, far beyond all others")
     return missing, warnings
 
@@ -148,31 +143,15 @@ def _levels(path: Path, frame: int | None) -> tuple[NDArray[Any], dict[str, floa
 
 
 def depth_capture(
-    depth: Depth,
-    calibrated: Calibrated,
-    where: Path,
-    settings: dict[str, Any],
-    *,
-    camera: str | None = None,
-    sensor: str | None = None,
+    depth: Depth, calibrated: Calibrated, where: Path, settings: dict[str, Any], options: ReadOptions
 ) -> Capture:
-    """Return the capture of a map of depths.
+    """Return the capture of a map of depths (H, W) along the axis of the camera [mm], NaN where missing.
 
-    Raises InputError if no pixel has a depth, a depth is no measurement, or the size of the map differs from the
-    camera's.
-
-    Parameters
-    ----------
-    depth, where
-        (H, W) along the axis of the camera [mm], NaN where missing; file of the map, for messages.
-    calibrated, settings
-        The cameras, and records of the import.
-    camera, sensor
-        Name of the camera, by default the first; that of the sensor, by default of the calibration, or
-        ``depth-camera``.
+    The camera is by default the first; ``settings`` are records of the import. Raises InputError if no pixel has a
+    depth, a depth is no measurement, or the size of the map differs from the camera's.
     """
     height, width = depth.shape
-    name, eye = camera_of(calibrated, camera, (width, height), where)
+    name, eye = camera_of(calibrated, options.camera, (width, height), where)
     seen = depth[~np.isnan(depth)]
     if not seen.size:
         raise InputError(where, "", "no pixel with a depth", "an image with some depths")
@@ -183,7 +162,7 @@ def depth_capture(
         settings = settings | {"warnings": [*settings.get("warnings", []), *calibrated.notes]}
     near, far = calibrated.range_mm or (None, None)
     return Capture(
-        sensor=sensor or calibrated.sensor or "depth-camera",
+        sensor=options.named or calibrated.sensor or "depth-camera",
         technology="depth_map",
         source="device",
         rig=Rig({name: eye}, calibrated.rig.projector),

@@ -60,11 +60,7 @@ class RecordedFrame:
 
 
 def read_frames(files: dict[str, Path], frame: int | None) -> dict[str, RecordedFrame]:
-    """Read the frame of one number from each stream, by the names of ``files``.
-
-    Raises InputError if a file is damaged, has no uncompressed frames, or lacks the frame; or if it has several and
-    none was chosen.
-    """
+    """Read the frame of one number from each stream, by the names of ``files``."""
     sequences = {name: _sequences(file) for name, file in files.items()}
     positions, count = _chosen(sequences, frame, next(iter(files.values())))
     return {name: _frame(file, positions[name], count) for name, file in files.items()}
@@ -101,12 +97,10 @@ def _sequences(file: Path) -> list[int]:
 
 def _chosen(sequences: dict[str, list[int]], frame: int | None, where: Path) -> tuple[dict[str, int], int]:
     """Return the position of the chosen frame in each stream, and the number of common frames."""
-    first_stream, *other_streams = (
-        {number: position for position, number in enumerate(numbers)} for numbers in sequences.values()
-    )
+    streams = [{number: position for position, number in enumerate(numbers)} for numbers in sequences.values()]
     if all(len(set(numbers)) == len(numbers) for numbers in sequences.values()):
-        common = [number for number in first_stream if all(number in stream for stream in other_streams)]
-        positions = [[stream[number] for stream in (first_stream, *other_streams)] for number in common]
+        common = [number for number in streams[0] if all(number in stream for stream in streams)]
+        positions = [[stream[number] for stream in streams] for number in common]
     else:
         positions = [[position] * len(sequences) for position in range(min(map(len, sequences.values())))]
     if not positions:

@@ -73,13 +73,8 @@ def recorded_streams(path: str | Path) -> dict[str, Path]:
         streams[stream] = file
     videos = [] if path.is_file() else sorted(file.name for file in path.iterdir() if file.suffix.lower() in _VIDEOS)
     if not streams and videos:
-        raise InputError(
-            path,
-            videos[0],
-            "a video",
-            "streams recorded by RecordMessage, .mcap",
-            "video is compressed with loss, which adds noise: record the streams themselves",
-        )
+        hint = "video is compressed with loss, which adds noise: record the streams themselves"
+        raise InputError(path, videos[0], "a video", "streams recorded by RecordMessage, .mcap", hint)
     if not streams:
         names = ", ".join(file.name for file in files[:6]) or "no .mcap"
         raise InputError(path, "", names, "files whose names say left, right, disparity or depth")
@@ -148,10 +143,7 @@ def _read_frames(streams: dict[str, Path], frame: int | None) -> dict[str, Recor
 
 
 def calibration_beside(path: Path) -> Path:
-    """Return the calibration in the folder of a recording.
-
-    Raises InputError if there is none, or more than one.
-    """
+    """Return the only calibration in the folder of a recording."""
     folder = path if path.is_dir() else path.parent
     if (folder / "calibration.json").is_file():
         return folder / "calibration.json"
@@ -167,15 +159,9 @@ def _stream_of(name: str) -> str | None:
     plain = re.sub("[^a-z0-9]", "", name.lower()).replace("depthai", "")
     if "rectified" in plain or "confidence" in plain:
         return None
-    for stream, words in {
-        "disparity": ("disparity",),
-        "depth": ("depth",),
-        "left": ("left", "camb"),
-        "right": ("right", "camc"),
-    }.items():
-        if any(word in plain for word in words):
-            return stream
-    return None
+    words = ("disparity", "depth", "left", "camb", "right", "camc")
+    word = next((word for word in words if word in plain), None)
+    return {"camb": "left", "camc": "right"}.get(word, word) if word else None
 
 
 def _derived(
@@ -191,15 +177,11 @@ def _derived(
             settings["warnings"] = warnings
     if "disparity" in frames:
         frame = frames["disparity"]
-        depth_bits = _subpixel_bits(frame, frames.get("depth"), calibration)
-        settings["subpixel_bits_from"] = (
-            "option" if bits is not None else "depth" if depth_bits is not None else "default"
-        )
-        if bits is None:
-            bits = (
-                depth_bits if depth_bits is not None else DEFAULT_SUBPIXEL_BITS if frame.image.dtype == np.uint16 else 0
-            )
-        settings["subpixel_bits"] = bits
+        by_depth = _subpixel_bits(frame, frames.get("depth"), calibration)
+        default = DEFAULT_SUBPIXEL_BITS if frame.image.dtype == np.uint16 else 0
+        origins = {"option": bits, "depth": by_depth, "default": default}
+        origin, bits = next((origin, number) for origin, number in origins.items() if number is not None)
+        settings |= {"subpixel_bits_from": origin, "subpixel_bits": bits}
         disparity = frame.image.astype(np.float32) / np.float32(2**bits)
         derived["disparity"] = np.where(disparity > 0, disparity, np.float32(np.nan))
     return derived
@@ -213,9 +195,8 @@ def _subpixel_bits(frame: RecordedFrame, depth: RecordedFrame | None, calibratio
     if not both.any():
         return None
     product = float(np.median(depth.image[both].astype(float) * frame.image[both]))
-    steps = np.log2(
-        product / (_matrix(frame, calibration)[0, 0] * float(np.linalg.norm(calibration.right_from_left.translation)))
-    )
+    baseline = float(np.linalg.norm(calibration.right_from_left.translation))
+    steps = np.log2(product / (_matrix(frame, calibration)[0, 0] * baseline))
     nearest = round(steps)
     return nearest if 0 <= nearest <= 8 and abs(steps - nearest) < np.log2(1 + _LOOSE) else None
 
@@ -224,6 +205,10 @@ def _matrix(frame: RecordedFrame, calibration: DepthaiCalibration) -> NDArray[np
     """Return K of a map's pixels: the frame's own, or that of the left camera at the frame's size."""
     height, width = frame.image.shape
     return frame.matrix if frame.matrix is not None else calibration.rig(width, height).reference.matrix
+
+
+def _without_skew(frame: RecordedFrame, calibration: DepthaiCalibration) -> NDArray[np.float64]:
+    return _matrix(frame, calibration) * [[1, 0, 1], [0, 1, 1], [1, 1, 1]]
 
 
 def _pair(left: RecordedFrame, right: RecordedFrame, calibration: DepthaiCalibration, where: Path) -> Rig:
@@ -240,8 +225,7 @@ def _disparity_rig(frame: RecordedFrame, calibration: DepthaiCalibration) -> Rig
     rig = calibration.rig(width, height)
     left, right = rig.cameras.values()
     pair = stereo_rectification(left, right)
-    K = _matrix(frame, calibration).copy()
-    K[0, 1] = K[1, 0] = 0.0
+    K = _without_skew(frame, calibration)
     return replace(rig, rectification=replace(pair, matrix_left=K, matrix_right=K))
 
 
@@ -249,6 +233,5 @@ def _depth_rig(frame: RecordedFrame, calibration: DepthaiCalibration) -> Rig:
     """Return the rectified camera of the depth map, which has no distortion, in the frame of the left camera."""
     height, width = frame.image.shape
     turned = stereo_rectification(*calibration.rig(width, height).cameras.values()).rotation_left
-    K = _matrix(frame, calibration).copy()
-    K[0, 1] = K[1, 0] = 0.0
+    K = _without_skew(frame, calibration)
     return Rig({"depth": Camera(K, np.zeros(5), width, height, Transform(turned.T, np.zeros(3)))})

@@ -18,7 +18,6 @@ The files do not state the following; real recordings confirm it:
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -27,25 +26,12 @@ import numpy as np
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
-from mitsim.capture.grey_image import Image, decode_grey
+from mitsim.capture.grey_image import Image, check_size, decode_grey
 from mitsim.capture.recordings.nxlib_calibration import NxLibTree, nxlib_rig, sensor_from_workspace
 from mitsim.capture.recordings.recording_files import chosen_frame, plain_name, recorded_files, recorded_names
 
 _CALIB = "_calib.json"
 _EXPECTED = "an Ensenso recording: a zip, an .enscam or a folder"
-
-
-@dataclass(frozen=True)
-class _ImageSet:
-    """Names of the files of one set: calibration, and images of each side in order."""
-
-    base: str
-    left: tuple[str, ...]
-    right: tuple[str, ...]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return (self.base + _CALIB, *self.left, *self.right)
 
 
 def read_ensenso(path: str | Path, *, dynamic: bool = True, frame: int | None = None) -> Capture:
@@ -61,17 +47,14 @@ def read_ensenso(path: str | Path, *, dynamic: bool = True, frame: int | None = 
     or the calibration lacks a field; the error names it.
     """
     path = Path(path)
-    chosen = _image_set(path, frame)
-    data = recorded_files(path, chosen.names)
-    tree = NxLibTree(data[chosen.names[0]], f"{path}/{chosen.names[0]}")
-    left, right = (
-        [decode_grey(data[name], f"{path}/{name}") for name in names] for names in (chosen.left, chosen.right)
-    )
+    calibration, *names = _image_set(path, frame)
+    data = recorded_files(path, [calibration, *names])
+    tree = NxLibTree(data[calibration], f"{path}/{calibration}")
+    images = [decode_grey(data[name], f"{path}/{name}") for name in names]
+    left, right = images[: len(images) // 2], images[len(images) // 2 :]
     height, width = left[0].shape
-    for name, image in zip((*chosen.left, *chosen.right), (*left, *right), strict=True):
-        if image.shape != (height, width):
-            found = f"{image.shape[1]} x {image.shape[0]} px"
-            raise InputError(f"{path}/{name}", "size", found, f"{width} x {height} px, as the left image")
+    for name, image in zip(names, images, strict=True):
+        check_size(image, (width, height), f"{path}/{name}", "as the left image")
     if tree.has("Sensor/Size") and tree.numbers("Sensor/Size", (2,)).tolist() != [width, height]:
         raise tree.fault("Sensor/Size", f"{width} x {height} px, as the images are; binned ones are not read")
     decoding, settings = _decoding(tree), _settings(tree, dynamic)
@@ -82,19 +65,16 @@ def read_ensenso(path: str | Path, *, dynamic: bool = True, frame: int | None = 
         source="simulated" if tree.is_virtual() else "device",
         rig=nxlib_rig(tree, (width, height), dynamic=dynamic),
         images={"left": _stacked(left), "right": _stacked(right)},
-        bits=8 * max(image.dtype.itemsize for image in (*left, *right)),
+        bits=8 * max(image.dtype.itemsize for image in images),
         decoding=decoding,
-        settings=settings | {"image_set": PurePosixPath(chosen.base).name},
+        settings=settings | {"image_set": PurePosixPath(calibration[: -len(_CALIB)]).name},
         serial=tree.text("SerialNumber"),
     )
 
 
 def ensenso_originals(path: str | Path, frame: int | None = None) -> dict[str, bytes]:
-    """Read the files of an image set unchanged, by name, for ``vendor/`` in a capture folder.
-
-    Raises InputError if ``path`` is neither zip nor folder, or a file is missing, damaged, encrypted or too large.
-    """
-    data = recorded_files(Path(path), _image_set(Path(path), frame).names)
+    """Read the files of an image set unchanged, by name, for ``vendor/`` in a capture folder."""
+    data = recorded_files(Path(path), _image_set(Path(path), frame))
     return {plain_name(name): content for name, content in data.items()}
 
 
@@ -104,8 +84,8 @@ def image_sets(path: str | Path) -> list[str]:
     return [PurePosixPath(name[: -len(_CALIB)]).name for name in names if name.lower().endswith(_CALIB)]
 
 
-def _image_set(path: Path, frame: int | None) -> _ImageSet:
-    """Select the files of an image set."""
+def _image_set(path: Path, frame: int | None) -> list[str]:
+    """Return the names of the files of one set: its calibration, then the left images in order, and as many right."""
     names = recorded_names(path, _EXPECTED)
     hint = "a stereo recording has <base>_left.png, <base>_right.png and <base>_calib.json"
     bases = [name[: -len(_CALIB)] for name in names if name.lower().endswith(_CALIB)]
@@ -117,20 +97,18 @@ def _image_set(path: Path, frame: int | None) -> _ImageSet:
     shown = ", ".join(PurePosixPath(base).name for base in bases[:4])
     number = chosen_frame(frame, len(bases), path, f"image sets ({shown})")
     strays = [
-        name
+        PurePosixPath(name).name
         for name in names
         if re.search(r"_(left|right)\.(png|tiff?)$", name, re.IGNORECASE)
         and not any(_side_pattern(base, "(?:left|right)").fullmatch(name) for base in bases)
     ]
     if frame is None and strays:
-        raise InputError(
-            path, PurePosixPath(strays[0]).name, "an image without its calibration", "complete image sets", hint
-        )
+        raise InputError(path, strays[0], "an image without its calibration", "complete image sets", hint)
     base = bases[number]
     left, right = (_of_side(path, base, side, names, hint) for side in ("left", "right"))
     if len(left) != len(right):
         raise InputError(path, f"{base}_*", f"{len(left)} left and {len(right)} right images", "as many of each")
-    return _ImageSet(base, left, right)
+    return [base + _CALIB, *left, *right]
 
 
 def _of_side(path: Path, base: str, side: str, names: list[str], hint: str) -> tuple[str, ...]:

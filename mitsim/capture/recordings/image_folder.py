@@ -28,6 +28,7 @@ from mitsim.capture.grey_image import (
     Image,
     bits_of,
     channel_name,
+    check_size,
     from_bit_0,
     is_colour,
     page_count,
@@ -64,19 +65,14 @@ def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNEL
     both = len(rig.cameras) == 2 and (decoder.triangulate == "cameras" or len(sensor.images or {}) == 2)
     used = list(rig.cameras) if both else list(rig.cameras)[:1]
     images: dict[str, Image] = {}
-    files: dict[str, list[str]] = {}
-    names, colour, gaps = {}, False, []
+    files, names, colour, gaps = dict[str, list[str]](), {}, False, []
     for name in used:
         paths = _files(folder, sensor, name, len(used))
         counts = [page_count(path) for path in paths]
         if sum(counts) != count:
-            raise InputError(
-                folder,
-                f"images of {name}",
-                f"{sum(counts)}{_ends(paths)}",
-                f"{count}, as the pattern of {sensor.name}",
-                advice(paths, name, count, sensor.ambient_image) if paths else _content(folder, used),
-            )
+            found = f"{sum(counts)}, {paths[0].name} to {paths[-1].name}" if paths else "0"
+            hint = advice(paths, name, count, sensor.ambient_image) if paths else _content(folder, used)
+            raise InputError(folder, f"images of {name}", found, f"{count}, as the pattern of {sensor.name}", hint)
         if (gap := gap_in(paths)) and not isinstance((sensor.images or {}).get(name), list):
             gaps.append(f"images of {name}: {gap}")
         files[name] = _labels(paths, counts)
@@ -190,10 +186,7 @@ def _stack(files: list[Path], counts: list[int], camera: Camera, channel: int) -
 
     def read(index: int) -> None:
         for number, image in enumerate(read_pages(files[index], channel=channel), sum(counts[:index])):
-            if image.shape != (camera.height, camera.width):
-                found = f"{image.shape[1]} x {image.shape[0]} px"
-                allowed = f"{camera.width} x {camera.height} px, as the calibration says"
-                raise InputError(labels[number], "size", found, allowed)
+            check_size(image, (camera.width, camera.height), labels[number], "as the calibration says")
             if image.dtype != first.dtype:
                 allowed = f"{first.itemsize * 8}, as {files[0].name}"
                 raise InputError(labels[number], "depth", f"{image.itemsize * 8} bits", allowed)
@@ -204,10 +197,7 @@ def _stack(files: list[Path], counts: list[int], camera: Camera, channel: int) -
 
 
 def _check_levels(stack: Image, files: list[str], bits: int) -> None:
-    """Check that images (P, H, W) have the bits that the sensor file states.
-
-    Raises InputError if they have more, or are files of 8 bits that should have more.
-    """
+    """Check that images (P, H, W) have the bits that the sensor file states."""
     for image, path in zip(stack, files, strict=True):
         if image.max() > 2**bits - 1:
             hint = "set imager.bits to the camera's output"
@@ -237,16 +227,11 @@ def advice(files: list[Path], camera: str, count: int, ambient_image: bool) -> s
                 f"{', '.join(strays[:4])} differs in name from the {count} images needed: write "
                 f"{camera} = {shape!r} in [images] of the sensor file, or --images {camera}={shape!r}"
             )
-    last = (
-        "" if ambient_image or len(files) != count + 1 else "write ambient_image = true, if the last has no light; or "
-    )
+    one_more = not ambient_image and len(files) == count + 1
+    last = "write ambient_image = true, if the last has no light; or " if one_more else ""
     return (
         f"{last}correct [pattern], or name the files in [images] of the sensor file, or by --images {camera}='PATTERN'"
     )
-
-
-def _ends(files: list[Path]) -> str:
-    return "" if not files else f", {files[0].name} to {files[-1].name}"
 
 
 def _content(folder: Path, cameras: list[str]) -> str:

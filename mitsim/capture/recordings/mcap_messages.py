@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from io import BytesIO
 from mmap import mmap
@@ -63,16 +63,13 @@ class Expected:
 
 
 def mcap_messages(
-    data: bytes | mmap, where: str | Path, expected: Expected | None = None
+    data: bytes | mmap, where: str | Path, expected: Expected = Expected()
 ) -> Iterator[tuple[Schema, Channel, Message]]:
     """Yield the messages in the order of the file, with the schema and the channel of each.
 
-    The overall checksums and the number of messages are checked after the last message.
-
-    Messages name the file ``where``, and what it should be: ``expected``, by default a recording of DepthAI. Raises
-    InputError if the file is truncated or damaged, or exceeds a limit when unpacked.
+    Raises InputError if the file is truncated or damaged, or exceeds a limit of ``expected`` when unpacked. The overall
+    checksums and the number of messages are checked after the last message.
     """
-    expected = expected or Expected()
     if data[: len(MCAP_MAGIC)] != MCAP_MAGIC:
         raise InputError(where, "", "a file that is not MCAP", expected.made_by)
     if data[-len(MCAP_MAGIC) :] != MCAP_MAGIC or len(data) < 2 * len(MCAP_MAGIC):
@@ -101,7 +98,7 @@ def _messages(view: memoryview, where: str | Path, expected: Expected) -> Iterat
                 stated = Statistics.read(_stream(body)).message_count
             if ended:  # later records repeat earlier ones
                 continue
-            for inner, record in _data(kind, body, expected.chunk):
+            for inner, _, record in _data(kind, body, expected.chunk):
                 seen = _bounded(seen + 1, expected.records, "records")
                 unpacked = _bounded(unpacked + len(record), LARGEST_RECORDING, "bytes in all chunks")
                 if inner == Opcode.SCHEMA:
@@ -137,13 +134,11 @@ def _records(view: memoryview, at: int = 0) -> Iterator[tuple[int, int, memoryvi
         at += _RECORD.size + length
 
 
-def _data(kind: int, body: memoryview, largest: int) -> Iterator[tuple[int, memoryview]]:
-    """Yield type and body of a record of the data section, or of the records in a chunk."""
+def _data(kind: int, body: memoryview, largest: int) -> Iterable[tuple[int, int, memoryview]]:
+    """Return a record of the data section, or the records in a chunk, as :func:`_records` does."""
     if kind != Opcode.CHUNK:
-        yield kind, body
-        return
-    for inner, _, record in _records(memoryview(_unpacked(Chunk.read(_stream(body)), largest))):
-        yield inner, record
+        return [(kind, 0, body)]
+    return _records(memoryview(_unpacked(Chunk.read(_stream(body)), largest)))
 
 
 def _unpacked(chunk: Chunk, largest: int) -> bytes:

@@ -149,15 +149,14 @@ def read_organised_cloud(path: str | Path | StoredCloud, options: ReadOptions) -
     points, is inverted, and the points are rotated from the rectified left frame to the sensor frame. Raises InputError
     if the file is damaged or has no grid, or no camera at the origin sees its points on the pixels of the grid.
     """
-    axes, link, camera = options.axes or AXES[0], options.link, options.camera
+    axes, link = options.axes or AXES[0], options.link
     if axes not in AXES:
         raise InputError("--axes", "", repr(axes), " | ".join(AXES))
     if options.unit is not None and options.unit not in LENGTHS_MM:
         raise InputError("--unit", "", repr(options.unit), " | ".join(LENGTHS_MM))
-    sensor = options.named
     stored = path if isinstance(path, StoredCloud) else read_stored_cloud(Path(path))
     path = stored.path
-    points, calibrated = _on_grid(stored, options.cameras, camera)
+    points, calibrated = _on_grid(stored, options.cameras, options.camera)
     settings: dict[str, Any] = {"imported_from": path.name, "axes_of_file": axes} | stored.records
     points[points[..., 2] == 0] = np.nan  # in the plane of the optical centre
     settings["unit_of_file"], distance = scale_to_mm(points, path, options.unit or stored.unit, "check --unit")
@@ -174,7 +173,7 @@ def read_organised_cloud(path: str | Path | StoredCloud, options: ReadOptions) -
             points = rectified_from_workspace.points(points).astype(np.float32)
             settings["link_target"] = str(tree.get("Link/Target") or "")
             settings["sensor_from_workspace"] = (turn @ rectified_from_workspace).matrix().tolist()
-    rig, records = _seen_by(points, path, calibrated, camera, turn)
+    rig, records = _seen_by(points, path, calibrated, options.camera, turn)
     settings |= records
     images = {} if stored.grey is None else {next(iter(rig.cameras)): stored.grey[None]}
     points = rig.reference.sensor_from_camera.points(points).astype(np.float32)
@@ -184,7 +183,7 @@ def read_organised_cloud(path: str | Path | StoredCloud, options: ReadOptions) -
         settings["warnings"] = warnings
     near, far = (calibrated.range_mm if calibrated else None) or (None, None)
     return Capture(
-        sensor=sensor or (calibrated.sensor if calibrated else "") or "point-cloud",
+        sensor=options.named or (calibrated.sensor if calibrated else "") or "point-cloud",
         technology="point_map",
         source="device",
         rig=rig,
@@ -203,9 +202,7 @@ def _on_grid(
     size, count = stored.size, stored.points.size // 3
     calibrated = None if calibration is None else read_calibration(calibration, size)
     if size is None and calibrated is not None:
-        eye = (
-            calibrated.rig.reference if camera is None else calibrated.rig.cameras.get(camera, calibrated.rig.reference)
-        )
+        eye = calibrated.rig.cameras.get(camera or "", calibrated.rig.reference)
         size = eye.width, eye.height
     calibrated = calibrated or stored.camera
     hint = "save it organised, a point or NaN for each pixel, or give the camera of its pixels: --calibration"
@@ -216,8 +213,7 @@ def _on_grid(
         error.stored = replace(stored, points=stored.points.reshape(-1, 3))
         raise error
     if size[0] * size[1] != count:
-        allowed = f"{size[0]} x {size[1]}, one for each pixel"
-        raise InputError(stored.path, "", f"{count} points", allowed, hint)
+        raise InputError(stored.path, "", f"{count} points", f"{size[0]} x {size[1]}, one for each pixel", hint)
     return stored.points.reshape(size[1], size[0], 3).copy(), calibrated
 
 
@@ -233,15 +229,9 @@ def _seen_by(
         "if they are in the frame of a robot or workspace, save them in the camera's, or invert an Ensenso's Link with "
         "--link; for an unusual lens give --calibration"
     )
-    ahead = points[..., 2] > 0
-    if ahead.sum() < 0.5 * np.isfinite(points[..., 2]).sum():
-        raise InputError(
-            path,
-            "z",
-            "points behind the camera: z under 0",
-            "z forward, y down",
-            "if y is up and z backward, use --axes opengl",
-        )
+    if (points[..., 2] > 0).sum() < 0.5 * np.isfinite(points[..., 2]).sum():
+        turned = "if y is up and z backward, use --axes opengl"
+        raise InputError(path, "z", "points behind the camera: z under 0", "z forward, y down", turned)
     if calibrated is not None:
         eyes = _possible_cameras(calibrated, name, (width, height), path, turn)
         measured = [(off_the_rays(eye.sensor_from_camera.points(points), eye), label, eye) for label, eye in eyes]

@@ -24,10 +24,7 @@ _KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWP
 
 
 def decode_pcd(data: bytes, where: str | Path) -> tuple[NDArray[np.float32], dict[str, str]]:
-    """Return the points (HEIGHT, WIDTH, 3) unchanged, and the header by key.
-
-    Raises InputError if the bytes are not a complete PCD with x, y and z.
-    """
+    """Return the points (HEIGHT, WIDTH, 3) unchanged, and the header by key; x, y and z are required."""
     header, body = _header(data, where)
     dtype, names = _fields(header, where)
     width, height = (_count(header, key, where) for key in ("WIDTH", "HEIGHT"))
@@ -102,10 +99,9 @@ def _numbers(
     with np.errstate(over="ignore", invalid="ignore"):
         if kind == "ascii":
             words = number_words(body)
-            stride = sum(int(np.prod(dtype[name].shape)) for name in names)
+            *first, stride = np.cumsum([0, *(int(np.prod(dtype[name].shape)) for name in names)]).tolist()
             if len(words) != count * stride:
                 raise ValueError(f"{len(words)} numbers, {count * stride} expected")
-            first = np.cumsum([0, *(int(np.prod(dtype[name].shape)) for name in names)])
             return {axis: np.array(words[first[names.index(axis)] :: stride], np.float32) for axis in "xyz"}
         if kind == "binary":
             if len(body) < count * dtype.itemsize:

@@ -10,7 +10,7 @@ PLY has no grid of its own. Two kinds of file state one. Range grids of Stanford
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -19,24 +19,12 @@ from numpy.typing import NDArray
 from characterisation.files.errors import InputError
 from mitsim.capture.recordings.cloud_numbers import number_words, unit_in
 
+#: NumPy's types by PLY's names, an old and a new one of each
 _TYPES = {
-    "char": "i1",
-    "uchar": "u1",
-    "short": "i2",
-    "ushort": "u2",
-    "int": "i4",
-    "uint": "u4",
-    "float": "f4",
-    "double": "f8",
-    "int8": "i1",
-    "uint8": "u1",
-    "int16": "i2",
-    "uint16": "u2",
-    "int32": "i4",
-    "uint32": "u4",
-    "float32": "f4",
-    "float64": "f8",
-}
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 #: largest number of lists of an element that are read
@@ -68,30 +56,21 @@ class _Property:
     count: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Element:
     name: str
     count: int
-    properties: tuple[_Property, ...] = ()
+    properties: list[_Property] = field(default_factory=list)
 
-    @property
-    def lists(self) -> bool:
-        """Return whether a property is a list."""
-        return any(entry.count for entry in self.properties)
-
-    def with_property(self, name: str, kind: str, count: str = "") -> _Element:
-        """Return the element with another property; a name that is there gets a number."""
+    def add(self, name: str, kind: str, count: str = "") -> None:
+        """Add a property; a name that is there gets a number."""
         taken = {entry.name for entry in self.properties}
         name = name.lower() if name in "XYZ" else name
-        unique = name if name not in taken else f"{name} {len(taken)}"
-        return replace(self, properties=(*self.properties, _Property(unique, kind, count)))
+        self.properties.append(_Property(name if name not in taken else f"{name} {len(taken)}", kind, count))
 
 
 def decode_ply(data: bytes, where: str | Path) -> Ply:
-    """Return points and grid from a PLY file's bytes.
-
-    Raises InputError if the bytes are not a complete PLY whose vertices have x, y and z.
-    """
+    """Return points and grid from the bytes of a PLY file, whose vertices must have x, y and z."""
     mark = re.search(rb"\nend_header[ \t]*\r?\n", data[:100_000])
     if not re.match(rb"ply[ \t]*\r?\n", data) or mark is None:
         raise InputError(where, "", "a file without the header of a PLY", "a PLY file")
@@ -121,18 +100,17 @@ def _elements(lines: tuple[str, ...], where: str | Path) -> tuple[str, list[_Ele
     order: str | None = None
     elements: list[_Element] = []
     for line in lines[1:]:
-        words = line.split()
-        match words:
+        match line.split():
             case ["format", kind, _] if kind in _ORDERS:
                 order = _ORDERS[kind]
             case ["element", name, count] if count.isascii() and count.isdigit() and len(count) <= 9:
                 elements.append(_Element(name, int(count)))
             case ["property", kind, name] if kind in _TYPES and elements:
-                elements[-1] = elements[-1].with_property(name, _TYPES[kind])
+                elements[-1].add(name, _TYPES[kind])
             case ["property", "list", count, kind, name] if count in _TYPES and kind in _TYPES and elements:
                 if _TYPES[count][0] == "f":
                     raise InputError(where, f"element {elements[-1].name}", line, "a whole number of items")
-                elements[-1] = elements[-1].with_property(name, _TYPES[kind], _TYPES[count])
+                elements[-1].add(name, _TYPES[kind], _TYPES[count])
             case ["comment" | "obj_info", *_] | []:
                 continue
             case _:
@@ -163,26 +141,28 @@ def _tables(body: bytes, order: str, elements: list[_Element]) -> dict[str, Tabl
     out: dict[str, Table] = {}
     at = 0
     for element in elements[: last + 1]:
-        if element.lists:
+        if any(entry.count for entry in element.properties):
             if element.count > _MOST_LISTS:
                 raise ValueError(f"{element.count} lists")
             numbers, rows, at = _rows(body, words, at, order, element)
             out[element.name] = numbers if element.name == "vertex" else rows
         elif order == "":
             columns = len(element.properties)
-            part = words[at : at + columns * element.count]
-            if len(part) < columns * element.count:
-                raise ValueError(f"{len(part)} numbers of {element.name}, {columns * element.count} expected")
+            size = columns * element.count
+            part = words[at : at + size]
+            if len(part) < size:
+                raise ValueError(f"{len(part)} numbers of {element.name}, {size} expected")
             table = np.array(part, np.float64).reshape(element.count, columns)
             out[element.name] = {entry.name: table[:, column] for column, entry in enumerate(element.properties)}
-            at += columns * element.count
+            at += size
         else:
             dtype = np.dtype([(entry.name, order + entry.kind) for entry in element.properties])
-            if len(body) - at < dtype.itemsize * element.count:
-                raise ValueError(f"{len(body) - at} bytes of {element.name}, {dtype.itemsize * element.count} expected")
+            size = dtype.itemsize * element.count
+            if len(body) - at < size:
+                raise ValueError(f"{len(body) - at} bytes of {element.name}, {size} expected")
             packed = np.frombuffer(body, dtype, element.count, at)
             out[element.name] = {entry.name: packed[entry.name] for entry in element.properties}
-            at += dtype.itemsize * element.count
+            at += size
     return out
 
 
@@ -224,11 +204,8 @@ def _rows(
 
 
 def _stated_size(lines: tuple[str, ...]) -> tuple[int, int] | None:
-    stated = {}
-    for line in lines:
-        match = re.fullmatch(r"(?:obj_info|comment)\s+(num_cols|num_rows|width|height)\s*[:= ]\s*(\d{1,6})", line)
-        if match:
-            stated[match.group(1)] = int(match.group(2))
+    wanted = re.compile(r"(?:obj_info|comment)\s+(num_cols|num_rows|width|height)\s*[:= ]\s*(\d{1,6})")
+    stated = {match[1]: int(match[2]) for line in lines if (match := wanted.fullmatch(line))}
     for wide, high in (("num_cols", "num_rows"), ("width", "height")):
         if stated.get(wide, 0) > 0 and stated.get(high, 0) > 0:
             return stated[wide], stated[high]

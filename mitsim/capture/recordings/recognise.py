@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -34,43 +33,26 @@ NAMES = {
 #: suffixes of files that describe cameras, a sensor or a study, and are no recordings
 _DESCRIPTIONS = frozenset({".toml", ".yml", ".yaml", ".xml", ".json", ".mat"})
 
-#: kinds by the first bytes of a file
+#: first bytes of the files of a kind
 _MARKS = {
-    b"PK\x03\x04": "ensenso",
-    b"PK\x05\x06": "ensenso",
-    HDF5_MAGIC: "zdf",
-    NPY_MAGIC: "npy",
-    b"ply\n": "ply",
-    b"ply\r\n": "ply",
-    BAG_MAGIC: "ros",
-    SQLITE_MAGIC: "ros",
-    b"\x89PNG": "depth",
-    b"II*\x00": "depth",
-    b"MM\x00*": "depth",
-    b"II+\x00": "depth",
-    b"MM\x00+": "depth",
-    b"P5": "depth",
-    EXR_MAGIC: "depth",
-    b"Pf\n": "depth",
+    "ensenso": (b"PK\x03\x04", b"PK\x05\x06"),
+    "zdf": (HDF5_MAGIC,),
+    "npy": (NPY_MAGIC,),
+    "ply": (b"ply\n", b"ply\r\n"),
+    "ros": (BAG_MAGIC, SQLITE_MAGIC),
+    "depth": (b"\x89PNG", b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+", b"P5", EXR_MAGIC, b"Pf\n"),
 }
 
-#: kinds by the suffix of a file whose first bytes are unknown
+#: suffixes of the files of a kind whose first bytes are unknown
 _SUFFIXES = {
-    ".zip": "ensenso",
-    ".enscam": "ensenso",
-    ".ply": "ply",
-    ".mcap": "depthai",
-    ".png": "depth",
-    ".pgm": "depth",
-    ".pfm": "depth",
-    ".exr": "depth",
-    ".bmp": "depth",
-    ".jpg": "depth",
-    ".jpeg": "depth",
-    ".bag": "ros",
-    ".db3": "ros",
-    ".zdf": "zdf",
-    ".npy": "npy",
+    "ensenso": (".zip", ".enscam"),
+    "ply": (".ply",),
+    "pcd": (".pcd",),
+    "depthai": (".mcap",),
+    "depth": (".png", ".pgm", ".pfm", ".exr", ".bmp", ".jpg", ".jpeg"),
+    "ros": (".bag", ".db3"),
+    "zdf": (".zdf",),
+    "npy": (".npy",),
 }
 
 #: suffixes of recordings that are one file
@@ -114,22 +96,24 @@ def kind_of(path: str | Path, *, sensor: str | None = None, calibration: str | N
         raise InputError(path, "", "no such file or folder", "a recording")
     with path.open("rb") as stream:
         begin = stream.read(64)
-    if path.suffix.lower() == ".npz":
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
         return "npy"
-    if path.suffix.lower() == ".3mf":  # a zip
-        raise InputError(path, "", *_NOT_READ[".3mf"])
+    if suffix == ".3mf":  # a zip
+        raise InputError(path, "", *_NOT_READ[suffix])
     if begin.startswith(MCAP_MAGIC):
         return _kind_of_mcap(path)
-    for mark, kind in _MARKS.items():
-        if begin.startswith(mark):
+    for kind, marks in _MARKS.items():
+        if begin.startswith(marks):
             return kind
-    if b".PCD" in begin or begin.startswith(b"VERSION") or path.suffix.lower() == ".pcd":
+    if b".PCD" in begin or begin.startswith(b"VERSION"):
         return "pcd"
-    if path.suffix.lower() in _SUFFIXES:
-        return _SUFFIXES[path.suffix.lower()]  # damaged; its reader reports the error
-    if path.suffix.lower() in _NOT_READ:
-        raise InputError(path, "", *_NOT_READ[path.suffix.lower()])
-    if path.suffix.lower() in _DESCRIPTIONS:
+    for kind, suffixes in _SUFFIXES.items():
+        if suffix in suffixes:
+            return kind  # damaged; its reader reports the error
+    if suffix in _NOT_READ:
+        raise InputError(path, "", *_NOT_READ[suffix])
+    if suffix in _DESCRIPTIONS:
         raise _no_recording(path, path)
     raise InputError(path, "", "a file of an unknown kind", "; ".join(NAMES.values()), "say which with --as")
 
@@ -159,14 +143,16 @@ def _own_files(keys: dict[str, Any]) -> str:
 def _kind_of_folder(path: Path, sensor: str | None, calibration: str | None) -> str:
     if is_robi(path):
         return "robi"
-    names = [file.relative_to(path).as_posix().lower() for file in _down_to(path, 3) if file.is_file()]
+    levels = [sorted(path.glob(pattern)) for pattern in ("*", "*/*", "*/*/*")]
+    names = [file.name.lower() for entries in levels for file in entries if file.is_file()]
     if any(name.endswith("_calib.json") for name in names) and any(
         name.endswith(("_left.png", "_left.tif", "_left.tiff")) for name in names
     ):
         return "ensenso"
-    top = [name for name in names if "/" not in name]
+    files = [file for file in levels[0] if file.is_file()]
+    top = [file.name.lower() for file in files]
     packed = (".mcap", ".db3", ".db3.zstd", ".mcap.zstd")
-    recorded = [file for file in _down_to(path, 1) if file.is_file() and file.name.lower().endswith(packed)]
+    recorded = [file for file in files if file.name.lower().endswith(packed)]
     if "metadata.yaml" in top or any(file.suffix.lower() == ".db3" for file in recorded):
         return "ros"
     if recorded and recorded[0].suffix.lower() == ".mcap" and _kind_of_mcap(recorded[0]) == "ros":
@@ -177,20 +163,15 @@ def _kind_of_folder(path: Path, sensor: str | None, calibration: str | None) -> 
         return "stereo-pair"
     if sensor is not None:
         return "images" if named_sensor(sensor)[1] == "structured_light" else "stereo-pair"
-    if any(name == "capture.json" for name in top):
+    if "capture.json" in top:
         raise InputError(path, "", "a capture folder", "a recording of another program", "it needs no import")
-    described = [file for file in _down_to(path, 1) if file.is_file()]
-    if described and all(file.suffix.lower() in _DESCRIPTIONS for file in described):
-        raise _no_recording(path, described[0])
-    entries = [entry.name + "/" * entry.is_dir() for entry in _down_to(path, 1)]
-    alone = next((file.name for file in _down_to(path, 1) if file.suffix.lower() in _RECORDED_ALONE), None)
-    raise InputError(
-        path,
-        "",
-        f"a folder with {', '.join(entries[:4]) or 'nothing in it'}",
-        "a recording of an Ensenso, of DepthAI or ROS; or images, with --sensor or --calibration",
-        "" if alone is None else f"name the recording in it: {path / alone}",
-    )
+    if files and all(file.suffix.lower() in _DESCRIPTIONS for file in files):
+        raise _no_recording(path, files[0])
+    entries = ", ".join(entry.name + "/" * entry.is_dir() for entry in levels[0][:4])
+    alone = next((entry for entry in levels[0] if entry.suffix.lower() in _RECORDED_ALONE), None)
+    allowed = "a recording of an Ensenso, of DepthAI or ROS; or images, with --sensor or --calibration"
+    hint = "" if alone is None else f"name the recording in it: {alone}"
+    raise InputError(path, "", f"a folder with {entries or 'nothing in it'}", allowed, hint)
 
 
 def _kind_of_mcap(path: Path) -> str:
@@ -201,8 +182,3 @@ def _kind_of_mcap(path: Path) -> str:
         with path.open("rb") as stream:
             return "ros" if b"ros" in stream.read(64)[21:24] else "depthai"
     return "ros" if is_ros_mcap(path) else "depthai"
-
-
-def _down_to(path: Path, levels: int) -> Iterable[Path]:
-    for level in range(levels):
-        yield from sorted(path.glob("/".join(["*"] * (level + 1))))

@@ -12,7 +12,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path, PurePosixPath
 
 from characterisation.files.checked_files import LARGEST_FILE, is_inside, read_bounded
@@ -38,32 +38,20 @@ _DEEPEST = 3
 
 #: errors of the standard library for a damaged, encrypted or unusual zip
 _DAMAGED = (
-    zipfile.BadZipFile,
-    zlib.error,
-    lzma.LZMAError,
-    struct.error,
-    EOFError,
-    OSError,
-    NotImplementedError,
-    RuntimeError,
-    ValueError,
-)
+    zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, KeyError, OSError, RuntimeError, ValueError,
+)  # fmt: skip
 
 
 def recorded_names(path: Path, expected: str) -> list[str]:
-    """List the files in a folder or zip down to the third level, with ``/`` between; ``expected`` is for messages.
-
-    Raises InputError if it is neither, is damaged, or contains too many files.
-    """
+    """List the files in a folder or zip down to the third level, with ``/`` between; ``expected`` is for messages."""
     if path.is_dir():
-        names = [
-            file.relative_to(path).as_posix()
-            for level in range(_DEEPEST)
-            for file in path.glob("/".join(["*"] * (level + 1)))
-            if file.is_file() and is_inside(file, path)
-        ]
+        files = (file for level in range(_DEEPEST) for file in path.glob("/".join(["*"] * (level + 1))))
+        names = [file.relative_to(path).as_posix() for file in files if file.is_file() and is_inside(file, path)]
+    elif path.is_file():
+        with _in_words(path), zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
     else:
-        names = _zipped_names(path, expected)
+        raise InputError(path, "", "no such file or folder", expected)
     if len(names) > MOST_FILES:
         raise InputError(path, "", f"{len(names)} files", f"up to {MOST_FILES} files")
     kept = [name for name in names if len(PurePosixPath(name).parts) <= _DEEPEST]
@@ -71,28 +59,28 @@ def recorded_names(path: Path, expected: str) -> list[str]:
 
 
 def recorded_files(path: Path, names: Iterable[str]) -> dict[str, bytes]:
-    """Return the bytes of some files of a folder or zip, by name.
-
-    Raises InputError if a file is missing, damaged, encrypted or too large.
-    """
+    """Return the bytes of some files of a folder or zip, by name."""
     out: dict[str, bytes] = {}
     total = 0
+    with _in_words(path), nullcontext() if path.is_dir() else zipfile.ZipFile(path) as archive:
+        for name in names:
+            out[name] = read_bounded(path / name) if archive is None else _member(archive, name, path)
+            total += len(out[name])
+            if total > LARGEST_RECORDING:
+                raise InputError(path, "size", f"over {total} bytes", f"up to {LARGEST_RECORDING} bytes in all")
+    return out
+
+
+@contextmanager
+def _in_words(path: Path) -> Iterator[None]:
+    """Turn the errors of the standard library for a damaged zip into one that names the file."""
     try:
-        archive = None if path.is_dir() else zipfile.ZipFile(path)
-        try:
-            for name in names:
-                out[name] = read_bounded(path / name) if archive is None else _member(archive, name, path)
-                total += len(out[name])
-                if total > LARGEST_RECORDING:
-                    raise InputError(path, "size", f"over {total} bytes", f"up to {LARGEST_RECORDING} bytes in all")
-        finally:
-            if archive is not None:
-                archive.close()
+        yield
     except InputError:
         raise
-    except (*_DAMAGED, KeyError) as error:
-        raise _damaged(path, error) from None
-    return out
+    except _DAMAGED as error:
+        found = f"a file that cannot be unpacked ({error})"
+        raise InputError(path, "", found, "an undamaged zip without password") from None
 
 
 @contextmanager
@@ -112,16 +100,6 @@ def plain_name(name: str) -> str:
     return plain if re.match("[A-Za-z0-9]", plain) else f"x{plain[1:]}"
 
 
-def _zipped_names(path: Path, expected: str) -> list[str]:
-    if not path.is_file():
-        raise InputError(path, "", "no such file or folder", expected)
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return archive.namelist()
-    except _DAMAGED as error:
-        raise _damaged(path, error) from None
-
-
 def _member(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:
     with archive.open(name) as member:
         data = member.read(LARGEST_FILE + 1)  # the archive may state a wrong size
@@ -130,16 +108,8 @@ def _member(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:
     return data
 
 
-def _damaged(path: Path, error: BaseException) -> InputError:
-    return InputError(path, "", f"a file that cannot be unpacked ({error})", "an undamaged zip without password")
-
-
 def frame_of(frame: int | str | None, path: Path, names: list[str] | None = None) -> int | None:
-    """Return the number of a frame given by its number, counted from 0, or by its name.
-
-    ``names`` of the frames in order, if they have any. Raises InputError if it is neither; the error lists the readable
-    frames.
-    """
+    """Return the number of a frame given by its number, counted from 0, or by its name in ``names``, in order."""
     if frame is None or isinstance(frame, int) or (frame.isascii() and frame.isdigit()):
         if frame is not None and names is not None and not int(frame) < len(names):
             raise InputError(path, "--frame", frame, _readable(names))
@@ -152,14 +122,7 @@ def frame_of(frame: int | str | None, path: Path, names: list[str] | None = None
 def chosen_frame(frame: int | None, count: int, where: Path, label: str) -> int:
     """Return the number of the chosen frame, from 0; a single frame need not be chosen.
 
-    Raises InputError if there are several and none was chosen, or there is no such frame.
-
-    Parameters
-    ----------
-    frame, count
-        Number of the frame, None if none was chosen, and number of frames.
-    where, label
-        For messages: the file, and the name of the frames in the plural.
+    ``label`` is the name of the frames in messages, in the plural.
     """
     if frame is None and count > 1:
         allowed, hint = "one in a capture", f"choose with --frame 0 to {count - 1}"

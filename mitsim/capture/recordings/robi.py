@@ -58,11 +58,10 @@ def read_robi(folder: str | Path, options: ReadOptions) -> tuple[Capture, list[P
     """Read one view of ``Scene_N/Ensenso`` or ``Scene_N/RealSense``, and list its files.
 
     The calibration is the folder with ``<sensor>_LEFT.yml`` etc.; by default ``cam`` in one of the parent folders.
-    ``frame`` is the number of the view in ``list.txt``. Raises InputError if a file is missing or invalid, or there are
-    several views and none was chosen.
+    ``frame`` is the number of the view in ``list.txt``; required if there are several.
     """
     folder = Path(folder)
-    frame, sensor = frame_of(options.frame, folder), options.named
+    frame = frame_of(options.frame, folder)
     views = read_bounded(folder / "list.txt").decode("utf-8", "replace").split()
     if not views:
         raise InputError(folder / "list.txt", "", "no view", "the names of the views, one per line: view_0")
@@ -76,9 +75,8 @@ def read_robi(folder: str | Path, options: ReadOptions) -> tuple[Capture, list[P
     tables = {name: where / f"{folder.name}_{name.upper()}.yml" for name in files}
     missing = [str(file) for file in (*files.values(), *tables.values()) if not file.is_file()]
     if missing:
-        raise InputError(
-            folder, "", f"a scene without {', '.join(missing)}", "images, depth and camera files of the view"
-        )
+        allowed = "images, depth and camera files of the view"
+        raise InputError(folder, "", f"a scene without {', '.join(missing)}", allowed)
     numbers = {name: _numbers(path) for name, path in tables.items()}
     rig = _rig(tables, numbers)
     images = {name: _image(files[name], rig.cameras[name])[None] for name in ("left", "right")}
@@ -100,19 +98,19 @@ def read_robi(folder: str | Path, options: ReadOptions) -> tuple[Capture, list[P
     if len(depths):
         near, far = np.percentile(depths, _PERCENTILES)
         decoding = Decoding(near_mm=float(near) * (1 - _WIDER), far_mm=float(far) * (1 + _WIDER))
-    pose_file = folder / "Depth" / f"DEPTH_{view}.json"
+    pose_files = [file for file in [folder / "Depth" / f"DEPTH_{view}.json"] if file.is_file()]
     capture = Capture(
-        sensor=sensor or folder.name,
+        sensor=options.named or folder.name,
         technology="active_stereo",
         source="device",
         rig=rig,
         images=images,
         decoding=decoding,
         settings=settings,
-        world_from_sensor=_pose(pose_file) if pose_file.is_file() else None,
+        world_from_sensor=_pose(pose_files[0]) if pose_files else None,
         derived={"depth": depth},
     )
-    return capture, [*files.values(), *tables.values(), *([pose_file] if pose_file.is_file() else [])]
+    return capture, [*files.values(), *tables.values(), *pose_files]
 
 
 def _calibrations(folder: Path, calibration: str | Path | None) -> Path:
@@ -122,12 +120,8 @@ def _calibrations(folder: Path, calibration: str | Path | None) -> Path:
     above = [parent / "cam" for parent in folder.resolve().parents]
     camera_folder = next((path for path in above if (path / f"{folder.name}_LEFT.yml").is_file()), None)
     if camera_folder is None:
-        raise InputError(
-            folder,
-            "calibration",
-            f"no cam/{folder.name}_LEFT.yml in a parent folder",
-            "the folder cam of the data set's toolkit: --calibration ROBI_Toolkit/cam",
-        )
+        allowed = "the folder cam of the data set's toolkit: --calibration ROBI_Toolkit/cam"
+        raise InputError(folder, "calibration", f"no cam/{folder.name}_LEFT.yml in a parent folder", allowed)
     return camera_folder
 
 
@@ -149,9 +143,8 @@ def _rig(tables: dict[str, Path], numbers: dict[str, dict[str, float]]) -> Rig:
     lost = [f"{tables[name]}: {key}" for name in ("left", "right") for key in _CAMERA_KEYS if key not in numbers[name]]
     lost += [f"{tables['depth']}: {key}" for key in ("baseline", "depth_unit") if key not in numbers["depth"]]
     if lost:
-        raise InputError(
-            tables["left"].parent, "", f"camera files without {'; '.join(lost)}", "these keys, in px and mm"
-        )
+        found = f"camera files without {'; '.join(lost)}"
+        raise InputError(tables["left"].parent, "", found, "these keys, in px and mm")
     baseline, shift = numbers["depth"]["baseline"], numbers["depth"].get("disparity_shift", 0.0)
     if not baseline > 0:
         raise InputError(tables["depth"], "baseline", f"{baseline:g}", "a length over 0 mm")

@@ -14,7 +14,7 @@ import mmap
 import re
 import sqlite3
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -69,10 +69,7 @@ class RosBag:
 
 
 def open_bag(path: Path) -> RosBag:
-    """Open a bag: a file, or the folder of a ROS 2 bag, whose files follow one another.
-
-    Raises InputError if it is missing, damaged, not indexed, packed as a whole, or no bag.
-    """
+    """Open a bag: a file, or the folder of a ROS 2 bag, whose files follow one another."""
     if not path.is_dir():
         return _opened(path)
     files = [file for file in islice(path.iterdir(), MOST_FILES) if file.is_file() and not file.is_symlink()]
@@ -104,13 +101,6 @@ def _opened(path: Path) -> RosBag:
 
 
 def _joined(path: Path, bags: list[RosBag]) -> RosBag:
-    counts: Counter[str] = Counter()
-    topics: dict[str, Topic] = {}
-    for bag in bags:
-        for name, topic in bag.topics.items():
-            topics.setdefault(name, topic)
-            counts[name] += topic.count
-
     def message(name: str, number: int) -> bytes:
         for bag in bags:
             count = bag.topics[name].count if name in bag.topics else 0
@@ -119,20 +109,23 @@ def _joined(path: Path, bags: list[RosBag]) -> RosBag:
             number -= count
         raise LookupError(name)
 
-    return RosBag(path, {name: replace(topic, count=counts[name]) for name, topic in topics.items()}, message)
+    return RosBag(path, _by_name(topic for bag in bags for topic in bag.topics.values()), message)
+
+
+def _by_name(topics: Iterable[Topic]) -> dict[str, Topic]:
+    """Return topics by name; those of one name are one, with the messages of all."""
+    out: dict[str, Topic] = {}
+    for topic in topics:
+        known = out.get(topic.name)
+        out[topic.name] = topic if known is None else replace(known, count=known.count + topic.count)
+    return out
 
 
 def _of_ros1(path: Path) -> RosBag:
     with _in_words(path), Reader(path) as reader:
-        topics = {
-            connection.topic: Topic(
-                connection.topic, connection.msgtype, connection.msgcount, True, connection.digest or ""
-            )
-            for connection in reader.connections
-        }
-        counts: Counter[str] = Counter()
-        for connection in reader.connections:
-            counts[connection.topic] += connection.msgcount
+        topics = _by_name(
+            Topic(one.topic, one.msgtype, one.msgcount, True, one.digest or "") for one in reader.connections
+        )
 
     def message(name: str, number: int) -> bytes:
         with _in_words(path), Reader(path) as reader:
@@ -146,7 +139,7 @@ def _of_ros1(path: Path) -> RosBag:
             messages = reader.messages(chosen, start=start, stop=start + 1)
             return next(islice(messages, number - times.index(start), None))[2]
 
-    return RosBag(path, {name: replace(topic, count=counts[name]) for name, topic in topics.items()}, message)
+    return RosBag(path, topics, message)
 
 
 def _bounded_by(decompressor: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:

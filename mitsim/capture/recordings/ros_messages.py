@@ -54,10 +54,7 @@ _PACKED_HEADER = struct.Struct("<iff")
 
 
 def read_message(bag: RosBag, topic: Topic, number: int) -> Any:
-    """Return a message of a topic by its number, from 0.
-
-    Raises InputError if it cannot be read as a message of its type.
-    """
+    """Return a message of a topic by its number, from 0."""
     data = bag.message(topic.name, number)
     where = f"{bag.path} {topic.name}"
     try:
@@ -82,16 +79,8 @@ def encoding_of(message: Any) -> str:
     return str(message.format).partition(";")[0].strip()
 
 
-def is_depth(message: Any) -> bool:
-    """Return whether an image has an encoding of depths."""
-    return encoding_of(message) in DEPTHS
-
-
 def depth_of(message: Any, where: str) -> tuple[NDArray[Any], float]:
-    """Return the numbers (H, W) of a depth image, uint16 or float32, and their unit [mm] by its encoding.
-
-    Raises InputError if it has another encoding, was compressed with loss, or is damaged.
-    """
+    """Return the numbers (H, W) of a depth image, uint16 or float32, and their unit [mm] by its encoding."""
     encoding = encoding_of(message)
     if encoding not in DEPTHS:
         raise InputError(where, "encoding", repr(encoding), " | ".join(DEPTHS))
@@ -115,10 +104,7 @@ def depth_of(message: Any, where: str) -> tuple[NDArray[Any], float]:
 
 
 def grey_of(message: Any, where: str, channel: int) -> NDArray[np.unsignedinteger[Any]]:
-    """Return the grey image (H, W), or one ``channel`` (in OpenCV's order) of a colour image, uint8 or uint16.
-
-    Raises InputError if it has an unknown encoding, or is damaged.
-    """
+    """Return the grey image (H, W), or one ``channel`` (in OpenCV's order) of a colour image, uint8 or uint16."""
     if not hasattr(message, "encoding"):
         return decode_grey(bytes(message.data), where, channel=channel)
     pixels = _pixels(message, where)
@@ -143,16 +129,12 @@ def _pixels(message: Any, where: str) -> NDArray[Any]:
         found = f"{data.size} bytes in rows of {step}"
         raise InputError(where, "data", found, f"{shape[1]} x {shape[0]} px of {row // shape[1]} bytes")
     strides = (step, channels * dtype.itemsize, dtype.itemsize)
-    return np.ndarray((*shape, channels), dtype, np.ascontiguousarray(data), strides=strides).astype(
-        dtype.newbyteorder("=")
-    )
+    pixels = np.ndarray((*shape, channels), dtype, np.ascontiguousarray(data), strides=strides)
+    return pixels.astype(dtype.newbyteorder("="))
 
 
 def points_of(message: Any, where: str) -> NDArray[np.float32]:
-    """Return the points (H, W, 3) of a cloud as in the message; a cloud without a grid has one row.
-
-    Raises InputError if it has no x, y and z of floating point, or is damaged.
-    """
+    """Return the points (H, W, 3) of a cloud as in the message; a cloud without a grid has one row."""
     fields = {str(field.name): (int(field.offset), _FIELDS.get(int(field.datatype), "")) for field in message.fields}
     if not all(fields.get(axis, (0, ""))[1] in ("f4", "f8") for axis in "xyz"):
         raise InputError(where, "fields", ", ".join(fields)[:80] or "none", "x, y and z of floating point")
@@ -181,9 +163,8 @@ def calibration_of(message: Any, rectified: bool) -> dict[str, Any]:
 
     Of ``rectified`` images, the camera is that of the projection matrix, without distortion, if the message has one.
     """
-    table: dict[str, Any] = {
-        name: int(getattr(message, name)) for name in ("width", "height", "binning_x", "binning_y")
-    }
+    numbers = ("width", "height", "binning_x", "binning_y")
+    table: dict[str, Any] = {name: int(getattr(message, name)) for name in numbers}
     table["distortion_model"] = str(message.distortion_model).lower().replace(" ", "_")
     for letter in "dkrp":
         values = getattr(message, letter, getattr(message, letter.upper(), ()))

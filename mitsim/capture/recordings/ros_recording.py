@@ -4,8 +4,8 @@ Signal chain: bag -> topic, chosen or the only one that fits -> one message of i
 calibration of the user -> capture.
 
 A ``camera_info`` belongs to the images whose topic begins like its own: ``/camera/depth/camera_info`` to
-``/camera/depth/image_rect_raw``. Images with the word
-``rect`` in their topic are rectified: their camera is the projection matrix.
+``/camera/depth/image_rect_raw``. Images with the word ``rect`` in their topic are rectified: their camera is the
+projection matrix.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from mitsim.capture.recordings.ros_bag import RosBag, Topic
 from mitsim.capture.recordings.ros_messages import (
     CAMERA_INFO,
     CLOUD,
+    DEPTHS,
     IMAGE,
     PACKED_IMAGE,
     calibration_of,
     depth_of,
     encoding_of,
     grey_of,
-    is_depth,
     label_of,
     points_of,
     read_message,
@@ -57,11 +57,7 @@ class Chosen:
 
 
 def chosen_topics(bag: RosBag, names: Sequence[str]) -> Chosen:
-    """Return the topics of these names; without names, the only depth image or cloud.
-
-    Raises InputError if there is no such topic, or it has nothing that is read, or there are several; the error lists
-    the topics.
-    """
+    """Return the topics of these names; without names, the only depth image or cloud; errors list the topics."""
     contents = {topic.name: content for topic in bag.topics.values() if (content := _content(bag, topic))}
     usable = {name: content for name, content in contents.items() if content != "image"}
     for name in names:
@@ -98,10 +94,9 @@ def _content(bag: RosBag, topic: Topic) -> str:
     if topic.kind == CLOUD:
         return "cloud"
     if topic.kind in (IMAGE, PACKED_IMAGE):
-        message, name = read_message(bag, topic, 0), topic.name.lower()
-        other = any(word in name for word in _NO_DEPTHS) and "depth" not in name
-        grey = encoding_of(message) == "mono16" and "depth" not in name  # which librealsense writes for both
-        return "depth" if is_depth(message) and not (other or grey) else "image"
+        encoding, name = encoding_of(read_message(bag, topic, 0)), topic.name.lower()
+        other = any(word in name for word in _NO_DEPTHS) or encoding == "mono16"  # which librealsense writes for both
+        return "depth" if encoding in DEPTHS and ("depth" in name or not other) else "image"
     return ""
 
 
@@ -145,8 +140,8 @@ def read_ros_depth(chosen: Chosen, frame: int | None, options: ReadOptions) -> C
     """Read one depth image of a bag.
 
     ``frame`` is the number of the message, from 0; required if there are several. By default the camera is the
-    ``camera_info`` of the topic, and the depth of one level that of the encoding, or the one that RealSense's viewer
-    recorded. Raises InputError if the message or the calibration cannot be read, or they do not belong together.
+    ``camera_info`` of the topic, and the depth of one level that of the encoding, or that which RealSense's viewer
+    recorded.
     """
     bag, topic = chosen.bag, chosen.topics[0]
     where = label_of(topic, bag.path)
@@ -161,21 +156,17 @@ def read_ros_depth(chosen: Chosen, frame: int | None, options: ReadOptions) -> C
     with np.errstate(over="ignore"):
         depth = levels.astype(np.float32) * np.float32(scale)
     depth[missing] = np.nan
-    size = (depth.shape[1], depth.shape[0])
-    calibrated = _calibrated(chosen, size, options.cameras)
+    calibrated = _calibrated(chosen, (depth.shape[1], depth.shape[0]), options.cameras)
     settings: dict[str, Any] = {"imported_from": bag.path.name, "topic": topic.name, "depth_scale_mm": float(scale)}
-    if warnings:
-        settings["warnings"] = warnings
-    settings |= _stamp(message)
-    return depth_capture(depth, calibrated, Path(where), settings, camera=options.camera, sensor=options.named)
+    settings |= _stamp(message) | ({"warnings": warnings} if warnings else {})
+    return depth_capture(depth, calibrated, Path(where), settings, options)
 
 
 def read_ros_pair(chosen: Chosen, frame: int | None, options: ReadOptions) -> tuple[Capture, tuple[int, int]]:
     """Read one stereo pair of a bag: the left image by its number, and the right image that is nearest in time.
 
     Returned with the numbers of both messages. ``frame`` is that of the left one, from 0; required if there are
-    several. By default the cameras are the ``camera_info`` of both topics. Raises InputError if a message or the
-    calibration cannot be read, or they do not belong together.
+    several. By default the cameras are the ``camera_info`` of both topics.
     """
     bag, (left, right) = chosen.bag, chosen.topics
     number = chosen_frame(frame, left.count, bag.path, f"messages of {left.name}")
@@ -193,10 +184,7 @@ def read_ros_pair(chosen: Chosen, frame: int | None, options: ReadOptions) -> tu
 
 
 def _of_same_time(bag: RosBag, topic: Topic, first: Any, number: int) -> tuple[Any, int]:
-    """Return the message of a topic whose stamp is that of another one, and its number; it is searched near that one's.
-
-    Raises InputError if none of them is of the same time.
-    """
+    """Return the message of a topic whose stamp is that of another one, searched near its number; with its number."""
     near = [index for index in range(number - 2, number + 3) if 0 <= index < topic.count]
     messages = [read_message(bag, topic, index) for index in near]
     apart = [abs(_seconds(message) - _seconds(first)) for message in messages]
@@ -226,9 +214,8 @@ def _calibrated(chosen: Chosen, size: tuple[int, int], calibration: str | Path |
         tables[info.name] = calibration_of(read_message(bag, info, 0), rectified)
     if len(tables) < len(chosen.topics):
         names = " and ".join(topic.name for topic in chosen.topics)
-        raise InputError(
-            bag.path, ", ".join(tables), f"one camera_info for {names}", "one for each: --calibration FILE"
-        )
+        found, allowed = f"one camera_info for {names}", "one for each: --calibration FILE"
+        raise InputError(bag.path, ", ".join(tables), found, allowed)
     if len(tables) == 2 and not any(table["p"][3:4] not in ([], [0.0]) for table in tables.values()):
         hint = "--calibration FILE with both cameras, R and T"
         raise InputError(bag.path, ", ".join(tables), "projection matrices without a baseline", "a pair of ROS", hint)
@@ -248,9 +235,8 @@ def _info_of(bag: RosBag, topic: Topic) -> Topic:
                 spaces[space] = info
     if not spaces:
         there = ", ".join(info.name for info in bag.topics.values() if info.kind == CAMERA_INFO)[:200]
-        raise InputError(
-            bag.path, topic.name, there or "no camera_info", "a camera_info of this topic", "or --calibration FILE"
-        )
+        allowed = "a camera_info of this topic"
+        raise InputError(bag.path, topic.name, there or "no camera_info", allowed, "or --calibration FILE")
     return spaces[max(spaces, key=len)]
 
 

@@ -53,7 +53,6 @@ def read_stereo_pair(folder: str | Path, options: ReadOptions) -> Capture:
     folder = Path(folder)
     own = str(folder) if is_euroc(folder) else None
     calibration, frame = options.cameras or own or options.cameras_of(folder, "a stereo pair"), options.frame
-    sensor = options.named
     channel = channel_of(options.channel)
     calibrated = at_size_of_images(folder, lambda size: read_calibration(calibration, size))  # for the names alone
     names = names_of_pair(calibrated, calibration)
@@ -67,8 +66,8 @@ def read_stereo_pair(folder: str | Path, options: ReadOptions) -> Capture:
     stems = [file.stem for file in files[names[0]]]
     number = chosen_frame(frame_of(frame, folder, stems), counts[0], folder, f"pairs, {stems[0]} to {stems[-1]}")
     chosen = {name: paths[number] for name, paths in files.items()}
-    left, right = ([_last_number(path) for path in paths] for paths in files.values())
-    if left[number] != right[number] and {*left} & {*right} - {None}:
+    left, right = ([int((re.findall(r"\d+", path.stem) or [-1])[-1]) for path in paths] for paths in files.values())
+    if left[number] != right[number] and {*left} & {*right} - {-1}:
         found = " with ".join(path.name for path in chosen.values())
         hint = f"remove images without a partner, or name one pair by --images {names[0]}=FILE --images {names[1]}=FILE"
         raise InputError(folder, f"pair {number}", found, "images of the same number", hint)
@@ -78,22 +77,14 @@ def read_stereo_pair(folder: str | Path, options: ReadOptions) -> Capture:
     settings: dict[str, Any] = {"files": {name: file.relative_to(folder).as_posix() for name, file in chosen.items()}}
     if is_colour(chosen[names[0]]):
         settings["channel"] = channel_name(channel)
-    return pair_capture(levels, chosen, read, settings, sensor)
-
-
-def _last_number(path: Path) -> int | None:
-    digits = re.findall(r"\d+", path.stem)
-    return int(digits[-1]) if digits else None
+    return pair_capture(levels, chosen, read, settings, options.named)
 
 
 def names_of_pair(calibrated: Calibrated, where: str | Path) -> list[str]:
-    """Return the names of the left and the right camera of a calibration, which messages name ``where``.
-
-    Raises InputError if it is not that of a pair.
-    """
+    """Return the names of the left and the right camera of a calibration, which must be that of a pair."""
     names = list(calibrated.rig.cameras)[:2]
     if len(names) < 2 or calibrated.unrelated:
-        stated = f"{', '.join(names)}{', without the pose of the second' if calibrated.unrelated else ''}"
+        stated = ", ".join(names) + (", without the pose of the second" if calibrated.unrelated else "")
         hint = "; ".join([*calibrated.notes, _POSE])
         raise InputError(where, "cameras", stated, "two cameras with R and T: a stereo pair", hint)
     return names
@@ -108,16 +99,9 @@ def pair_capture(
 ) -> Capture:
     """Return the capture of a stereo pair.
 
-    Raises InputError if the size of an image differs from its camera's, or its type from that of the left one.
-
-    Parameters
-    ----------
-    levels, places
-        Images (H, W) [DN] by name of their camera, the left one first; file or topic of each, for messages.
-    calibrated, settings
-        The cameras, and records of the import.
-    sensor
-        Name of the sensor; by default that of the calibration, or ``stereo-pair``.
+    ``levels`` are images (H, W) [DN] by name of their camera, the left one first, ``places`` the file or topic of each,
+    and ``settings`` records of the import. Raises InputError if the size of an image differs from its camera's, or its
+    type from that of the left one.
     """
     first = next(iter(levels.values()))
     for name, image in levels.items():

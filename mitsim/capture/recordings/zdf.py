@@ -54,10 +54,7 @@ class Zdf:
 
 
 def read_zdf(path: Path) -> Zdf:
-    """Read a ``.zdf`` file.
-
-    Raises InputError if it is no netCDF-4 file, is damaged or too large, or has no point cloud.
-    """
+    """Read a ``.zdf`` file."""
     expected = "a .zdf file of Zivid"
     if read_bounded(path, expected, first=len(HDF5_MAGIC)) != HDF5_MAGIC:
         raise InputError(path, "", "a file that is not netCDF-4", expected, "save it again in Zivid Studio")

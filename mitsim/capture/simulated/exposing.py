@@ -33,11 +33,8 @@ from mitsim.sensor.transforms import Transform
 class LightOnImagers:
     """Light on the imagers from one pose: all inputs of a capture except the noise of the imagers.
 
-    - ``radiance``: (P, h, w) of each camera in its region [W / (mm^2 sr)].
-    - ``rois``: region of each camera's image.
-    - ``exposures``: exposure times [s].
-    - ``noise``: the sources of noise that are on.
-    - ``world_from_sensor``: pose of the sensor.
+    - ``radiance``: (P, h, w) of each camera in its region of ``rois`` [W / (mm^2 sr)].
+    - ``exposures``: exposure times [s]; ``noise``: the sources of noise that are on.
     - ``rendered``: settings of the rendering: scene, samples_per_pixel, light_path_depth, and indirect_light if it is
       rendered separately.
     - ``other``: (h, w) of each camera, the part of every image's radiance that is not the projector's: of a scene with
@@ -80,11 +77,8 @@ class UnitPatterns:
         Pixels are independent, so this is equivalent to another unit's patterns.
         """
         fixed, step = self.fixed, (rows, columns)
-        rolled = FixedPattern(
-            np.roll(fixed.offset, step, (0, 1)),
-            np.roll(fixed.response, step, (0, 1)),
-            np.roll(fixed.column, columns),
-        )
+        offset, response = (np.roll(values, step, (0, 1)) for values in (fixed.offset, fixed.response))
+        rolled = FixedPattern(offset, response, np.roll(fixed.column, columns))
         return UnitPatterns(rolled, None if self.delays is None else np.roll(self.delays, step, (0, 1)))
 
 
@@ -116,24 +110,10 @@ def brightest_images(sensor: Sensor, radiance: dict[str, NDArray[np.float32]]) -
 def expose_camera(
     sensor: Sensor, light: LightOnImagers, camera: str, patterns: UnitPatterns, stream: np.random.SeedSequence
 ) -> NDArray[np.unsignedinteger[Any]]:
-    """Expose the imager of a camera; return its images as grey levels (count, H, W).
+    """Expose the imager of a camera; return its images as grey levels (count, H, W); ``stream`` seeds the noise.
 
     All images at the shortest exposure come first, then those at the next. Pixels outside the region that is read out
     are 0.
-
-    Parameters
-    ----------
-    sensor
-        Sensor with the imager and the pattern.
-    light
-        Light on the imagers, with exposures and the sources of noise that are on.
-    camera, patterns, stream
-        Name of the camera, fixed patterns of the camera's imager, and seed of the noise.
-
-    See Also
-    --------
-    brightest_images : decide the exposures
-    capture_of : the capture of all cameras
     """
     imager, scale, noise, inside = sensor.imager, sensor.electrons(), light.noise, light.rois[camera].slices
     radiance, exposures = light.radiance[camera], light.exposures
@@ -165,20 +145,9 @@ def expose_camera(
 def capture_of(
     sensor: Sensor, light: LightOnImagers, images: dict[str, NDArray[np.unsignedinteger[Any]]], seed: int
 ) -> Capture:
-    """Return the capture of exposed images, with all that decoding needs and the settings of the simulation.
+    """Return the capture of the images of :func:`expose_camera`, with all that decoding needs and records.
 
-    Parameters
-    ----------
-    sensor, light
-        As for :func:`expose_camera`.
-    images
-        Images of each camera, from :func:`expose_camera`.
-    seed
-        Seed of the noise, for the record.
-
-    See Also
-    --------
-    expose_camera : the images of one camera
+    ``seed`` is that of the noise.
     """
     adc, exposures = converter(sensor.imager, light.noise), light.exposures
     whole = {name: Roi.whole(camera.width, camera.height) for name, camera in sensor.rig.cameras.items()}

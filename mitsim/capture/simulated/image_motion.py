@@ -36,18 +36,10 @@ def image_motion(
 
     Parameters
     ----------
-    before, world_from_sensor
-        Camera and pose of the sensor with which images are known.
-    after, other_world_from_sensor
-        Camera and pose with which they are asked for.
-    points
-        (n, 3) of the part [mm], world frame.
-    roi
-        Region of the images.
-
-    See Also
-    --------
-    moved_images : apply it to images
+    before, world_from_sensor, after, other_world_from_sensor
+        Camera and pose of the sensor with which images are known, and those with which they are asked for.
+    points, roi
+        (n, 3) of the part [mm], world frame; region of the images.
     """
     first = before.project(world_from_sensor.inverse().points(points))
     second = after.project(other_world_from_sensor.inverse().points(points))

@@ -91,10 +91,6 @@ def keep_light(
         :func:`~mitsim.scene.light_transport.plain_scene.distinct_bsdfs`. Paths are kept by their light in these.
     seed
         Of all random numbers.
-
-    See Also
-    --------
-    can_be_kept : whether it makes sense for a scene
     """
     bsdfs = distinct_bsdfs(scene)
     assert rendering.kept is not None

@@ -38,10 +38,8 @@ def blur_by_lens(image: NDArray[np.float32], imager: Imager, camera: Camera, roi
 
     Parameters
     ----------
-    image
-        (h, w) radiance of the region.
-    imager
-        Its blur at the centre and in the corner of the image.
+    image, imager
+        (h, w) radiance of the region; the blur at the centre and in the corner of the image.
     camera, roi
         Camera whose image has the region, and region of the camera's image.
     """

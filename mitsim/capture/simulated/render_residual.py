@@ -1,8 +1,5 @@
 """Measure the error of a rendering, relative to the noise that the sensor adds.
 
-Signal chain: one camera rendered three times -> differences in electrons -> divided by the standard deviation of the
-imager's temporal noise at that brightness.
-
 A rendering has two errors:
 
 - *Noise*. Directions of later bounces and of emitters are random, so another seed gives another image. Direct light
@@ -84,16 +81,10 @@ def render_residual(
 
     Parameters
     ----------
-    simulated, scene, world_from_sensor, camera, rendering
-        The rendering to check.
-    seed
-        Seed of the first rendering.
+    simulated, scene, world_from_sensor, camera, rendering, seed
+        The rendering to check, and the seed of the first one.
     around
         (n, 3) points in the sensor frame [mm]; only the part of the images around them is rendered. All if None.
-
-    See Also
-    --------
-    residual_of : of images that are rendered otherwise
     """
     roi = None if around is None else roi_around(simulated.sensor.rig.cameras[camera], around, 0)
 
@@ -154,10 +145,6 @@ def checked_rendering(
         Capture whose settings get ``render_residual`` (null if nothing is lit) and the warning.
     simulated, scene, world_from_sensor, rendering, seed
         Those of the capture. Images of the first camera are compared.
-
-    See Also
-    --------
-    render_residual : the errors alone
     """
     rig = simulated.sensor.rig
     residual = render_residual(simulated, scene, world_from_sensor, next(iter(rig.cameras)), rendering, seed=seed)

@@ -16,10 +16,8 @@ from mitsim.capture.simulated.indirect_light import IndirectLight, KeptSettings
 class IndirectImages:
     """Interreflections that ``SimulatedSensor.indirect_radiance`` rendered before, for each camera.
 
-    - ``images``: (P, h, w) of each camera in its region, before the lens [W / (mm^2 sr)].
-    - ``rois``: region of each camera's image.
-    - ``settings``: settings with which they were rendered.
-    - ``depth``: largest number of surfaces on a light path.
+    ``images`` are (P, h, w) in the region ``rois`` of each camera's image, before the lens [W / (mm^2 sr)]. ``depth``
+    is the largest number of surfaces on a light path.
     """
 
     images: dict[str, NDArray[np.float32]]
@@ -47,10 +45,9 @@ class Rendering:
 
     @classmethod
     def smoothed(cls, samples: int, depth: int, smoothing_px: float) -> Rendering:
-        """Return settings with as many paths for direct light as for interreflections, which are smoothed.
+        """Return settings with as many paths for direct light as for interreflections.
 
-        ``smoothing_px`` is the standard deviation of the filter over the interreflections on each shape; 0 for no
-        filter.
+        ``smoothing_px`` is the standard deviation of the filter over the interreflections on each shape; 0 for none.
         """
         return cls(samples, depth, IndirectLight(samples, smoothing_px) if smoothing_px > 0 and depth > 1 else None)
 
@@ -81,11 +78,7 @@ class Rendering:
     def records(self, scene: str, parameters: dict[str, str]) -> dict[str, Any]:
         """Return what a capture's settings say of the rendering of a scene with parameters, as JSON values."""
         given = {"scene_parameters": dict(sorted(parameters.items()))} if parameters else {}
-        out: dict[str, Any] = {
-            "scene": scene,
-            **given,
-            "samples_per_pixel": self.samples,
-            "light_path_depth": self.surfaces,
-        }
+        paths = {"samples_per_pixel": self.samples, "light_path_depth": self.surfaces}
+        out: dict[str, Any] = {"scene": scene, **given, **paths}
         indirect = self.indirect_settings
         return out if indirect is None else out | {"indirect_light": asdict(indirect)}

@@ -19,17 +19,6 @@ def room_image(
     """Return the radiance (h, w) of a region of a camera's image in the room's light alone [W / (mm^2 sr)].
 
     Its gradient is along the axes of the sensor frame at the middle of the working range, the same for all cameras.
-
-    Parameters
-    ----------
-    sensor
-        Sensor with a ``room``.
-    scene, world_from_sensor
-        Scene to light, and the pose of the sensor.
-    camera, rays
-        Name of the camera, and the rays of its pixel centres.
-    roi
-        Region of the image.
     """
     relative = SeenSurfaces.of(scene, rays, world_from_sensor, roi).room_radiance(directional_albedos(scene))
     eye, depth = sensor.rig.cameras[camera], float(np.mean(sensor.working_range_mm))

@@ -8,9 +8,8 @@ sensor's rule -> grey levels with noise (:mod:`mitsim.capture.simulated.exposing
 One seed determines everything: each camera has its own random streams for rendering, speckle and noise. Speckle is one
 draw for all images of a pose. The noise of the imager has a stream for each image.
 
-If only a part of the scene matters, only its region of each image is traced and exposed. Cameras read out a region of
-interest in the same way. The settings of the capture state the region. The rest of the image is missing, not dark, and
-has grey level 0.
+If only a part of the scene matters, only its region of each image is traced and exposed, as cameras read out a region
+of interest. The rest of the image is missing, not dark, and has grey level 0.
 """
 
 from __future__ import annotations
@@ -65,7 +64,6 @@ _DEFAULT = Rendering()
 class SimulatedSensor:
     """A sensor on the device, ready for any number of captures of any scene.
 
-    - ``sensor``: the sensor.
     - ``rays``: of each camera: rays for light paths, with the true calibration.
     - ``patterns``: the projector and its codes.
     - ``units``: fixed patterns of each camera's imager.
@@ -133,16 +131,10 @@ class SimulatedSensor:
         ----------
         scene, world_from_sensor, camera
             Scene to render, pose of the sensor, and name of the camera.
-        indirect, seed
-            Samples and smoothing of the interreflections, and seed of the light paths.
-        depth
-            Largest number of surfaces on a light path.
+        indirect, seed, depth
+            Samples and smoothing of the interreflections; seed of the light paths, and their most surfaces.
         roi
             Region of the image; by default all of it.
-
-        See Also
-        --------
-        radiance : all light
         """
         rays = self.rays[camera]
         roi = roi or rays.whole
@@ -173,18 +165,10 @@ class SimulatedSensor:
         ----------
         scene, world_from_sensor, camera
             Scene to render, pose of the sensor, and name of the camera.
-        rendering
-            Light paths, and interreflections that are rendered already.
-        seed
-            Seed of the light paths.
-        roi
-            Region of the image; by default all of it.
-        speckle
-            Speckle of the region; None for none.
-
-        See Also
-        --------
-        light : the radiance of all cameras, with exposures
+        rendering, seed
+            Light paths, interreflections that are rendered already, and seed of the light paths.
+        roi, speckle
+            Region of the image, by default all of it; its speckle, None for none.
         """
         return self._radiance(scene, world_from_sensor, camera, rendering, seed, roi, speckle)[0]
 
@@ -266,11 +250,6 @@ class SimulatedSensor:
             out. The rest has grey level 0. ``decoding.read_out`` states the region of each camera that has one.
         noise
             The sources of noise that are on; all by default.
-
-        Raises
-        ------
-        InputError
-            If the radiance or the exposure is not finite.
         """
         noise, sensor, prerendered = noise or Noise(), self.sensor, rendering.prerendered
         light, rois, other = {}, {}, dict[str, NDArray[np.float32]]()
@@ -316,12 +295,10 @@ class SimulatedSensor:
     ) -> Capture:
         """Return one capture: :meth:`light`, exposed once.
 
-        The same seed gives the same bytes. Use another seed for each capture.
-
         Parameters
         ----------
         scene, world_from_sensor, seed, rendering, around, noise
-            As for :meth:`light`; ``seed`` is also that of the noise.
+            As for :meth:`light`; ``seed`` is also that of the noise: the same one gives the same bytes.
         """
         light = self.light(scene, world_from_sensor, seed=seed, rendering=rendering, around=around, noise=noise)
         return self.expose(light, seed)

@@ -33,10 +33,8 @@ def true_images(
 
     Parameters
     ----------
-    simulated
-        Sensor, prepared.
-    scene, world_from_sensor
-        Scene that it sees, and pose of the sensor.
+    simulated, scene, world_from_sensor
+        Sensor, scene that it sees, and pose of the sensor.
     samples, depth, seed
         Light paths per pixel, surfaces on a light path, and seed, for the share of indirect light.
     """
@@ -67,13 +65,8 @@ def _true_image(
     white = ProjectedPatterns(np.ones(size, np.float32), projector)
 
     def light(surfaces_on_path: int) -> NDArray[np.float32]:
-        lit, ambient = trace(
-            scene,
-            simulated.rays[camera],
-            white,
-            world_from_sensor,
-            replace(paths, depth=surfaces_on_path),
-        )
+        of_depth = replace(paths, depth=surfaces_on_path)
+        lit, ambient = trace(scene, simulated.rays[camera], white, world_from_sensor, of_depth)
         return np.asarray(lit - ambient)
 
     direct, total = light(1), light(paths.depth)
