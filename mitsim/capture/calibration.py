@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from characterisation.files.documents import Document
@@ -21,7 +20,6 @@ Number = Annotated[float, Field(ge=-1e9, le=1e9)]
 Row3 = tuple[Number, Number, Number]
 Row4 = tuple[Number, Number, Number, Number]
 Side = Annotated[int, Field(ge=1, le=LONGEST_SIDE_PX)]
-
 
 #: largest element of R R^T - I of a rotation in the files of mitsim; chosen: they have more than six digits
 EXACT = 1e-6
@@ -119,7 +117,7 @@ def calibration_table(rig: Rig) -> dict[str, Any]:
 
 def pose_table(pose: Transform | None) -> dict[str, Any]:
     """Return the content of ``pose.json``, not yet checked."""
-    return {"world_from_sensor": None if pose is None else _rows(pose.matrix())}
+    return {"world_from_sensor": None if pose is None else pose.matrix().tolist()}
 
 
 def rig_of(document: CalibrationDocument) -> Rig:
@@ -140,9 +138,9 @@ def _camera_table(name: str, camera: Camera) -> dict[str, Any]:
         "model": camera.model,
         "width": int(camera.width),
         "height": int(camera.height),
-        "matrix": _rows(camera.matrix),
+        "matrix": np.asarray(camera.matrix, np.float64).tolist(),
         "distortion": np.ravel(camera.distortion).astype(float).tolist(),
-        "sensor_from_camera": _rows(camera.sensor_from_camera.matrix()),
+        "sensor_from_camera": camera.sensor_from_camera.matrix().tolist(),
     }
 
 
@@ -155,8 +153,3 @@ def _camera(document: CameraDocument) -> Camera:
         sensor_from_camera=Transform.from_matrix(document.sensor_from_camera),
         model=document.model,
     )
-
-
-def _rows(matrix: NDArray[np.float64]) -> list[list[float]]:
-    rows: list[list[float]] = np.asarray(matrix, np.float64).tolist()
-    return rows

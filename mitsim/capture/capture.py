@@ -86,13 +86,11 @@ class Capture:
                 raise ValueError(f"images of {name}: the cameras are {', '.join(self.rig.cameras)}")
             camera = self.rig.cameras[name]
             if stack.ndim != 3 or stack.shape[1:] != (camera.height, camera.width):
-                raise ValueError(
-                    f"images of {name}: shape {stack.shape}, but the camera has {camera.height} x {camera.width} pixels"
-                )
+                there = f"{camera.height} x {camera.width} pixels"
+                raise ValueError(f"images of {name}: shape {stack.shape}, but the camera has {there}")
         # decoders take the cameras in the order of the rig
-        object.__setattr__(
-            self, "images", {name: self.images[name] for name in self.rig.cameras if name in self.images}
-        )
+        ordered = {name: self.images[name] for name in self.rig.cameras if name in self.images}
+        object.__setattr__(self, "images", ordered)
         for name, values in self.derived.items():
             if name not in DERIVED_UNITS:
                 raise ValueError(f"map {name!r}: allowed are {', '.join(DERIVED_UNITS)}")

@@ -64,10 +64,8 @@ class CaptureDocument(Document):
 
 def capture_schema() -> dict[str, Any]:
     """Return the JSON schema (draft 2020-12) of ``capture.json``."""
-    schema = CaptureDocument.model_json_schema()
-    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
-    schema["title"] = "mitsim capture"
-    return schema
+    draft = "https://json-schema.org/draft/2020-12/schema"
+    return CaptureDocument.model_json_schema() | {"$schema": draft, "title": "mitsim capture"}
 
 
 def schema_text() -> str:

@@ -12,7 +12,7 @@
       truth/left.exr     true values at each pixel, in simulated captures that request them
       vendor/            the maker's own files, unchanged, if there are any
 
-The format is described in docs/reference/formats/capture-folder.md.
+docs/reference/formats/capture-folder.md describes the format.
 """
 
 from __future__ import annotations

@@ -44,7 +44,6 @@ _PFM = re.compile(rb"P[fF]\s+\d+\s+\d+\s+(\S{1,40})\s")
 
 Image = NDArray[np.unsignedinteger[Any]]
 
-
 #: fewest lower bits that are empty in all levels of images whose levels are in the upper bits; chosen
 _LEAST_EMPTY = 2
 
@@ -57,11 +56,6 @@ def channel_of(name: str | None) -> int:
     if name is not None and name not in CHANNELS:
         raise InputError("--channel", "", repr(name), " | ".join(CHANNELS))
     return CHANNELS[name or "green"]
-
-
-def channel_name(channel: int) -> str:
-    """Return the name of a channel by its number."""
-    return next(name for name, number in CHANNELS.items() if number == channel)
 
 
 def is_colour(path: Path) -> bool:

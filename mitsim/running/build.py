@@ -18,7 +18,6 @@ from characterisation.words.version import __version__
 #: packages whose files make up the build
 _OWN = ("characterisation", "mitsim")
 
-
 #: packages that can influence a capture or its metrics
 _PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "opencv-contrib-python-headless", "xarray")
 

@@ -75,10 +75,8 @@ class Executor(Protocol):
 
         Parameters
         ----------
-        items
-            What there is to do.
-        order, work
-            Plain value of an item, and the function of it.
+        items, order, work
+            What there is to do; plain value of an item, and the function of it.
         prepared
             Names of what a worker prepares for an item: a whole, of which it keeps the last, and a part of it; by
             default nothing.
@@ -302,10 +300,8 @@ def results_of(
 
     Parameters
     ----------
-    orders, work
-        Plain values, and a module-level function of one.
-    workers, label
-        None for this process; label of the progress on stderr.
+    orders, work, workers, label
+        Plain values; a module-level function of one; None for this process; label of the progress on stderr.
     """
     if workers is None:
         return [work(order) for order in track(orders, label)]

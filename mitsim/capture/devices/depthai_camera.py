@@ -17,15 +17,13 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import timedelta
-from importlib import import_module
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.files.errors import MissingEnvironmentError
 from mitsim.capture.devices.depthai_settings import DepthaiSettings, configuration, configure
-from mitsim.capture.devices.device_error import DeviceError
+from mitsim.capture.devices.device_error import DeviceError, imported
 from mitsim.capture.devices.live_camera import LiveCamera
 
 Image = NDArray[np.unsignedinteger[Any]]
@@ -139,12 +137,7 @@ def depthai() -> Any:
     """Import the package without its log messages, or raise an error with the installation command."""
     os.environ.setdefault("DEPTHAI_LEVEL", "error")  # it warns if there is no USB bus
     os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")  # mitsim handles Ctrl-C
-    try:
-        return import_module("depthai")
-    except ImportError:
-        raise MissingEnvironmentError(
-            "DepthAI cameras need depthai, which is not installed: pip install 'mitsim[depthai]'"
-        ) from None
+    return imported("depthai", "depthai", "DepthAI cameras", "depthai")
 
 
 def stereo_pipeline(pipeline: Any, settings: DepthaiSettings, dai: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any
 
 from characterisation.files.errors import MissingEnvironmentError
@@ -21,6 +22,15 @@ class DeviceError(MissingEnvironmentError):
     def __reduce__(self) -> tuple[Any, ...]:
         """Support pickling between processes."""
         return type(self), (self.where, self.operation, self.found, self.expected, self.hint)
+
+
+def imported(name: str, package: str, users: str, extra: str) -> Any:
+    """Import a module of a package, or raise an error with the installation command."""
+    try:
+        return import_module(name)
+    except ImportError:
+        hint = f"pip install 'mitsim[{extra}]'"
+        raise MissingEnvironmentError(f"{users} need {package}, which is not installed: {hint}") from None
 
 
 def check_open(where: str, operation: str, closed: bool, fault: str, again: str = "Open it again") -> None:

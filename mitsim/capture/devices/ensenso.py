@@ -17,7 +17,6 @@ from __future__ import annotations
 import json
 from contextlib import suppress
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -25,8 +24,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from characterisation.files.documents import Document
-from characterisation.files.errors import MissingEnvironmentError
-from mitsim.capture.devices.device_error import DeviceError
+from mitsim.capture.devices.device_error import DeviceError, imported
 from mitsim.capture.devices.ensenso_faults import fault_of, no_library
 from mitsim.capture.devices.live_camera import LiveCamera
 
@@ -132,7 +130,9 @@ class EnsensoCamera(LiveCamera):
             camera.capture({} if seconds is None else {"Timeout": round(1000 * seconds)})
             disparity = points = None
             if self.settings.maps:
-                disparity = _disparity(camera.compute_disparity_map().get_binary_data())
+                values = camera.compute_disparity_map().get_binary_data()[..., 0]
+                disparity = values.astype(np.float32) / DISPARITY_SCALE
+                disparity[values == NO_DISPARITY] = np.nan
                 points = np.asarray(camera.compute_point_map().get_binary_data(), np.float32)
             node = camera.get_node().value()
             if (node.get("Link") or {}).get("Target"):
@@ -143,8 +143,16 @@ class EnsensoCamera(LiveCamera):
             return EnsensoShot(node, self._images(), disparity, points, self._source(node))
 
     def _release(self) -> None:
-        self._restore()
-        with suppress(Exception):  # the camera may be disconnected
+        for path, value in reversed(self._before.items()):
+            with suppress(Exception):  # the camera may be disconnected
+                _write(self._item(f"Parameters/{path}"), value)
+        with suppress(Exception):
+            if self._link is not None:
+                self._item("Link").set_json(json.dumps(self._link), True)
+        with suppress(Exception):
+            if self._before:
+                self._synchronize()
+        with suppress(Exception):
             if self._camera is not None:
                 self._camera.close()
         with suppress(Exception):
@@ -212,20 +220,6 @@ class EnsensoCamera(LiveCamera):
             return "simulated"
         return "replay" if '"File"' in ports else "device"
 
-    def _restore(self) -> None:
-        """Restore the changed parameters, as far as the camera responds."""
-        for path, value in reversed(self._before.items()):
-            with suppress(Exception):
-                _write(self._item(f"Parameters/{path}"), value)
-        if self._link is not None:
-            with suppress(Exception):
-                self._item("Link").set_json(json.dumps(self._link), True)
-        if self._before:
-            with suppress(Exception):
-                self._synchronize()
-        self._before.clear()
-        self._link = None
-
     def _serials(self) -> list[str]:
         """Return the serial numbers of the stereo cameras that NxLib lists."""
         with suppress(Exception):
@@ -240,12 +234,7 @@ def open_ensenso(serial: str, settings: EnsensoSettings) -> EnsensoCamera:
     NxLib's shared library is that of the SDK, or of ``NXLIB_LIBRARY_PATH``. Raises MissingEnvironmentError without the
     package ``ensenso-nxlib``, DeviceError without the SDK, or if the camera cannot be opened or rejects the settings.
     """
-    try:
-        nxlib = import_module("nxlib")
-    except ImportError:
-        raise MissingEnvironmentError(
-            "Ensenso cameras need ensenso-nxlib, which is not installed: pip install 'mitsim[ensenso]'"
-        ) from None
+    nxlib = imported("nxlib", "ensenso-nxlib", "Ensenso cameras", "ensenso")
     try:
         return EnsensoCamera(serial, settings, nxlib)
     except OSError as error:  # CDLL's
@@ -260,8 +249,3 @@ def _write(item: Any, value: Value) -> None:
 def _image(item: Any) -> Images:
     data = item.get_binary_data()[..., 0]
     return data.view(np.uint16) if data.dtype == np.int16 else data  # type: ignore[no-any-return]  # read as signed
-
-
-def _disparity(data: NDArray[np.int16]) -> NDArray[np.float32]:
-    values = data[..., 0]
-    return np.where(values == NO_DISPARITY, np.float32(np.nan), values.astype(np.float32) / DISPARITY_SCALE)

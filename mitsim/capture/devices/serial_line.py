@@ -15,10 +15,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Protocol
 
-from characterisation.files.errors import InputError, MissingEnvironmentError
-from mitsim.capture.devices.device_error import DeviceError
+from characterisation.files.errors import InputError
+from mitsim.capture.devices.device_error import DeviceError, imported
 
 #: longest wait of one read of the port [s], which limits the precision of deadlines
 TICK_S = 0.02
@@ -171,7 +171,7 @@ def open_line(port: str, baud: int, where: str) -> SerialLine:
     ``rfc2217://host:port``), for which ``baud`` may have no effect. Raises DeviceError if the port does not open,
     InputError if its name is invalid, MissingEnvironmentError without pyserial.
     """
-    serial = pyserial()
+    serial = imported("serial", "pyserial", "stages", "hardware")
     try:
         opened = serial.serial_for_url(port, baud, timeout=TICK_S, write_timeout=WRITE_S, exclusive=True)
     except ValueError as error:
@@ -180,16 +180,6 @@ def open_line(port: str, baud: int, where: str) -> SerialLine:
     except Exception as error:  # OSError or an error of the platform; termios.error is not an OSError
         raise _not_opened(port, where, error) from None
     return SerialLine(opened, where)
-
-
-def pyserial() -> Any:
-    """Import pyserial, or raise an error with the installation command."""
-    try:
-        return import_module("serial")
-    except ImportError:
-        raise MissingEnvironmentError(
-            'stages need pyserial, which is not installed: pip install "mitsim[hardware]"'
-        ) from None
 
 
 def known_ports() -> list[str]:

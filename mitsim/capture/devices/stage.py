@@ -83,9 +83,8 @@ class LiveStage:
         self.identity = controller.identity
         self.axes = tuple(axis.name for axis in connection.axes)
         self.limits = tuple(axis.limits_deg for axis in connection.axes)
-        self.resolution = tuple(
-            step / abs(axis.gear) for axis, step in zip(connection.axes, controller.resolution, strict=True)
-        )
+        steps = zip(connection.axes, controller.resolution, strict=True)
+        self.resolution = tuple(step / abs(axis.gear) for axis, step in steps)
         self._controller, self._clock = controller, clock
         self._homed = connection.homing == "none"
         self._fault, self._closed, self._halted = "", False, False
@@ -202,9 +201,8 @@ class LiveStage:
             now = self._clock.now()
             if readings != last:
                 last, since = readings, now
-            there = all(
-                abs(a - b) <= step for a, b, step in zip(readings, targets, self._controller.resolution, strict=True)
-            )
+            places = zip(readings, targets, self._controller.resolution, strict=True)
+            there = all(abs(reading - target) <= step for reading, target, step in places)
             if moving is False or (moving is None and (there or now - since >= STANDSTILL_S)):
                 return
             if now >= deadline:

@@ -165,25 +165,18 @@ def _without_place(points: NDArray[np.floating]) -> NDArray[np.bool_]:
 
 
 def scale_to_mm(points: NDArray[np.floating], path: Path, unit: str | None = None, hint: str = "") -> tuple[str, float]:
-    """Scale points (..., 3) of a file to mm, in place; missing ones are NaN or (0, 0, 0), and become NaN.
+    """Scale points (..., 3) of a file to mm, in place; return their unit, and their median distance in it.
 
-    Raises InputError if there is no point, one is beyond :data:`FARTHEST_MM`, or the unit is neither given nor
-    plausible.
+    Missing ones are NaN or (0, 0, 0), and become NaN. Raises InputError if there is no point, one is beyond
+    :data:`FARTHEST_MM`, or the unit is neither given nor plausible.
 
     Parameters
     ----------
-    points, path
-        As in the file; the file, for messages.
+    points, path, hint
+        As in the file; for messages the file, and what to do if the points are too far away.
     unit
         One of :data:`~mitsim.sensor.calibration_qualifiers.LENGTHS_MM`; by default metres if the median distance is
         under :data:`METRES_UNDER`, else millimetres.
-    hint
-        What to do if the points are too far away.
-
-    Returns
-    -------
-    tuple of str and float
-        The unit, and the median distance of the points from the origin in it.
     """
     points[_without_place(points)] = np.nan
     seen = points[np.isfinite(points[..., 0])]

@@ -1,8 +1,5 @@
 """Read the points of a text: lines of x, y and z with any separators, a decimal point or comma, and names of columns.
 
-Signal chain: bytes -> text -> comments, names of columns and their unit -> separators and decimal mark -> numbers ->
-x, y, z.
-
 Names of columns, in a line before the numbers or a comment, tell which columns are x, y and z; without names they are
 the first three, unless these seem to count rows. The unit stands with the names (``x [mm]``, ``x_mm``), in a line below
 them, or in a line of its own (``units: mm``). A comma is the decimal mark if other separators stand between the numbers
@@ -143,9 +140,8 @@ def _with_points(rows: list[bytes]) -> list[bytes]:
     if mark is None or not any(mark + mark in row or row.startswith(mark) or row.endswith(mark) for row in rows):
         return rows
     count = max(row.rstrip(mark).count(mark) for row in sample)
-    return [
-        mark.join(field.strip() or b"nan" for field in (row.split(mark) + [b""] * count)[: count + 1]) for row in rows
-    ]
+    filled = ((row.split(mark) + [b""] * count)[: count + 1] for row in rows)
+    return [mark.join(field.strip() or b"nan" for field in fields) for fields in filled]
 
 
 def _has_decimal_commas(rows: list[bytes]) -> bool:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenEXR
 from numpy.typing import NDArray
 
 from characterisation.files.checked_files import read_bounded
@@ -20,14 +21,13 @@ from characterisation.files.errors import InputError
 from characterisation.words.numbers import percent
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
-from mitsim.capture.exr import EXR_MAGIC, exr_depths
 from mitsim.capture.grey_image import read_depths
 from mitsim.capture.npy import NPY_MAGIC
 from mitsim.capture.recordings.array_file import arrays_in, disparities, is_disparity, map_among, unit_of_depths
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
 from mitsim.capture.recordings.cloud_numbers import FAR_BEYOND, FARTHEST_MM, METRES_UNDER, NEITHER_ABOVE, near_note
 from mitsim.capture.recordings.read_options import ReadOptions
-from mitsim.capture.recordings.recording_files import frame_of
+from mitsim.capture.recordings.recording_files import EXR_MAGIC, frame_of
 from mitsim.capture.recordings.stated_scale import check_scale, scale_by_folder, stated_scales
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.png import LONGEST_SIDE_PX
@@ -36,6 +36,9 @@ Depth = NDArray[np.float32]
 
 #: beginning of the names of folders of disparities, such as KITTI's disp_occ_0, whose files are named by numbers alone
 _DISPARITIES = re.compile(r"disp(?:arit(?:y|ies))?s?(?![a-z])", re.IGNORECASE)
+
+#: names of the channel of an OpenEXR image that has depths, along the axis of the camera
+_CHANNELS = ("Z", "depth.Z", "depth.V", "depth.Y", "Depth.Z", "Depth.V")
 
 #: share of the pixels with one largest depth from which it may mean no depth; chosen
 _MARKED = 0.01
@@ -134,12 +137,26 @@ def _levels(path: Path, frame: int | None) -> tuple[NDArray[Any], dict[str, floa
         arrays = arrays_in(data, path)
         values = map_among(arrays, path, frame)
     else:
-        values = exr_depths(path) if data.startswith(EXR_MAGIC) else read_depths(path)
+        values = _exr_depths(path) if data.startswith(EXR_MAGIC) else read_depths(path)
     if values.ndim != 2 or not all(1 <= side <= LONGEST_SIDE_PX for side in values.shape):
         raise InputError(path, "shape", " x ".join(map(str, values.shape)), "depths of rows x columns")
     if values.dtype.kind != "f" and values.dtype not in (np.uint8, np.uint16):
         values = values.astype(np.uint16 if values.min() >= 0 and values.max() < 1 << 16 else np.float64)
     return values, dict(stated_scales(arrays)), unit_of_depths(arrays)
+
+
+def _exr_depths(path: Path) -> NDArray[Any]:
+    """Return the depths (H, W) of an OpenEXR image: of the channel of a depth, else of the only one, or equal ones."""
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as image:
+            channels = {name: np.array(channel.pixels) for name, channel in image.channels().items()}
+    except (RuntimeError, ValueError, KeyError) as error:
+        raise InputError(path, "", str(error), "a whole OpenEXR image") from None
+    named = [name for name in _CHANNELS if name in channels][:1]
+    values = [channels[name] for name in named or channels if name.rpartition(".")[2] != "A"]
+    if not values or any(not np.array_equal(values[0], other, equal_nan=True) for other in values[1:]):
+        raise InputError(path, "channels", ", ".join(channels) or "none", f"one channel, or one named {_CHANNELS[0]}")
+    return values[0].astype(np.float32) if values[0].dtype == np.float16 else values[0]
 
 
 def depth_capture(

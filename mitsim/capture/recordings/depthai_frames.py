@@ -1,8 +1,5 @@
 """Read frames of DepthAI's recordings: MCAP files of protobuf messages ``dai.proto.img_frame.ImgFrame``.
 
-Signal chain: sequence numbers of all frames of every stream -> numbers common to all streams -> for the chosen frame
-only: rows of pixels at the stride of the frame -> image; the camera matrix of its pixels.
-
 The file's own schema describes the message, so DepthAI is not needed. Files of several streams share the frames whose
 sequence numbers all of them have. Unnumbered frames are matched by their order.
 """

@@ -1,8 +1,5 @@
 """Read recordings of Luxonis' DepthAI (``RecordMessage``: MCAP files), with the device's calibration, as captures.
 
-Signal chain: streams by the names of their files -> one frame of each -> raw pair, else disparity, else depth ->
-rig of the calibration at the size of the images.
-
 Points are measured from the first of these that was recorded; the setting ``measured_from`` names it:
 
 raw pair
@@ -51,10 +48,7 @@ _LOOSE = 0.25
 
 
 def recorded_streams(path: str | Path) -> dict[str, Path]:
-    """Return the files of the streams ``left``, ``right``, ``disparity`` and ``depth``, recognised by their names.
-
-    Raises InputError if there is none, there are two of one stream, or there are videos instead.
-    """
+    """Return the files of the streams ``left``, ``right``, ``disparity`` and ``depth``, recognised by their names."""
     path = Path(path)
     if path.is_file():
         files = [path]
@@ -85,8 +79,7 @@ def read_depthai_recording(path: str | Path, options: ReadOptions) -> Capture:
     """Read one frame of a recording: an .mcap file, or a folder of them, one for each stream.
 
     The calibration is JSON as DepthAI saves it; by default ``calibration.json`` or the only ``*calib*.json`` beside the
-    streams. Raises InputError if a file is missing, damaged or lossily compressed, or not of the calibration and its
-    camera. Raises MissingEnvironmentError without the packages of the extra ``recordings``.
+    streams. Raises MissingEnvironmentError without the packages of the extra ``recordings``.
     """
     path = Path(path)
     streams = recorded_streams(path)
@@ -203,8 +196,7 @@ def _subpixel_bits(frame: RecordedFrame, depth: RecordedFrame | None, calibratio
 
 def _matrix(frame: RecordedFrame, calibration: DepthaiCalibration) -> NDArray[np.float64]:
     """Return K of a map's pixels: the frame's own, or that of the left camera at the frame's size."""
-    height, width = frame.image.shape
-    return frame.matrix if frame.matrix is not None else calibration.rig(width, height).reference.matrix
+    return frame.matrix if frame.matrix is not None else calibration.rig(*frame.image.shape[::-1]).reference.matrix
 
 
 def _without_skew(frame: RecordedFrame, calibration: DepthaiCalibration) -> NDArray[np.float64]:
@@ -221,11 +213,8 @@ def _pair(left: RecordedFrame, right: RecordedFrame, calibration: DepthaiCalibra
 
 def _disparity_rig(frame: RecordedFrame, calibration: DepthaiCalibration) -> Rig:
     """Return the calibrated pair, rectified as by the device: its rotations, and one K for both."""
-    height, width = frame.image.shape
-    rig = calibration.rig(width, height)
-    left, right = rig.cameras.values()
-    pair = stereo_rectification(left, right)
-    K = _without_skew(frame, calibration)
+    rig, K = calibration.rig(*frame.image.shape[::-1]), _without_skew(frame, calibration)
+    pair = stereo_rectification(*rig.cameras.values())
     return replace(rig, rectification=replace(pair, matrix_left=K, matrix_right=K))
 
 

@@ -1,7 +1,4 @@
-"""Read a folder of images of any structured-light rig as a capture.
-
-Signal chain: sensor file -> files of each camera, in order -> images, checked for number, size, bits and colour ->
-:class:`~mitsim.capture.capture.Capture` with the code and the decoder's settings of the sensor file.
+"""Read a folder of images of any structured-light rig as a capture, with the code and the decoder of a sensor file.
 
 Files are ordered by number: ``image_2.png`` comes before ``image_10.png``. Each page of a TIFF is an image. The sensor
 file's ``[pattern]`` describes the images; an ``image_sequence`` lists them in any order.
@@ -27,7 +24,6 @@ from mitsim.capture.grey_image import (
     SUFFIXES,
     Image,
     bits_of,
-    channel_name,
     check_size,
     from_bit_0,
     is_colour,
@@ -49,8 +45,7 @@ def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNEL
 
     Without ``[images]`` in the sensor file, a rig of one camera uses all images in the folder. A rig of two cameras
     uses those in the subfolders named after the cameras, or those whose names begin with the cameras' names. Of colour
-    images one ``channel`` is used. Raises InputError if the sensor is not a structured-light one, images are missing or
-    too many, or an image cannot be read or differs in size or depth from the sensor file.
+    images one ``channel`` is used.
     """
     folder, rig = Path(folder), sensor.rig
     code, decoder = sensor.pattern, sensor.settings
@@ -97,18 +92,14 @@ def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNEL
         near_mm=decoder.near_mm,
         far_mm=decoder.far_mm,
     )
-    settings: dict[str, Any] = {"imported_from": folder.resolve().name, "files": names}
-    if gaps:
-        settings["warnings"] = gaps
-    if colour:
-        settings["channel"] = channel_name(channel)
-    bits = sensor.bits
-    if bits is None:
-        bits = bits_of(images.values())
-        if bits > 8:
-            settings["bits_from"] = "the brightest pixel, since the sensor file has no imager.bits"
-    if empty:
-        settings["empty_bits"] = empty
+    bits = sensor.bits or bits_of(images.values())
+    by_levels = "the brightest pixel, since the sensor file has no imager.bits"
+    records: dict[str, Any] = {
+        "warnings": gaps,
+        "channel": list(CHANNELS)[channel] if colour else "",
+        "bits_from": by_levels if sensor.bits is None and bits > 8 else "",
+        "empty_bits": empty,
+    }
     return Capture(
         sensor=sensor.name,
         technology=sensor.technology,
@@ -117,7 +108,8 @@ def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNEL
         images=images,
         bits=bits,
         decoding=decoding,
-        settings=settings,
+        settings={"imported_from": folder.resolve().name, "files": names}
+        | {name: value for name, value in records.items() if value},
     )
 
 
@@ -208,15 +200,7 @@ def _check_levels(stack: Image, files: list[str], bits: int) -> None:
 
 
 def advice(files: list[Path], camera: str, count: int, ambient_image: bool) -> str:
-    """Return advice on images of a camera that are not ``count``: by their names, else on the pattern.
-
-    Parameters
-    ----------
-    files, camera
-        Files of the images, and name of the camera, as in the sensor file.
-    count, ambient_image
-        Number of images that the pattern needs, and whether the last of these is without the projector.
-    """
+    """Return advice on images of a camera that are not ``count``: by their names, else on the pattern."""
     if gap := gap_in(files):
         return gap
     shapes = Counter(re.sub(r"\d+", "*", path.name) for path in files)
@@ -229,9 +213,8 @@ def advice(files: list[Path], camera: str, count: int, ambient_image: bool) -> s
             )
     one_more = not ambient_image and len(files) == count + 1
     last = "write ambient_image = true, if the last has no light; or " if one_more else ""
-    return (
-        f"{last}correct [pattern], or name the files in [images] of the sensor file, or by --images {camera}='PATTERN'"
-    )
+    by_name = f"name the files in [images] of the sensor file, or by --images {camera}='PATTERN'"
+    return f"{last}correct [pattern], or {by_name}"
 
 
 def _content(folder: Path, cameras: list[str]) -> str:

@@ -1,8 +1,5 @@
 """Read organised point clouds in PLY, PCD, ZDF and NumPy files as captures.
 
-Signal chain: file -> points on their grid -> axes and unit -> inverse of an Ensenso's ``Link`` -> the camera of the
-grid, fitted or given -> points in the sensor frame [mm], NaN where missing.
-
 A device with a rectified pair outputs its points on the pixels and in the frame of the *rectified* left camera. The
 sensor frame of mitsim is that of the raw first camera. The points are therefore rotated by the rectifying rotation,
 from the ``--link`` file or from a calibration with a rectification.
@@ -84,8 +81,7 @@ def read_stored_cloud(path: Path) -> StoredCloud:
     """Read a PLY, PCD, ZDF or NumPy file of another program; what its bytes are counts, not its suffix.
 
     A PLY often does not state its grid, though it has a point for every pixel, as PhoXi Control and Zivid Studio write
-    it: the grid is then found from the points. Raises InputError if the file is damaged, of none of these formats, or
-    was written by mitsim.
+    it: the grid is then found from the points.
     """
     expected = "a PLY, PCD, ZDF or NumPy file"
     if path.suffix.lower() == ".zdf" or read_bounded(path, expected, first=len(HDF5_MAGIC)) == HDF5_MAGIC:

@@ -87,9 +87,8 @@ def _with_lens(points: NDArray[np.floating], start: tuple[float, float, float, f
     even = (slice(0, None, 2),)
     try:
         with np.errstate(all="ignore"):
-            fit = least_squares(
-                residuals, first, args=even, bounds=(-limits, limits), x_scale=scale, max_nfev=_MOST_STEPS
-            )
+            bounds = (-limits, limits)
+            fit = least_squares(residuals, first, args=even, bounds=bounds, x_scale=scale, max_nfev=_MOST_STEPS)
     except ValueError:  # numbers that are not finite
         return None
     fx, fy, cx, cy, *lens = fit.x.tolist()
@@ -125,11 +124,9 @@ def grid_of(points: NDArray[np.floating]) -> tuple[int, int] | None:
     for width in range(_NARROWEST, min(count // _NARROWEST, LONGEST_SIDE_PX) + 1):
         if count % width or count // width > LONGEST_SIDE_PX:
             continue
-        off = [
-            _residual(design, coordinates) for design, coordinates in ((across, used % width), (down, used // width))
-        ]
-        if best is None or max(off) < best[0]:
-            best = max(off), (width, count // width)
+        off = max(_residual(across, used % width), _residual(down, used // width))
+        if best is None or off < best[0]:
+            best = off, (width, count // width)
     return best[1] if best is not None and best[0] <= _LOOSE_PX else None
 
 

@@ -7,10 +7,9 @@ from typing import Any
 
 from characterisation.files.errors import InputError
 from characterisation.files.toml_tables import read_toml_table
-from mitsim.capture.exr import EXR_MAGIC
 from mitsim.capture.npy import NPY_MAGIC
 from mitsim.capture.recordings.calibration_file import is_euroc
-from mitsim.capture.recordings.recording_files import BAG_MAGIC, MCAP_MAGIC, SQLITE_MAGIC
+from mitsim.capture.recordings.recording_files import BAG_MAGIC, EXR_MAGIC, MCAP_MAGIC, SQLITE_MAGIC
 from mitsim.capture.recordings.robi import is_robi
 from mitsim.capture.recordings.zdf import HDF5_MAGIC
 from mitsim.sensor.preset import named_sensor
@@ -60,8 +59,10 @@ _RECORDED_ALONE = frozenset({".zip", ".enscam", ".ply", ".pcd", ".mcap", ".bag",
 
 #: files that are not read: what they are, what is read instead, and how to make it
 _NOT_READ = {
-    ".raw": ("bytes without their size", "a 16-bit PNG, or an .npy: np.fromfile(...).reshape(rows, columns)", ""),
-    ".bin": ("bytes without their size", "a 16-bit PNG, or an .npy: np.fromfile(...).reshape(rows, columns)", ""),
+    **dict.fromkeys(
+        (".raw", ".bin"),
+        ("bytes without their size", "a 16-bit PNG, or an .npy: np.fromfile(...).reshape(rows, columns)", ""),
+    ),
     ".praw": (
         "a .praw of PhoXi Control, whose format Photoneo has not published",
         "a cloud that PhoXi Control saves as organised PLY",

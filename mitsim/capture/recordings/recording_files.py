@@ -27,6 +27,9 @@ BAG_MAGIC = b"#ROSBAG V"
 #: first bytes of an SQLite file, such as a ROS 2 bag
 SQLITE_MAGIC = b"SQLite format 3\0"
 
+#: first bytes of an OpenEXR image
+EXR_MAGIC = b"\x76\x2f\x31\x01"
+
 #: largest number of files in one recording
 MOST_FILES = 10_000
 
@@ -89,9 +92,8 @@ def needs_recordings(path: Path, kind: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        raise MissingEnvironmentError(
-            f"{path}: {kind} needs packages that are not installed ({error.name}): pip install 'mitsim[recordings]'"
-        ) from None
+        found, hint = f"packages that are not installed ({error.name})", "pip install 'mitsim[recordings]'"
+        raise MissingEnvironmentError(f"{path}: {kind} needs {found}: {hint}") from None
 
 
 def plain_name(name: str) -> str:

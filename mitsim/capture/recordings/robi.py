@@ -1,8 +1,7 @@
 """Read one view of the ROBI data set, shiny metal parts in a bin seen by an Ensenso or a RealSense, as a capture.
 
-Signal chain: ``Scene_N/<sensor>`` folder -> view, by its number in ``list.txt`` -> ``StereoPattern`` pair and the
-device's own ``Depth`` -> cameras of ``cam/<sensor>_LEFT.yml``, ``_RIGHT.yml`` and ``_DEPTH.yml`` -> capture for the
-matcher, with the device's depth and its pose.
+A view, by its number in ``list.txt`` of ``Scene_N/<sensor>``, has a ``StereoPattern`` pair, the device's own ``Depth``
+with its pose, and the cameras of ``cam/<sensor>_LEFT.yml``, ``_RIGHT.yml`` and ``_DEPTH.yml``.
 
 The data set (Yang, Gao, Li and Waslander, IROS 2021) contains rectified images. Its reader (ROBI_Toolkit, ``inout.py``)
 computes the disparity of a depth Z as f B / Z - (cx_right - cx_left) + ``disparity_shift``: the images of the RealSense

@@ -123,9 +123,8 @@ def _by_name(topics: Iterable[Topic]) -> dict[str, Topic]:
 
 def _of_ros1(path: Path) -> RosBag:
     with _in_words(path), Reader(path) as reader:
-        topics = _by_name(
-            Topic(one.topic, one.msgtype, one.msgcount, True, one.digest or "") for one in reader.connections
-        )
+        found = (Topic(one.topic, one.msgtype, one.msgcount, True, one.digest or "") for one in reader.connections)
+        topics = _by_name(found)
 
     def message(name: str, number: int) -> bytes:
         with _in_words(path), Reader(path) as reader:

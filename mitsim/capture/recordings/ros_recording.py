@@ -1,8 +1,5 @@
 """Read a depth image, an organised cloud or a stereo pair of a bag of ROS as a capture.
 
-Signal chain: bag -> topic, chosen or the only one that fits -> one message of it -> its ``camera_info``, or the
-calibration of the user -> capture.
-
 A ``camera_info`` belongs to the images whose topic begins like its own: ``/camera/depth/camera_info`` to
 ``/camera/depth/image_rect_raw``. Images with the word ``rect`` in their topic are rectified: their camera is the
 projection matrix.
@@ -198,7 +195,6 @@ def _of_same_time(bag: RosBag, topic: Topic, first: Any, number: int) -> tuple[A
 
 #: largest difference in time of the two images of a pair; assumed: under a quarter of a frame at 60 Hz
 _SAME_TIME_S = 0.004
-
 
 #: names of topics of rectified images; a transport may follow
 _RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:_[^/]*)?(?:/compressed(?:Depth)?)?$")

@@ -1,8 +1,4 @@
-"""Read a stereo pair saved as two images, with the calibration of its cameras, as a capture.
-
-Signal chain: images whose names begin with those of the two cameras -> pairs ordered by number -> the chosen pair, the
-green channel of colour images -> capture for the matcher.
-"""
+"""Read a stereo pair saved as two images, with the calibration of its cameras, as a capture for the matcher."""
 
 from __future__ import annotations
 
@@ -17,10 +13,10 @@ from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_image import (
+    CHANNELS,
     SUFFIXES,
     Image,
     bits_of,
-    channel_name,
     channel_of,
     from_bit_0,
     is_colour,
@@ -47,8 +43,7 @@ def read_stereo_pair(folder: str | Path, options: ReadOptions) -> Capture:
 
     A folder of EuRoC has its own calibration; any other has two cameras, the left one first. ``images`` are patterns of
     file names for cameras whose images are not named after them. ``frame`` is the number of the pair, counted from 0,
-    or the name of its left image. Raises InputError if an image is missing or does not fit the calibration, or there
-    are several pairs and none was chosen.
+    or the name of its left image; required if there are several. Of colour images one ``channel`` is used.
     """
     folder = Path(folder)
     own = str(folder) if is_euroc(folder) else None
@@ -76,7 +71,7 @@ def read_stereo_pair(folder: str | Path, options: ReadOptions) -> Capture:
     read = read_calibration(calibration, (first.shape[1], first.shape[0]))
     settings: dict[str, Any] = {"files": {name: file.relative_to(folder).as_posix() for name, file in chosen.items()}}
     if is_colour(chosen[names[0]]):
-        settings["channel"] = channel_name(channel)
+        settings["channel"] = list(CHANNELS)[channel]
     return pair_capture(levels, chosen, read, settings, options.named)
 
 

@@ -89,7 +89,5 @@ def moved_images(images: NDArray[np.float32], motion: NDArray[np.float64] | None
     """Return images (P, h, w) after a motion of :func:`image_motion`; None leaves them as they are."""
     if motion is None or not images.size:
         return images
-    size, flags = images.shape[:0:-1], cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return np.stack(
-        [cv2.warpAffine(image, motion, size, flags=flags, borderMode=cv2.BORDER_REPLICATE) for image in images]
-    )
+    size, flags, border = images.shape[:0:-1], cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, cv2.BORDER_REPLICATE
+    return np.stack([cv2.warpAffine(image, motion, size, flags=flags, borderMode=border) for image in images])

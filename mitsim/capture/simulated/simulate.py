@@ -35,11 +35,11 @@ from mitsim.capture.simulated.exposing import (
 from mitsim.capture.simulated.indirect_light import IndirectLight, smoothed
 from mitsim.capture.simulated.lens_blur import blur_by_lens
 from mitsim.capture.simulated.rendering import Rendering
-from mitsim.capture.simulated.room_image import room_image
 from mitsim.capture.simulated.surface_speckle import draw_speckle
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.plain_scene import has_emitters, single_plane
 from mitsim.scene.light_transport.projected_codes import ModulatedLight, ProjectedLight, ProjectedPatterns
+from mitsim.scene.light_transport.room_light import SeenSurfaces, directional_albedos
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays
@@ -215,11 +215,23 @@ class SimulatedSensor:
         in_threads(finish_projected, projected)
         other = ambient_images[0].copy() if lamps else None
         if self.sensor.room is not None:
-            room = room_image(self.sensor, scene, world_from_sensor, camera, self.pixel_rays(camera), roi)
-            room = self.apply_lens(room, camera, roi)
+            room = self.apply_lens(self._room_image(scene, world_from_sensor, camera, roi), camera, roi)
             images += room
             other = room if other is None else other + room
         return images[: self.patterns.count + ambient_image], other
+
+    def _room_image(self, scene: Scene, world_from_sensor: Transform, camera: str, roi: Roi) -> NDArray[np.float32]:
+        """Return the radiance (h, w) in the light of the sensor file's ``[room]`` alone, before the lens.
+
+        Its gradient is along the axes of the sensor frame at the middle of the working range, the same for all cameras.
+        """
+        surfaces = SeenSurfaces.of(scene, self.pixel_rays(camera), world_from_sensor, roi)
+        relative = surfaces.room_radiance(directional_albedos(scene))
+        eye, depth = self.sensor.rig.cameras[camera], float(np.mean(self.sensor.working_range_mm))
+        pixels = np.stack(roi.pixels(), axis=-1).astype(float)
+        directions = eye.sensor_from_camera.directions(eye.rays_to_fold(pixels))
+        points = eye.centre + directions * ((depth - eye.centre[2]) / directions[..., 2:])
+        return np.asarray(relative * self.sensor.room_irradiance(points), np.float32)
 
     def apply_lens(self, image: NDArray[np.float32], camera: str, roi: Roi) -> NDArray[np.float32]:
         """Return the image (h, w) of a region, blurred by a camera's lens and darkened toward the corners."""

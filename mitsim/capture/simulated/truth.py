@@ -39,9 +39,8 @@ def true_images(
         Light paths per pixel, surfaces on a light path, and seed, for the share of indirect light.
     """
     paths = LightPaths(samples=samples, seed=seed, depth=max(depth, 3), with_ambient=True)
-    return {
-        name: _true_image(simulated, scene, world_from_sensor, name, paths) for name in simulated.sensor.rig.cameras
-    }
+    cameras = simulated.sensor.rig.cameras
+    return {name: _true_image(simulated, scene, world_from_sensor, name, paths) for name in cameras}
 
 
 def _true_image(
