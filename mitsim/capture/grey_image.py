@@ -206,7 +206,7 @@ def _checked(image: NDArray[Any], where: str | Path) -> Image:
     return np.asarray(image)
 
 
-def check_size(image: Image, size: tuple[int, int], where: str | Path, reason: str) -> None:
+def check_image_size(image: Image, size: tuple[int, int], where: str | Path, reason: str) -> None:
     """Check that an image has the ``size`` (width, height) [px]; the error at ``where`` says its ``reason``."""
     if image.shape != size[::-1]:
         found = f"{image.shape[1]} x {image.shape[0]} px"

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.capture.devices.depthai_settings import DepthaiSettings, configuration, configure
-from mitsim.capture.devices.device_error import DeviceError, imported
+from mitsim.capture.devices.device_error import DeviceError, imported_package
 from mitsim.capture.devices.live_camera import LiveCamera
 
 Image = NDArray[np.unsignedinteger[Any]]
@@ -73,7 +73,7 @@ class DepthaiCamera(LiveCamera):
             self._pipeline.start()
             self._light(settings.dot_projector, settings.flood_light)
             for _ in range(settings.warm_up_frames):
-                aligned(self._queues, settings.timeout_s, self.where)
+                aligned_frames(self._queues, settings.timeout_s, self.where)
 
     def take(self) -> DepthaiShot:
         """Take one capture; its frames are exposed after the call.
@@ -87,14 +87,14 @@ class DepthaiCamera(LiveCamera):
                 for old in queue.tryGetAll():
                     newest = max(newest, old.getSequenceNum())
             # the frame in progress may have begun before the call: skip one more
-            frames = aligned(self._queues, self.settings.timeout_s, self.where, newest + 2)
+            frames = aligned_frames(self._queues, self.settings.timeout_s, self.where, newest + 2)
             begin = self._dai.CameraExposureOffset.START
             while any(frames[name].getTimestamp(begin) < asked for name in _IMAGES):  # more may be on their way
                 if time.monotonic() >= deadline:
                     fault = f"no frame exposed after the call within {self.settings.timeout_s:g} s"
                     raise DeviceError(self.where, "capture", fault, "frames", "Close and open the camera again")
                 number = frames["left"].getSequenceNum()
-                frames = aligned(self._queues, self.settings.timeout_s, self.where, number + 1)
+                frames = aligned_frames(self._queues, self.settings.timeout_s, self.where, number + 1)
             self._last = frames["left"].getSequenceNum()
             settings = {
                 "maker": "Luxonis",
@@ -137,7 +137,7 @@ def depthai() -> Any:
     """Import the package without its log messages, or raise an error with the installation command."""
     os.environ.setdefault("DEPTHAI_LEVEL", "error")  # it warns if there is no USB bus
     os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")  # mitsim handles Ctrl-C
-    return imported("depthai", "depthai", "DepthAI cameras", "depthai")
+    return imported_package("depthai", "depthai", "DepthAI cameras", "depthai")
 
 
 def stereo_pipeline(pipeline: Any, settings: DepthaiSettings, dai: Any) -> Any:
@@ -186,7 +186,7 @@ def frame_settings(frame: Any) -> dict[str, Any]:
     return {name: value for name, value in read.items() if value is not None}
 
 
-def aligned(
+def aligned_frames(
     queues: Mapping[str, Any], timeout_s: float, where: str, first: int = 0, now: Callable[[], float] = time.monotonic
 ) -> dict[str, Any]:
     """Return the next frames of a common sequence number, ``first`` or more, one from each queue.

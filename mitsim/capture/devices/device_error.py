@@ -24,7 +24,7 @@ class DeviceError(MissingEnvironmentError):
         return type(self), (self.where, self.operation, self.found, self.expected, self.hint)
 
 
-def imported(name: str, package: str, users: str, extra: str) -> Any:
+def imported_package(name: str, package: str, users: str, extra: str) -> Any:
     """Import a module of a package, or raise an error with the installation command."""
     try:
         return import_module(name)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from characterisation.files.documents import Document
-from mitsim.capture.devices.device_error import DeviceError, imported
+from mitsim.capture.devices.device_error import DeviceError, imported_package
 from mitsim.capture.devices.ensenso_faults import fault_of, no_library
 from mitsim.capture.devices.live_camera import LiveCamera
 
@@ -234,7 +234,7 @@ def open_ensenso(serial: str, settings: EnsensoSettings) -> EnsensoCamera:
     NxLib's shared library is that of the SDK, or of ``NXLIB_LIBRARY_PATH``. Raises MissingEnvironmentError without the
     package ``ensenso-nxlib``, DeviceError without the SDK, or if the camera cannot be opened or rejects the settings.
     """
-    nxlib = imported("nxlib", "ensenso-nxlib", "Ensenso cameras", "ensenso")
+    nxlib = imported_package("nxlib", "ensenso-nxlib", "Ensenso cameras", "ensenso")
     try:
         return EnsensoCamera(serial, settings, nxlib)
     except OSError as error:  # CDLL's

@@ -67,7 +67,7 @@ class Grbl:
     """GRBL on a serial line; a :class:`~mitsim.capture.devices.stage.Controller`."""
 
     def __init__(self, connection: StageConnection, line: SerialLine) -> None:
-        self._line, self._connection, self._fault = line, connection, connection.fault
+        self._line, self._connection, self._fault = line, connection, connection.stage_fault
         self._columns = tuple("XYZ".index(axis.channel) for axis in connection.axes)
         self._offset: tuple[float, ...] | None = None
         self._homing = False

@@ -47,7 +47,7 @@ class PanTiltUnit:
     """A PTU on a serial line; a :class:`~mitsim.capture.devices.stage.Controller`."""
 
     def __init__(self, connection: StageConnection, line: SerialLine) -> None:
-        self._line, self._connection, self._fault = line, connection, connection.fault
+        self._line, self._connection, self._fault = line, connection, connection.stage_fault
         self._channels = tuple(axis.channel for axis in connection.axes)
         line.send(b" H ")  # stop a motion left by an earlier program
         self._make_terse()

@@ -18,7 +18,7 @@ from importlib import import_module
 from typing import Protocol
 
 from characterisation.files.errors import InputError
-from mitsim.capture.devices.device_error import DeviceError, imported
+from mitsim.capture.devices.device_error import DeviceError, imported_package
 
 #: longest wait of one read of the port [s], which limits the precision of deadlines
 TICK_S = 0.02
@@ -171,7 +171,7 @@ def open_line(port: str, baud: int, where: str) -> SerialLine:
     ``rfc2217://host:port``), for which ``baud`` may have no effect. Raises DeviceError if the port does not open,
     InputError if its name is invalid, MissingEnvironmentError without pyserial.
     """
-    serial = imported("serial", "pyserial", "stages", "hardware")
+    serial = imported_package("serial", "pyserial", "stages", "hardware")
     try:
         opened = serial.serial_for_url(port, baud, timeout=TICK_S, write_timeout=WRITE_S, exclusive=True)
     except ValueError as error:

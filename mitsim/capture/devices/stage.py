@@ -137,7 +137,7 @@ class LiveStage:
         """
         with self._stopped_on_error("stop"):
             if not self._halt():
-                raise self.connection.fault("stop", "no confirmation", "axes that stand")
+                raise self.connection.stage_fault("stop", "no confirmation", "axes that stand")
 
     def close(self) -> None:
         """Stop the axes if they are not stopped yet, and close the port; further calls do nothing."""
@@ -173,7 +173,7 @@ class LiveStage:
     def _check_homed(self, operation: str) -> None:
         if not self._homed and not self._fault and not self._closed:
             hint = "Its zero is unknown after power-up and after every fault"
-            raise self.connection.fault(operation, "a stage that has not been homed", "home() first", hint)
+            raise self.connection.stage_fault(operation, "a stage that has not been homed", "home() first", hint)
 
     def _halt(self) -> bool:
         self._halted = self._controller.halt()
@@ -209,7 +209,7 @@ class LiveStage:
                 angles = zip(self.axes, self._angles(readings), strict=True)
                 found = f"axes that still move, at {', '.join(f'{name} {angle:.3f}' for name, angle in angles)} deg"
                 expected = "arrival in the time that follows from distance and speed"
-                raise self.connection.fault("move", found, expected, "Check for a blocked axis")
+                raise self.connection.stage_fault("move", found, expected, "Check for a blocked axis")
             self._clock.sleep(POLL_S)
 
     def _check_arrival(self, requested: Sequence[float], position: Angles) -> None:
@@ -217,7 +217,7 @@ class LiveStage:
             if not abs(angle - target) <= self.connection.tolerance_deg:
                 found, hint = f"an axis that stands at {angle:.3f} deg", "Check for a blocked axis, or a manual stop"
                 expected = f"{target:.3f} deg within {self.connection.tolerance_deg:g}"
-                raise self.connection.fault("move", found, expected, hint, name)
+                raise self.connection.stage_fault("move", found, expected, hint, name)
 
     @contextmanager
     def _stopped_on_error(self, operation: str) -> Iterator[None]:

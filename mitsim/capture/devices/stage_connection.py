@@ -115,7 +115,7 @@ class StageConnection(Document):
         """Return the baud rate; by default that of the kind."""
         return self.baud if self.baud is not None else BAUD[self.kind]
 
-    def fault(self, operation: str, found: str, expected: str, hint: str = "", axis: str = "") -> DeviceError:
+    def stage_fault(self, operation: str, found: str, expected: str, hint: str = "", axis: str = "") -> DeviceError:
         """Return an error of the stage, or of one ``axis`` of it."""
         return DeviceError(f"{self.where}, axis {axis}" if axis else self.where, operation, found, expected, hint)
 
@@ -127,7 +127,9 @@ class StageConnection(Document):
         """Reject a device that is not the ``model`` of the connection."""
         if self.model.lower() not in identity.lower():
             expected = f"a device whose name contains {self.model!r}"
-            raise self.fault("identify", repr(identity), expected, "Check the port, or correct stage.connection.model")
+            raise self.stage_fault(
+                "identify", repr(identity), expected, "Check the port, or correct stage.connection.model"
+            )
 
     def check_steps(self, index: int, steps_per_deg: float) -> None:
         """Reject a device whose steps differ from the connection's: the angles would be wrong by the ratio."""
@@ -135,4 +137,6 @@ class StageConnection(Document):
         wanted = axis.steps_per_deg
         if wanted is not None and not math.isclose(steps_per_deg, wanted, rel_tol=1e-3):
             hint = "Check the device, or correct steps_per_deg or the device's setting"
-            raise self.fault("identify", f"{steps_per_deg:.6g} steps in a degree", f"{wanted:.6g}", hint, axis.name)
+            raise self.stage_fault(
+                "identify", f"{steps_per_deg:.6g} steps in a degree", f"{wanted:.6g}", hint, axis.name
+            )

@@ -26,7 +26,7 @@ import numpy as np
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
-from mitsim.capture.grey_image import Image, check_size, decode_grey
+from mitsim.capture.grey_image import Image, check_image_size, decode_grey
 from mitsim.capture.recordings.nxlib_calibration import NxLibTree, nxlib_rig, sensor_from_workspace
 from mitsim.capture.recordings.recording_files import chosen_frame, plain_name, recorded_files, recorded_names
 
@@ -54,7 +54,7 @@ def read_ensenso(path: str | Path, *, dynamic: bool = True, frame: int | None = 
     left, right = images[: len(images) // 2], images[len(images) // 2 :]
     height, width = left[0].shape
     for name, image in zip(names, images, strict=True):
-        check_size(image, (width, height), f"{path}/{name}", "as the left image")
+        check_image_size(image, (width, height), f"{path}/{name}", "as the left image")
     if tree.has("Sensor/Size") and tree.numbers("Sensor/Size", (2,)).tolist() != [width, height]:
         raise tree.fault("Sensor/Size", f"{width} x {height} px, as the images are; binned ones are not read")
     decoding, settings = _decoding(tree), _settings(tree, dynamic)

@@ -24,7 +24,7 @@ from mitsim.capture.grey_image import (
     SUFFIXES,
     Image,
     bits_of,
-    check_size,
+    check_image_size,
     from_bit_0,
     is_colour,
     page_count,
@@ -66,7 +66,7 @@ def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNEL
         counts = [page_count(path) for path in paths]
         if sum(counts) != count:
             found = f"{sum(counts)}, {paths[0].name} to {paths[-1].name}" if paths else "0"
-            hint = advice(paths, name, count, sensor.ambient_image) if paths else _content(folder, used)
+            hint = advice_on_number(paths, name, count, sensor.ambient_image) if paths else _content(folder, used)
             raise InputError(folder, f"images of {name}", found, f"{count}, as the pattern of {sensor.name}", hint)
         if (gap := gap_in(paths)) and not isinstance((sensor.images or {}).get(name), list):
             gaps.append(f"images of {name}: {gap}")
@@ -178,7 +178,7 @@ def _stack(files: list[Path], counts: list[int], camera: Camera, channel: int) -
 
     def read(index: int) -> None:
         for number, image in enumerate(read_pages(files[index], channel=channel), sum(counts[:index])):
-            check_size(image, (camera.width, camera.height), labels[number], "as the calibration says")
+            check_image_size(image, (camera.width, camera.height), labels[number], "as the calibration says")
             if image.dtype != first.dtype:
                 allowed = f"{first.itemsize * 8}, as {files[0].name}"
                 raise InputError(labels[number], "depth", f"{image.itemsize * 8} bits", allowed)
@@ -199,7 +199,7 @@ def _check_levels(stack: Image, files: list[str], bits: int) -> None:
         raise InputError(files[0], "depth", "8 bits", f"more: imager.bits is {bits}", hint)
 
 
-def advice(files: list[Path], camera: str, count: int, ambient_image: bool) -> str:
+def advice_on_number(files: list[Path], camera: str, count: int, ambient_image: bool) -> str:
     """Return advice on images of a camera that are not ``count``: by their names, else on the pattern."""
     if gap := gap_in(files):
         return gap

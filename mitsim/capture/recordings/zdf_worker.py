@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 NAMES = ("pointcloud", "xyz", "x", "y", "z", "snr", "contrast", "rgba_image", "rgb_image")
 
 
-def search(group: Any, most: int, arrays: dict[str, NDArray[Any]], numbers: dict[str, float]) -> None:
+def _search(group: Any, most: int, arrays: dict[str, NDArray[Any]], numbers: dict[str, float]) -> None:
     """Add the arrays of a group and its groups, the first ``matrix`` and ``distortion``, and the single numbers.
 
     The process ends if an array has more than 4 ``most`` values.
@@ -47,7 +47,7 @@ def search(group: Any, most: int, arrays: dict[str, NDArray[Any]], numbers: dict
         if value.size == 1 and value.dtype.kind in "fiu":
             numbers.setdefault(name.lower(), float(value.ravel()[0]))
     for inner in group.groups.values():
-        search(inner, most, arrays, numbers)
+        _search(inner, most, arrays, numbers)
 
 
 def read(path: str, most: int) -> dict[str, NDArray[Any]]:
@@ -56,7 +56,7 @@ def read(path: str, most: int) -> dict[str, NDArray[Any]]:
     numbers: dict[str, float] = {}
     with netCDF4.Dataset(path) as file:
         file.set_auto_maskandscale(False)
-        search(file, most, arrays, numbers)
+        _search(file, most, arrays, numbers)
     if "matrix" not in arrays and {"fx", "fy", "cx", "cy"} <= set(numbers):
         fx, fy, cx, cy = (numbers[name] for name in ("fx", "fy", "cx", "cy"))
         arrays["matrix"] = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])

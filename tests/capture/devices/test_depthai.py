@@ -16,7 +16,7 @@ from characterisation.files.errors import InputError, MissingEnvironmentError
 from mitsim.capture.devices.depthai_camera import (
     DepthaiCamera,
     DepthaiShot,
-    aligned,
+    aligned_frames,
     depthai,
     disparity_of,
     fault_of,
@@ -114,15 +114,15 @@ def test_frames_of_one_number_are_found_whatever_was_lost(kept, common, first):
     both = [number for number in set.intersection(*map(set, shared)) if number >= first]
     if not both:
         with pytest.raises(DeviceError, match="no frame of"):
-            aligned(queues, 0.002, "test", first)
+            aligned_frames(queues, 0.002, "test", first)
         return
-    frames = aligned(queues, 1.0, "test", first)
+    frames = aligned_frames(queues, 1.0, "test", first)
     assert {frame.getSequenceNum() for frame in frames.values()} == {min(both)}
 
 
 def test_frames_that_do_not_come_are_told_in_time():
     with pytest.raises(DeviceError, match=r"no frame of right within 0\.05 s.*cable") as caught:
-        aligned({"left": queue_of([1]), "right": queue_of([])}, 0.05, "camera depthai")
+        aligned_frames({"left": queue_of([1]), "right": queue_of([])}, 0.05, "camera depthai")
     assert caught.value.where == "camera depthai"
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from characterisation.files.errors import InputError
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.grey_image import CHANNELS, read_grey
-from mitsim.capture.recordings.image_folder import advice, read_image_folder
+from mitsim.capture.recordings.image_folder import advice_on_number, read_image_folder
 from mitsim.cli.program import app
 from mitsim.decoding.cloud import capture_cloud, decoder_settings
 from mitsim.sensor.light_code import patterns, value
@@ -323,7 +323,7 @@ def test_another_number_of_images_is_explained(names, told):
     plain, *others = names.split(" ")
     shape, number = plain.split("*")
     found = [Path(shape.format(index)) for index in range(int(number))] + [Path(name) for name in others]
-    assert advice(found, "camera", 18, ambient_image=False).startswith(told)
+    assert advice_on_number(found, "camera", 18, ambient_image=False).startswith(told)
 
 
 def test_a_gap_in_the_numbers_of_a_full_series_is_told(whole):
