@@ -98,11 +98,8 @@ def validate_captures(
     """
     recorded = read_capture(real)
     if simulated is None and rendered_here(recorded):
-        allowed, hint = (
-            "device, replay, or simulated by a maker's virtual camera",
-            "name SIMULATED to compare two simulations",
-        )
-        raise InputError(real, "source", "a simulation of mitsim", allowed, hint)
+        allowed = "device, replay, or simulated by a maker's virtual camera"
+        raise InputError(real, "source", "a simulation of mitsim", allowed, "name SIMULATED to compare two simulations")
     twin_sensor = None if simulated is not None else sensor_of(recorded, sensor, real)
     if twin_sensor is not None:
         check_technology(recorded, twin_sensor, str(real))  # before the capture is decoded
@@ -111,18 +108,16 @@ def validate_captures(
     settings, imager, decoder = _decoder(recorded, given, twin_sensor, on)
     recorded = _with_imager(recorded, imager)
     specimen = find_specimen(recorded, settings, roi, str(real))
-    say(f"specimen: a plane at {_distance(specimen):.0f} mm, with {specimen.off_plane:.2g} mm rms deviation")
-    if twin_sensor is not None:
-        other, where = (
-            rebuild(recorded, twin_sensor, specimen, str(real), projector_on=on, seed=seed),
-            str(output / "simulated"),
-        )
-        other = replace(other, decoding=other.decoding.model_copy(update={"decoder": settings}))
-        write_capture(other, output / "simulated", overwrite=True)
-        say(f"rebuilt: {where}")
-    else:
-        assert given is not None
+    say(f"specimen: a plane at {specimen.distance:.0f} mm, with {specimen.off_plane:.2g} mm rms deviation")
+    if given is not None:
         other, where = given, str(simulated)
+    else:
+        assert twin_sensor is not None
+        where = str(output / "simulated")
+        other = rebuild(recorded, twin_sensor, specimen, str(real), projector_on=on, seed=seed)
+        other = replace(other, decoding=other.decoding.model_copy(update={"decoder": settings}))
+        write_capture(other, where, overwrite=True)
+        say(f"rebuilt: {where}")
     comparison = compare_captures(
         recorded, _with_imager(other, imager), specimen, settings, where, projector_on=on, seed=seed
     )
@@ -141,10 +136,9 @@ def _decoder(
 ) -> tuple[Settings, Imager | None, str]:
     """Return the settings that decode both captures, their imager, and whose they are, in words.
 
-    Those of the simulated sensor, within the depths that ``recorded`` states: its decoder is part of it; ``given`` is
-    the simulated capture, if the user names one. If ``recorded``, with the projector ``on``, has other images than it
-    takes, those of ``recorded``: a matcher of four shifted patterns has 40 times the noise of another on one of them,
-    and one of dots 20 times on a print with the projector off.
+    Those of the simulated sensor, within the depths that ``recorded`` states: its decoder is part of it. If that takes
+    other images than ``recorded`` has, those of ``recorded``: a matcher of four shifted patterns has 40 times the noise
+    of another on one of them, and one of dots 20 times on a print with the projector off.
     """
     stated = recorded.decoding
     device = None if stated.near_mm is None or stated.far_mm is None else (stated.near_mm, stated.far_mm)
@@ -206,10 +200,6 @@ def _decimals(row: ComparedRow) -> int:
     return int(np.clip(1 - np.floor(np.log10(row.uncertainty)), 1, 4))
 
 
-def _distance(specimen: Specimen) -> float:
-    return float(np.linalg.norm(specimen.world_from_sensor.translation))
-
-
 def _preamble(
     real: Capture, simulated: Capture, specimen: Specimen, comparison: Comparison, where: Path, on: bool, decoder: str
 ) -> str:
@@ -220,7 +210,7 @@ def _preamble(
         f"{_whose(real).capitalize()}: `{where}`, {real.sensor}{serial}, source {real.source}. Simulated: "
         f"{simulated.sensor}, source {simulated.source}. Projector {'on' if on else 'off'}. "
         f"Decoder of both: {decoder}.",
-        f"Specimen: a plane at {_distance(specimen):.0f} mm; the cloud deviates by {rounded(specimen.off_plane, 2)} mm "
+        f"Specimen: a plane at {specimen.distance:.0f} mm; the cloud deviates by {rounded(specimen.off_plane, 2)} mm "
         f"rms. Patches of {PATCH_PX} px: {comparison.image_patches} of the image, {comparison.cloud_patches} of the "
         f"cloud; a margin of {MARGIN_PX:g} px inside the specimen's outline is excluded. Contrast in windows of "
         f"{comparison.window_px} px. Grey levels are those of {plain_image(real).name}.",
@@ -234,19 +224,15 @@ def _preamble(
 
 def _shown(name: str, capture: Capture, specimen: Specimen, patches: SpecimenPatches) -> Shown:
     mask = image_mask(specimen, capture.rig.reference)
-    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-    image = reference_levels(capture)
-    cut = (
-        slice(max(int(rows[0]) - _BORDER_PX, 0), int(rows[-1]) + _BORDER_PX),
-        slice(max(int(columns[0]) - _BORDER_PX, 0), int(columns[-1]) + _BORDER_PX),
-    )
+    ends = (np.flatnonzero(mask.any(axis=axis))[[0, -1]].tolist() for axis in (1, 0))
+    cut = tuple(slice(max(first - _BORDER_PX, 0), last + _BORDER_PX) for first, last in ends)
     roi = Roi.around(patches.on_grid) or Roi(0, 0, 1, 1)
     totals = patches.status.sum(axis=0)
     shares = {status: float(totals[status] / totals.sum()) for status in Status if totals[status] > 0}
     return Shown(
         f"{name}: {capture.sensor}",
         capture.source,
-        image[cut],
+        reference_levels(capture)[cut],
         np.asarray(patches.levels.sum(axis=0)),
         patches.residual[roi.slices],
         shares,

@@ -38,7 +38,7 @@ from mitsim.decoding.matching.stereo_geometry import StereoGeometry
 from mitsim.twin.compare.compared_quantities import QUANTITIES, Quantity
 from mitsim.twin.compare.plain_image import median_level, plain_image
 from mitsim.twin.compare.specimen_patches import PATCH_PX, SpecimenPatches, contrast_window, specimen_patches
-from mitsim.twin.finish.specimen import Specimen
+from mitsim.twin.finish.specimen import LARGER, Specimen
 
 Verdict = Literal["agrees", "differs", "not comparable", "does not apply"]
 
@@ -59,6 +59,9 @@ _SAME_PLANE = 0.02
 
 #: ratio to the difference below which an uncertainty is rounding, since all draws gave the same value
 _ROUNDING = 1e-9
+
+#: what to do about a capture that cannot be compared
+_SIMULATE = "leave SIMULATED out: mitsim then simulates it"
 
 
 @dataclass(frozen=True)
@@ -116,17 +119,11 @@ def compare_captures(
     projector_on: bool = True,
     seed: int = 1,
 ) -> Comparison:
-    """Compare a simulated capture with a real one.
+    """Compare a simulated capture with a real one, on the pixels of the specimen as the real one shows it.
 
-    Raises InputError if the simulated capture has another camera, its specimen is at another distance, or the specimen
-    is too small.
-
-    - ``real``, ``simulated``, ``settings``: the two captures, and the settings of the decoder for both.
-    - ``specimen``: pose and extent of the specimen in the real capture's sensor frame; its pixels are evaluated in both
-      captures.
-    - ``where``, ``seed``: name of the simulated capture in messages; selects the draws of the bootstrap.
-    - ``projector_on``: state of the projector in the real capture. If only one of the captures has a pattern,
-      quantities that need one are not comparable.
+    ``where`` names the simulated capture, ``seed`` selects the draws of the bootstrap, ``projector_on`` is the state in
+    the real capture. Raises InputError if the simulated capture has another camera, its specimen is at another
+    distance, or the specimen is too small.
     """
     _check(real, simulated, where)
     window = contrast_window(real, specimen)
@@ -139,13 +136,11 @@ def compare_captures(
     if patches != simulated_counts:
         text = "{image} patches of images and {cloud} of clouds on the specimen"
         found, allowed = text.format(**simulated_counts), f"that of REAL: {text.format(**patches)}"
-        raise InputError(where, "calibration", found, allowed, "leave SIMULATED out: mitsim then simulates it")
+        raise InputError(where, "calibration", found, allowed, _SIMULATE)
     real_patches, simulated_patches = _known_in_both(*seen)
     if min(patches.values()) < LEAST_PATCHES:
         found = f"{min(patches.values())} patches of {PATCH_PX} px on it"
-        raise InputError(
-            "REAL", "specimen", found, f"{LEAST_PATCHES} or more", "use a larger --window, or a nearer view"
-        )
+        raise InputError("REAL", "specimen", found, f"{LEAST_PATCHES} or more", LARGER)
     _check_distance(real_patches, simulated_patches, where)
     reasons, inapplicable = _reasons_not_comparable(simulated, projector_on), _inapplicable(real, geometry)
     rows = [_histogram_row(real_patches, simulated_patches, reasons, seed)]
@@ -163,13 +158,12 @@ def _known_in_both(
     real_patches: SpecimenPatches, simulated_patches: SpecimenPatches
 ) -> tuple[SpecimenPatches, SpecimenPatches]:
     """Return both without values of patches that only one capture has, so that medians are over the same patches."""
-    changes: list[dict[str, Floats]] = [{}, {}]
     for name in ("sigma", "sigma_px", "distance", "row_error"):
         values = getattr(real_patches, name), getattr(simulated_patches, name)
-        finite = np.isfinite(values[0]) & np.isfinite(values[1])
-        for change, array in zip(changes, values, strict=True):
-            change[name] = np.where(finite, array, np.nan)
-    return replace(real_patches, **changes[0]), replace(simulated_patches, **changes[1])  # type: ignore[arg-type]
+        unknown = np.where(np.isfinite(values).all(axis=0), 0.0, np.nan)
+        real_patches = replace(real_patches, **{name: values[0] + unknown})
+        simulated_patches = replace(simulated_patches, **{name: values[1] + unknown})
+    return real_patches, simulated_patches
 
 
 def _check(real: Capture, simulated: Capture, where: str) -> None:
@@ -179,7 +173,7 @@ def _check(real: Capture, simulated: Capture, where: str) -> None:
     if (camera.width, camera.height) != (real_camera.width, real_camera.height) or simulated.bits != real.bits:
         found = f"{camera.width} x {camera.height} pixels of {simulated.bits} bits"
         allowed = f"{real_camera.width} x {real_camera.height} of {real.bits} bits, as REAL"
-        raise InputError(where, "camera", found, allowed, "leave SIMULATED out: mitsim then simulates it")
+        raise InputError(where, "camera", found, allowed, _SIMULATE)
     if simulated.technology != real.technology:
         raise InputError(where, "technology", simulated.technology, f"{real.technology}, as REAL")
 
@@ -189,9 +183,7 @@ def _check_distance(real_patches: SpecimenPatches, simulated_patches: SpecimenPa
     off = off[np.isfinite(off)]
     if len(off) and np.median(off) > _SAME_PLANE:
         found = f"a specimen {100 * float(np.median(off)):.1f} % nearer or farther than that of REAL"
-        raise InputError(
-            where, "pose", found, f"up to {100 * _SAME_PLANE:g} %", "leave SIMULATED out: mitsim then simulates it"
-        )
+        raise InputError(where, "pose", found, f"up to {100 * _SAME_PLANE:g} %", _SIMULATE)
 
 
 def _reasons_not_comparable(simulated: Capture, projector_on: bool) -> dict[str, str]:
@@ -207,16 +199,12 @@ def _inapplicable(capture: Capture, geometry: Geometry) -> dict[str, str]:
     """Return the reasons why quantities are meaningless for this kind of capture, by name."""
     inapplicable: dict[str, str] = {}
     if not isinstance(geometry, StereoGeometry):
-        inapplicable |= dict.fromkeys(
-            ("sigma in disparity", "vertical error"), "it needs points from a pair of cameras"
-        )
+        inapplicable = dict.fromkeys(("sigma in disparity", "vertical error"), "it needs points from a pair of cameras")
     elif capture.technology == "structured_light":
         inapplicable["vertical error"] = "stripes along the rows do not identify a row"
     plain = plain_image(capture)
-    if not plain.has_dots:
-        for name in ("contrast", "run length"):
-            inapplicable[name] = f"there are no dots in {plain.name}"
-    return inapplicable
+    without_dots = () if plain.has_dots else ("contrast", "run length")
+    return inapplicable | dict.fromkeys(without_dots, f"there are no dots in {plain.name}")
 
 
 def _row(
@@ -273,11 +261,10 @@ def _histogram_row(
     distance = _distance(*totals)
     rng = np.random.default_rng([seed, len(QUANTITIES) - 1])
     exchanged = []
-    every = totals[0] + totals[1]
     for _ in range(DRAWS):
         from_real = rng.integers(0, 2, counts[0].shape[0])
         mixed = np.asarray(from_real @ counts[0] + (1 - from_real) @ counts[1])
-        exchanged.append(_distance(mixed, every - mixed))
+        exchanged.append(_distance(mixed, totals[0] + totals[1] - mixed))
     uncertainty = float(np.percentile(exchanged, 95)) / COVERAGE
     margin = 0.05 * median_level(totals[0])
     verdict, why = _verdict(distance, uncertainty, margin, reasons.get(HISTOGRAMS, ""))

@@ -46,10 +46,8 @@ _APERTURE_PX2 = 1 / 12 + 1 / (6 * _TEXELS_PER_PX**2)
 def plate(specimen: Specimen, sensor: Sensor, texture: Floats | None) -> Scene:
     """Return a rectangle at the specimen, matt white, or with reflectances (rows, columns) from low x and y on."""
     backend.activate()
-    mi = backend.mi
-    half = specimen.cell * specimen.occupied.shape[::-1] / 2
-    middle = specimen.low + half
-    to_world = mi.ScalarTransform4f().translate([*middle, 0.0]).scale([*half, 1.0])
+    mi, half = backend.mi, specimen.extent / 2
+    to_world = mi.ScalarTransform4f().translate([*(specimen.low + half), 0.0]).scale([*half, 1.0])
     bsdf: dict[str, Any] = {"type": "matt_white", "reflectance": REFLECTANCE}
     if texture is not None:
         image = mi.TensorXf(np.ascontiguousarray(REFLECTANCE * texture[..., None], np.float32))
@@ -68,8 +66,7 @@ def plate(specimen: Specimen, sensor: Sensor, texture: Floats | None) -> Scene:
 
 def _sheet(specimen: Specimen, bend: Bend) -> trimesh.Trimesh:
     """Return the extent of the specimen as a bent mesh, with normals toward the sensor."""
-    extent = specimen.cell * specimen.occupied.shape[::-1]
-    x, y = (specimen.low[axis] + np.linspace(0, extent[axis], _MESH + 1) for axis in (0, 1))
+    x, y = (specimen.low[axis] + np.linspace(0, specimen.extent[axis], _MESH + 1) for axis in (0, 1))
     xy = np.stack(np.meshgrid(x, y), axis=-1)
     vertices = np.concatenate([xy, bend.heights(xy)[..., None]], axis=-1).reshape(-1, 3)
     number = np.arange(len(vertices)).reshape(_MESH + 1, _MESH + 1)
@@ -83,28 +80,21 @@ def _sheet(specimen: Specimen, bend: Bend) -> trimesh.Trimesh:
 def texture_of(specimen: Specimen, camera: Camera, electrons: Floats, light: LightOnImagers, name: str) -> Floats:
     """Return the reflectance (rows, columns) of the plate, up to a factor.
 
-    It is the ratio of the recorded image to that of a white plate. Outside the image of the reference camera, the value
-    of the nearest pixel is repeated.
-
-    ``specimen``, ``camera``, ``electrons``: pose and extent of the plate; the camera, and the plain image (H, W) [e-]
-    that it recorded. ``light``, ``name``: light of a white plate on the imagers, of the region of the image that shows
-    the plate, and name of the camera in it.
+    It is the ratio of the plain image (H, W) [e-] that a camera recorded to the light of a white plate. Outside the
+    image of the camera, the value of the nearest pixel is repeated.
     """
     roi = light.rois[name]
-    inside = roi.slices
     white = light.radiance[name][0].astype(float)
     lit = white > 0.05 * np.percentile(white, 99)
-    ratio = denoised(electrons[inside], lit) / np.where(lit, white, np.nan)
+    ratio = denoised(electrons[roi.slices], lit) / np.where(lit, white, np.nan)
     ratio = np.where(np.isfinite(ratio), ratio, np.nanmedian(ratio))
-    extent = specimen.cell * specimen.occupied.shape[::-1]
-    reach = float(np.linalg.norm(specimen.world_from_sensor.translation))
-    texel = reach / float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])) / _TEXELS_PER_PX
-    columns, rows = np.minimum(np.ceil(extent / texel).astype(int), _LARGEST_TEXTURE)
-    x = specimen.low[0] + (np.arange(columns) + 0.5) / columns * extent[0]
-    y = specimen.low[1] + (np.arange(rows) + 0.5) / rows * extent[1]
-    xs, ys = np.meshgrid(x, y)
-    points = specimen.world_from_sensor.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1))
-    pixels = np.nan_to_num(camera.project(points)) - [roi.left, roi.top]
+    texel = specimen.distance / float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])) / _TEXELS_PER_PX
+    counts = np.minimum(np.ceil(specimen.extent / texel).astype(int), _LARGEST_TEXTURE)
+    x, y = (
+        low + (np.arange(count) + 0.5) / count * extent
+        for low, count, extent in zip(specimen.low, counts, specimen.extent, strict=True)
+    )
+    pixels = np.nan_to_num(camera.project(specimen.in_sensor(x, y))) - [roi.left, roi.top]
     sharp = ratio - _APERTURE_PX2 / 2 * laplace(ratio, mode="nearest")
     return np.asarray(map_coordinates(sharp, [pixels[..., 1], pixels[..., 0]], order=3, mode="nearest")).clip(0.0)
 
@@ -112,16 +102,12 @@ def texture_of(specimen: Specimen, camera: Camera, electrons: Floats, light: Lig
 def printed(
     light: LightOnImagers, specimen: Specimen, camera: Camera, electrons: Floats, name: str, plain: PlainImage
 ) -> LightOnImagers:
-    """Return light with the print of the recorded plain image on the specimen of its only camera.
+    """Return the light of a white specimen on its only camera with the print of the recorded plain image (H, W) [e-].
 
     Parameters
     ----------
-    light, name
-        Light of a white specimen on the imager of the only camera, and name of the camera in it.
-    specimen, camera, electrons
-        Pose and extent of the specimen; the camera, and the plain image (H, W) [e-] that it recorded.
-    plain
-        The images whose largest level is the plain image.
+    light, specimen, camera, electrons, name, plain
+        The plain image is ``electrons``, the largest level of the images ``plain``; ``name`` is that of the camera.
     """
     inside, radiance = light.rois[name].slices, light.radiance[name]
     there = image_mask(specimen, camera)[inside]

@@ -10,15 +10,12 @@ capture of source ``simulated``.
 exposure if known, median grey level. *Taken from the sensor file*: projector, dot pattern, imager, blur. The scale is a
 factor on power times reflectance, which no image can separate.
 
-*Projector off.* There is no pattern, and the matcher uses the specimen's own texture. The plate gets it from the
-recorded reference image, less its noise, so that the noise is not there twice. The plate is lit evenly. The second
-camera sees the same texture from its own pose. This plate is flat. The light of a sensor's [room] and the blur of its
-lens are in the texture, and are not simulated again.
+*Projector off.* The matcher uses the specimen's own texture. A flat, evenly lit plate gets it from the recorded
+reference image, less its noise, so that the noise is not there twice. The light of a sensor's [room] and the blur of
+its lens are in the texture, and are not simulated again.
 
 *Print under structured light.* For a single camera, the print is a factor on every pixel: the recorded plain image over
-the rebuilt one.
-
-Not included: a print under dots, and objects around the specimen.
+the rebuilt one. Not included: a print under dots, and objects around the specimen.
 """
 
 from __future__ import annotations
@@ -45,7 +42,7 @@ from mitsim.twin.compare.plain_image import median_level, plain_image
 from mitsim.twin.compare.plate import REFLECTANCE, plate, printed, texture_of
 from mitsim.twin.finish.electrons import chip_of, linearised
 from mitsim.twin.finish.find_specimen import MARGIN_PX, image_mask
-from mitsim.twin.finish.specimen import Specimen
+from mitsim.twin.finish.specimen import LARGER, Specimen
 
 #: rays per pixel
 SAMPLES = 16
@@ -70,27 +67,21 @@ def check_technology(real: Capture, sensor: Sensor, where: str) -> None:
 def rebuild(
     real: Capture, sensor: Sensor, specimen: Specimen, where: str, *, projector_on: bool = True, seed: int = 1
 ) -> Capture:
-    """Simulate a real capture with a plane in place of its specimen.
+    """Simulate a real capture, in messages ``where``, with a plane in place of its specimen.
 
-    Raises InputError if the sensor has another technology, or takes other images than the recording.
-
-    - ``real``, ``where``: recorded capture, and its name in messages.
-    - ``sensor``: supplies projector, pattern and imager in place of those of the device.
-    - ``specimen``: pose and extent of the specimen, from :func:`mitsim.twin.finish.find_specimen.find_specimen`.
-    - ``projector_on``, ``seed``: if false, the plate has the texture that the reference camera recorded, and even
-      light; selects the noise.
+    The sensor supplies projector, pattern and imager. If the projector was not on, the plate has even light and the
+    texture that the reference camera recorded. Raises InputError if the sensor has another technology, or takes other
+    images than the recording.
     """
     check_technology(real, sensor, where)
     twin_sensor = like(real, sensor, where)
     if not projector_on and real.technology == "structured_light":
-        allowed = f"on: {where} is structured light, which has no code without it"
-        raise InputError("--projector", "", "off", allowed)
+        raise InputError("--projector", "", "off", f"on: {where} is structured light, which has no code without it")
     name, plain = next(iter(real.rig.cameras)), plain_image(real)
     chip = chip_of(real, sensor.imager, where)  # rejects another number of bits
     if not projector_on:  # the texture contains room light and lens blur of the recording
-        twin_sensor = replace(
-            twin_sensor, room=None, imager=replace(twin_sensor.imager, blur_px=0.0, corner_blur_px=None)
-        )
+        sharp = replace(twin_sensor.imager, blur_px=0.0, corner_blur_px=None)
+        twin_sensor = replace(twin_sensor, room=None, imager=sharp)
     simulated = SimulatedSensor(twin_sensor)
     if not projector_on:
         size = twin_sensor.projector.optics.height, twin_sensor.projector.optics.width
@@ -167,9 +158,7 @@ def _scale(
     name, plain = next(iter(real.rig.cameras)), plain_image(real)
     roi, there = light.rois[name], image_mask(specimen, real.rig.cameras[name], MARGIN_PX)
     if not there.any():
-        raise InputError(
-            "REAL", "specimen", "no pixels", "a specimen in the image", "use a larger --window, or a nearer view"
-        )
+        raise InputError("REAL", "specimen", "no pixels", "a specimen in the image", LARGER)
     if not light.radiance[name].any():
         raise InputError("--sensor", "projector", "no light on the specimen", "a projector that illuminates it")
     wanted, full = median_level(np.bincount(plain.of(real.images[name])[there])), 2**real.bits - 1
@@ -177,10 +166,9 @@ def _scale(
         found = f"a median grey level of {wanted:.0f} on the specimen, in {plain.name}"
         allowed = f"under {full}, since a saturated image does not determine the power"
         raise InputError(where, "images", found, allowed, "repeat the capture with a shorter exposure")
-    needed = list(plain.images)
 
     def too_bright(scale: float) -> bool:
-        radiance = light.radiance[name][needed] * np.float32(scale)
+        radiance = light.radiance[name][list(plain.images)] * np.float32(scale)
         seen = simulated.expose(replace(light, radiance={name: radiance}, rois={name: roi}), seed).images[name]
         return median_level(np.bincount(plain.merged(seen)[there])) > wanted
 

@@ -141,13 +141,7 @@ def specimen_patches(
 def patch_rows(
     capture: Capture, settings: Settings, geometry: StereoGeometry, specimen: Specimen
 ) -> tuple[Floats, Floats, Floats]:
-    """Return row errors (Q,) [px] of the patches of a pair's cloud.
-
-    Also returns columns and rows of their middles in the right image.
-
-    ``capture``, ``settings``, ``geometry``: capture of a flat specimen, settings of its decoder, and rectified geometry
-    of its pair of cameras. ``specimen``: pose and extent of the specimen.
-    """
+    """Return row errors (Q,) [px] of a pair's patches, and columns and rows of their middles in the right image."""
     cloud, on_grid, corners = _cloud_patches(capture, settings, geometry, specimen)
     valid = _tiles(np.where(on_grid, cloud.valid.astype(float), np.nan), corners)
     usable = np.nansum(valid, axis=-1) >= _LEAST_FOR_ROWS * np.isfinite(valid).sum(axis=-1)
@@ -180,7 +174,6 @@ def points_on_specimen(cloud: PointCloud, specimen: Specimen) -> NDArray[np.bool
 
 
 def _disparity(cloud: PointCloud, geometry: StereoGeometry) -> Floats:
-    """Return the disparity (H, W) [px] of the points of a cloud."""
     local = (cloud.points.astype(float) - geometry.grid.origin) @ geometry.grid.rotation
     return np.asarray(geometry.rectification.disparity(local[..., 2]))
 
@@ -216,7 +209,7 @@ def patch_corners(mask: NDArray[np.bool_], side: int, least: float) -> list[tupl
 def _tiles(values: Floats, corners: list[tuple[int, int]]) -> Floats:
     """Return the pixels (P, 1600) of the patches."""
     tiles = [values[row : row + PATCH_PX, column : column + PATCH_PX].ravel() for row, column in corners]
-    return np.stack(tiles) if tiles else np.empty((0, PATCH_PX**2))
+    return np.array(tiles).reshape(-1, PATCH_PX**2)
 
 
 def _histograms(levels: Floats, count: int) -> csr_array:
@@ -245,9 +238,8 @@ def _in_disparity(noise: RayNoise, sigma: Floats, tiles: Floats, geometry: Geome
     filled = np.isfinite(tiles[..., 2]).any(axis=-1)
     ray = np.full((len(tiles), 3), np.nan)
     ray[filled] = np.nanmean(tiles[filled], axis=1)
-    cosine = geometry.grid.cos_off_axis(ray)
     focal_baseline = geometry.rectification.matrix_left[0, 0] * geometry.rectification.baseline
-    return np.asarray(sigma * focal_baseline / (noise.distance**2 * cosine))
+    return np.asarray(sigma * focal_baseline / (noise.distance**2 * geometry.grid.cos_off_axis(ray)))
 
 
 def _row_errors(

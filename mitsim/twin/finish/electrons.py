@@ -52,12 +52,10 @@ class PixelNoise:
 
 
 def pixel_noise(imager: Imager, chip: Imager, count: int, exposure_s: float, ambient: bool) -> PixelNoise:
-    """Return the noise of the mean of several images of one exposure; shot noise of the scene's own light is neglected.
+    """Return the noise of the mean of ``count`` images; shot noise of the scene's own light is neglected.
 
-    - ``imager``, ``chip``: source of the noise, and the imager with the capture's number of bits (:func:`chip_of`).
-    - ``count``, ``exposure_s``: number of images, and their exposure [s].
-    - ``ambient``: whether an image with the projector off is subtracted. Its read noise adds, and the fixed pattern
-      cancels.
+    ``chip`` is the imager with the capture's number of bits (:func:`chip_of`). If an ``ambient`` image with the
+    projector off is subtracted, its read noise adds, and the fixed pattern cancels.
     """
     per_image = 1.0 / count + (1.0 if ambient else 0.0)
     level = 1.0 / chip.gain  # e- of a grey level

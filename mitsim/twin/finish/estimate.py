@@ -40,6 +40,8 @@ _ROUNDS = 3
 _FEWEST_CAPTURES = 3
 #: least number of blocks to fit three parameters and their residual
 FEWEST_BLOCKS = 12
+#: all blocks
+_ALL = slice(None)
 
 
 @dataclass(frozen=True)
@@ -63,10 +65,8 @@ class Fit:
     - ``log_power``: natural logarithm of the relative power; for a diffuse sheet, of the power times the albedo.
     - ``log_alpha``: natural logarithm of alpha; ``wide_angle``: share [1]. Both are None for a diffuse sheet.
     - ``ambient``: light of the room in the middle of the image [e-/s], None if not fitted.
-    - ``reduced_chi_square`` of all ``blocks``, which contain ``pixels``.
     - ``grain`` C [1]; ``neighbours``: correlation of the residuals of neighbouring blocks [1].
     - ``at_limit``: whether alpha reached an end of its range.
-    - ``residuals`` by view.
     """
 
     log_power: FittedQuantity
@@ -121,23 +121,18 @@ def fit_views(views: Sequence[CouponView], finish: MetalFinish | None) -> Fit:
 
 def best_values(problem: Problem) -> tuple[Floats, Floats, float]:
     """Return the best parameters, the variance of the block means [e-^2] that weighs them, and the grain [1]."""
-    every = np.ones(problem.count, bool)
-    values, grain = _first(problem, every), 0.0
+    values, grain = _first(problem), 0.0
     for _ in range(_ROUNDS):
         variance, grain = problem.variance(values)
-        values = refine(problem, values, variance, every)
+        values = refine(problem, values, variance)
     return values, variance, grain
 
 
-def _first(problem: Problem, use: NDArray[np.bool_]) -> Floats:
+def _first(problem: Problem) -> Floats:
     """Return initial estimates of the parameters: the best local minimum along alpha, after Gauss-Newton from each."""
     measured = np.maximum(problem.measured, 0.0)
-    noise = np.concatenate(
-        [
-            view.noise.variance(measured[a : a + view.size])
-            for view, a in zip(problem.views, problem.starts, strict=False)
-        ]
-    )
+    by_view = zip(problem.views, np.split(measured, problem.starts[1:-1]), strict=True)
+    noise = np.concatenate([view.noise.variance(means) for view, means in by_view])
     variance = (noise + (FIRST_GRAIN * measured) ** 2) / problem.counts + (0.02 * measured) ** 2
     weight = 1.0 / np.sqrt(variance)
     if problem.finish is None:
@@ -149,8 +144,8 @@ def _first(problem: Problem, use: NDArray[np.bool_]) -> Floats:
         starts.append(np.array([float(x), *amplitudes]))
         costs.append(misfit)
     lowest = [i for i in range(_SCAN) if costs[i] <= min(costs[max(i - 1, 0)], costs[min(i + 1, _SCAN - 1)])]
-    refined = [refine(problem, starts[i], variance, use) for i in lowest]
-    return min(refined, key=lambda v: float(np.sum(problem.residual(v, variance)[use] ** 2)))
+    refined = [refine(problem, starts[i], variance) for i in lowest]
+    return min(refined, key=lambda v: float(np.sum(problem.residual(v, variance) ** 2)))
 
 
 def _amplitudes(columns: Floats, measured: Floats, weight: Floats) -> tuple[Floats, float]:
@@ -162,15 +157,13 @@ def _amplitudes(columns: Floats, measured: Floats, weight: Floats) -> tuple[Floa
     return np.asarray(amplitudes / scale), float(misfit)
 
 
-def refine(problem: Problem, start: Floats, variance: Floats, use: NDArray[np.bool_]) -> Floats:
+def refine(problem: Problem, start: Floats, variance: Floats, use: NDArray[np.bool_] | slice = _ALL) -> Floats:
     """Return the parameters of weighted least squares, by SciPy's ``trf`` method.
 
     Parameters
     ----------
-    problem, start
-        Blocks of all views, and parameters to start from.
-    variance, use
-        Of the block means [e-^2], (blocks,); which blocks count, (blocks,).
+    problem, start, variance, use
+        ``variance`` (blocks,) of the block means [e-^2]; ``use`` (blocks,): which blocks count.
     """
     low, high, inner = np.zeros(len(start)), np.full(len(start), np.inf), start.copy()
     first = 0
@@ -181,25 +174,21 @@ def refine(problem: Problem, start: Floats, variance: Floats, use: NDArray[np.bo
     most = problem.measured.mean() / np.maximum(problem.linear_means.mean(axis=0), 1e-300)
     least = 1e-4 * np.abs(most if first == 0 else np.array([most[0], *most]))
     inner[first:] = np.maximum(inner[first:], least)
-    answer = least_squares(
-        lambda v: problem.residual(v, variance)[use],
-        inner,
-        jac=lambda v: problem.jacobian(v, variance)[use],
-        bounds=(low, high),
-        x_scale="jac",
-        xtol=1e-7,
-        ftol=1e-11,
-        gtol=1e-11,
-        max_nfev=60,
-    )
+
+    def residual(values: Floats) -> Floats:
+        return problem.residual(values, variance)[use]
+
+    def jacobian(values: Floats) -> Floats:
+        return problem.jacobian(values, variance)[use]
+
+    limits = {"xtol": 1e-7, "ftol": 1e-11, "gtol": 1e-11}
+    answer = least_squares(residual, inner, jacobian, (low, high), x_scale="jac", max_nfev=60, **limits)
     return np.asarray(answer.x, np.float64)
 
 
 def _jackknife(problem: Problem, values: Floats, variance: Floats) -> Floats:
     """Return the jackknife's standard uncertainties of the results: one capture, or quarter of a view, is left out."""
     group = problem.capture if len(np.unique(problem.capture)) >= _FEWEST_CAPTURES else problem.quarters()
-    without = np.array(
-        [problem.results(refine(problem, values, variance, group != left_out))[0] for left_out in np.unique(group)]
-    )
-    count = len(without)
-    return np.asarray(np.sqrt((count - 1) / count * ((without - without.mean(axis=0)) ** 2).sum(axis=0)))
+    kept = [group != left_out for left_out in np.unique(group)]
+    without = np.array([problem.results(refine(problem, values, variance, use))[0] for use in kept])
+    return np.asarray(np.sqrt((len(kept) - 1) / len(kept) * ((without - without.mean(axis=0)) ** 2).sum(axis=0)))

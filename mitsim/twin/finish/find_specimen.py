@@ -47,18 +47,13 @@ _NEAR_PLANE = 0.02
 
 
 def find_specimen(capture: Capture, settings: Settings, roi: Roi | None, where: str) -> Specimen:
-    """Estimate the plane and the outline of the specimen from the capture's decoded cloud.
+    """Estimate the plane and the outline of the specimen from the capture's decoded cloud; messages name ``where``.
+
+    ``roi`` is a region of the reference image [px] that shows only the specimen, also where it has no points. The plane
+    is fitted to its points, and ``off_plane`` of the result is their robust standard deviation. Without a region,
+    :func:`specimen_in_cloud` takes the plane of most points, and ``off_plane`` is their rms distance.
 
     Raises InputError if the capture has no images, the region is not in the image, or too few points lie in one plane.
-
-    - ``capture``, ``settings``: capture with images, and the settings of its decoder.
-    - ``roi``: region of the reference image [px] that shows only the specimen, also where it has no points. The plane
-      is fitted to its points (:func:`characterisation.features.fits.fit_plane`). Without a region,
-      :func:`mitsim.twin.finish.specimen.specimen_in_cloud` takes the plane of most points, and the outline of the dense
-      ones.
-    - ``where``: name of the capture in messages.
-
-    ``off_plane`` of the result is a robust standard deviation with a region, and the rms distance without one.
     """
     if not capture.images:
         raise InputError(where, "images", "none", "a capture with images, not only a map of the device")
@@ -67,11 +62,10 @@ def find_specimen(capture: Capture, settings: Settings, roi: Roi | None, where: 
         flat = specimen_in_cloud(cloud, where)
         return replace(flat, bend=_bend_of(flat, cloud.points[cloud.valid].astype(float)))
     camera, geometry = capture.rig.reference, capture_geometry(capture, settings)
-    window = [roi.left, roi.top, roi.width, roi.height]
+    grid, window = geometry.grid, [roi.left, roi.top, roi.width, roi.height]
     if not roi.fits(camera.width, camera.height):
         allowed = f"COLUMN ROW WIDTH HEIGHT within {camera.width} x {camera.height} pixels"
         raise InputError("--window", "", window, allowed)
-    grid = geometry.grid
     low, high = np.array([roi.left, roi.top]), np.array([roi.right, roi.bottom])
 
     def shown(points: Floats) -> NDArray[np.bool_]:
@@ -109,23 +103,17 @@ def find_specimen(capture: Capture, settings: Settings, roi: Roi | None, where: 
     columns, rows = np.ceil(extent / cell).astype(int)
     xs, ys = np.meshgrid(first[0] + (np.arange(columns) + 0.5) * cell[0], first[1] + (np.arange(rows) + 0.5) * cell[1])
     occupied = shown(pose.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1)))
-    scatter = scatter_of(off, rounding_scale(points, plane))
-    specimen = Specimen(pose, first, cell, occupied, scatter)
+    specimen = Specimen(pose, first, cell, occupied, scatter_of(off, rounding_scale(points, plane)))
     return replace(specimen, bend=_bend_of(specimen, points))
 
 
 def find_coupon(
     capture: Capture, sensor: Sensor, size: tuple[float, float], where: str, roi: Roi | None = None
 ) -> Specimen:
-    """Return the coupon in a capture.
+    """Return the coupon of a ``size`` (width, height) [mm] in a capture, in messages ``where``.
 
-    Raises InputError if no plane is found, or the sensor is behind the coupon.
-
-    - ``capture``, ``sensor``, ``where``: capture of the coupon, the sensor whose decoder and imager it is read with,
-      and its name in messages.
-    - ``size``: width and height of the coupon [mm].
-    - ``roi``: image region that shows the coupon. Without it the coupon follows from the capture's pose, otherwise from
-      the plane of its cloud.
+    It follows from the points in ``roi``, else from the capture's pose, else from the plane of its cloud by the decoder
+    of the sensor. Raises InputError if no plane is found, or the sensor is behind the coupon.
     """
     if roi is not None:
         return find_specimen(capture, sensor.settings, roi, where)
@@ -141,7 +129,7 @@ def find_coupon(
 def _bend_of(specimen: Specimen, points: Floats) -> Bend | None:
     """Return the bend of the points (n, 3) [mm], in the sensor frame, on a specimen's cells; None for too few."""
     local = specimen.world_from_sensor.points(points)
-    near = np.abs(local[:, 2]) < _NEAR_PLANE * np.linalg.norm(specimen.world_from_sensor.translation)
+    near = np.abs(local[:, 2]) < _NEAR_PLANE * specimen.distance
     inside = np.zeros(len(local), bool)
     inside[near] = specimen.contains(local[near, :2], np.zeros(int(near.sum())))
     step = rounding_step(points[inside], specimen.world_from_sensor.rotation[2])
@@ -149,11 +137,9 @@ def _bend_of(specimen: Specimen, points: Floats) -> Bend | None:
 
 
 def on_specimen(specimen: Specimen, origin: Floats, rays: Floats, pitch: float, margin_px: float) -> NDArray[np.bool_]:
-    """Return which view rays meet the specimen, (...), at least a margin inside its outline.
+    """Return which view rays (..., 3), sensor frame, meet the specimen at least a margin inside its outline.
 
-    ``specimen``, ``margin_px``: plane and outline of the specimen, and the margin. ``origin``, ``rays``, ``pitch``:
-    common origin (3,) [mm] and unit vectors (..., 3) of the rays, in the sensor frame; angle of neighbouring rays
-    [rad].
+    ``pitch`` [rad] is the angle of neighbouring rays, ``origin`` (3,) [mm] the origin of all.
     """
     points, reach, cosine = feet_of(specimen.world_from_sensor, origin, rays)
     down = cosine > GRAZING
@@ -164,11 +150,10 @@ def on_specimen(specimen: Specimen, origin: Floats, rays: Floats, pitch: float, 
 
 
 def feet_of(pose: Transform, origin: Floats, rays: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return where rays meet the plane z = 0 of a frame.
+    """Return where rays (..., 3) from an origin (3,) [mm] meet the plane z = 0 of the frame to which ``pose`` leads.
 
-    The results are x and y (..., 2) [mm] in the frame of the plane, the distance along the ray [mm], and the cosine to
-    the normal. Points and distances are NaN for rays that miss the plane. ``pose`` takes the sensor frame, that of
-    ``origin`` (3,) [mm] and ``rays`` (..., 3), to the frame of the plane.
+    The results are x and y (..., 2) [mm] in the frame of the plane, the distance along the ray [mm], both NaN for rays
+    that miss the plane, and the cosine to the normal.
     """
     start, directions = pose.points(origin), pose.directions(rays)
     cosine = -directions[..., 2]

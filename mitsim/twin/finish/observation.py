@@ -29,9 +29,9 @@ from characterisation.files.arrays import Floats
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
+from mitsim.sensor.camera import Camera
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.modulation import AmplitudeModulation
-from mitsim.sensor.sensor import Sensor
 from mitsim.twin.finish.electrons import PixelNoise, chip_of, linearised, pixel_noise
 from mitsim.twin.finish.specimen import Specimen
 from mitsim.twin.finish.white_coupon import Pattern, WhiteCouponRenderer, coupon_roi
@@ -115,21 +115,14 @@ def observe(
     pattern: Pattern,
     lit_room: bool = False,
 ) -> list[CouponView]:
-    """Return the view of a coupon by every camera at every exposure.
+    """Return the view of a coupon by every camera at every exposure; the renderer has the cameras of the capture.
 
-    Raises InputError if the capture is one of time of flight or has no images, or its exposures or its number of images
-    are wrong.
-
-    ``coupon_capture``, ``renderer``: capture, and the coupon in it; renders the white coupon, its sensor has the
-    cameras of the capture. ``block_px``: side of a block [px]. ``pattern``, ``lit_room``: ``mean`` if the capture has
-    the sensor's own pattern, otherwise ``level``; whether the images contain other light than that of the projector.
+    ``pattern`` is ``mean`` if the capture has the sensor's own pattern, otherwise ``level``. In a ``lit_room`` the
+    images contain other light than that of the projector. Raises InputError if the capture is one of time of flight or
+    has no images, or its exposures or its number of images are wrong.
     """
-    sensor, capture, specimen, where = (
-        renderer.sensor,
-        coupon_capture.capture,
-        coupon_capture.specimen,
-        coupon_capture.where,
-    )
+    sensor, capture, specimen = renderer.sensor, coupon_capture.capture, coupon_capture.specimen
+    where, projector = coupon_capture.where, specimen.world_from_sensor.points(sensor.projector.optics.centre)
     if isinstance(sensor.pattern, AmplitudeModulation):
         raise InputError(where, "technology", capture.technology, "images of light, not of its correlation")
     if not capture.images:
@@ -141,18 +134,17 @@ def observe(
     views = []
     for name, stack in capture.images.items():
         if len(stack) % len(exposures) or len(stack) // len(exposures) <= ambient:
-            raise InputError(
-                where, "images", f"{len(stack)} of {name}", f"as many at each of {len(exposures)} exposures"
-            )
-        roi = coupon_roi(sensor.rig.cameras[name], specimen)
+            allowed = f"as many at each of {len(exposures)} exposures"
+            raise InputError(where, "images", f"{len(stack)} of {name}", allowed)
+        camera = sensor.rig.cameras[name]
+        roi, centre = coupon_roi(camera, specimen), specimen.world_from_sensor.points(camera.centre)
         white = renderer.white(specimen, name, roi, pattern)
-        region = _CouponRegion.of(specimen, sensor, name, roi, white, capture.decoding.read_out.get(name))
+        inside, points = _pixels_inside(specimen, camera, roi, white, capture.decoding.read_out.get(name))
         loss, count = renderer.corner_loss(name), len(stack) // len(exposures)
         for number, seconds in enumerate(exposures):
             images = stack[number * count : (number + 1) * count, *roi.slices]
             chip = chip_of(capture, sensor.imager, where)
-            blocks = _Blocks.of(region.inside, images, chip, block_px)
-            rows, columns = blocks.rows, blocks.columns
+            rows, columns, block, grid, whole = _blocks(inside, images, chip, block_px)
             levels = linearised(images[:, rows, columns], chip)
             room_s = float(seconds) if lit_room and not ambient else 0.0
             illumination = np.ones(len(rows)) if loss is None else loss[roi.slices][rows, columns].astype(float)
@@ -164,107 +156,78 @@ def observe(
                     float(seconds),
                     columns + roi.left,
                     rows + roi.top,
-                    blocks.block,
+                    block,
                     block_px,
-                    blocks.grid,
+                    grid,
                     levels[:-1].mean(axis=0) - levels[-1] if ambient else levels.mean(axis=0),
                     white[rows, columns] * float(seconds),
                     illumination * room_s,
-                    region.toward(region.camera_centre, rows, columns),
-                    region.toward(region.projector_centre, rows, columns),
+                    _directions(points[rows, columns], centre),
+                    _directions(points[rows, columns], projector),
                     pixel_noise(sensor.imager, chip, count - ambient, float(seconds), ambient),
-                    blocks.whole,
+                    whole,
                     specimen,
-                    "" if blocks.whole else _why_no_block(region, specimen, block_px),
+                    "" if whole else _why_no_block(inside, points, white, specimen, block_px),
                 )
             )
     return views
 
 
-@dataclass(frozen=True)
-class _CouponRegion:
-    """A coupon in a region (h, w) of a camera's image."""
-
-    inside: NDArray[np.bool_]  # (h, w) pixels on the coupon, inside its edge
-    points: Floats  # (h, w, 3) [mm]: where the view rays meet the plane, in the frame of the coupon
-    white: Floats  # (h, w) [e-/s] of a white coupon
-    #: ``camera_centre``, ``projector_centre`` (3,) [mm]: centres of camera and projector, in the frame of the coupon
-    camera_centre: Floats
-    projector_centre: Floats
-
-    @classmethod
-    def of(
-        cls, specimen: Specimen, sensor: Sensor, name: str, roi: Roi, white: Floats, read_out: Roi | None
-    ) -> _CouponRegion:
-        """Intersect the view rays of a region with the plane of the coupon, and select the pixels inside its edge.
-
-        ``read_out`` is the region that the camera ``name`` read out, None for the whole image.
-        """
-        camera = sensor.rig.cameras[name]
-        pose = specimen.world_from_sensor
-        centre, projector_centre = pose.points(camera.centre), pose.points(sensor.projector.optics.centre)
-        columns, rows = roi.pixels()
-        rays = camera.rays(np.stack([columns, rows], axis=-1).astype(float))
-        rays = pose.directions(camera.sensor_from_camera.directions(rays))
-        down = rays[..., 2] < -1e-6
-        reach = np.where(down, -centre[2] / np.where(down, rays[..., 2], -1.0), 0.0)
-        points = centre + reach[..., None] * rays
-        focal = float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
-        footprint = reach / (focal * np.where(down, -rays[..., 2], 1.0))
-        inside = down & (white > _UNLIT * white.max())
-        inside[inside] = specimen.contains(points[inside][:, :2], _EDGE_PX * footprint[inside])
-        if read_out is not None:
-            inside &= (columns >= read_out.left) & (columns < read_out.right)
-            inside &= (rows >= read_out.top) & (rows < read_out.bottom)
-        return cls(inside, points, white, centre, projector_centre)
-
-    def toward(self, centre: Floats, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Floats:
-        """Return unit directions (N, 3) from the points of pixels toward a ``centre`` (3,) [mm]."""
-        out = centre - self.points[rows, columns]
-        return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
+def _pixels_inside(
+    specimen: Specimen, camera: Camera, roi: Roi, white: Floats, read_out: Roi | None
+) -> tuple[NDArray[np.bool_], Floats]:
+    """Return the lit pixels (h, w) inside the coupon's edge, and where all rays meet its plane (h, w, 3) [mm]."""
+    pose = specimen.world_from_sensor
+    centre, (columns, rows) = pose.points(camera.centre), roi.pixels()
+    rays = camera.rays(np.stack([columns, rows], axis=-1).astype(float))
+    rays = pose.directions(camera.sensor_from_camera.directions(rays))
+    down = rays[..., 2] < -1e-6
+    reach = np.where(down, -centre[2] / np.where(down, rays[..., 2], -1.0), 0.0)
+    points = centre + reach[..., None] * rays
+    focal = float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
+    footprint = reach / (focal * np.where(down, -rays[..., 2], 1.0))
+    inside = down & (white > _UNLIT * white.max())
+    inside[inside] = specimen.contains(points[inside][:, :2], _EDGE_PX * footprint[inside])
+    if read_out is not None:
+        inside &= (columns >= read_out.left) & (columns < read_out.right)
+        inside &= (rows >= read_out.top) & (rows < read_out.bottom)
+    return inside, points
 
 
-@dataclass(frozen=True)
-class _Blocks:
-    """The pixels of a region that are compared: ``rows``, ``columns`` (N,) in it, ``block`` (N,), ``grid`` (B, 2).
+def _directions(points: Floats, centre: Floats) -> Floats:
+    """Return unit directions (N, 3) from points toward a centre (3,)."""
+    out = centre - points
+    return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
 
-    ``whole``: number of blocks on the coupon, saturated ones included.
+
+def _blocks(
+    inside: NDArray[np.bool_], images: NDArray[Any], chip: Imager, width: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], int]:
+    """Group the pixels on the coupon in blocks of ``width`` px, without saturated blocks and their neighbours.
+
+    Returns rows, columns and block (N,) of the pixels, grid (B, 2), and the number of blocks with the saturated ones.
     """
-
-    rows: NDArray[np.int64]
-    columns: NDArray[np.int64]
-    block: NDArray[np.int64]
-    grid: NDArray[np.int64]
-    whole: int
-
-    @classmethod
-    def of(cls, inside: NDArray[np.bool_], images: NDArray[Any], chip: Imager, width: int) -> _Blocks:
-        """Group the pixels on the coupon in blocks of ``width`` px, without saturated blocks and their neighbours."""
-        rows, columns = np.nonzero(inside)
-        shape = tuple(-(-size // width) for size in inside.shape)
-        number = (rows // width) * shape[1] + columns // width
-        held = np.bincount(number, minlength=shape[0] * shape[1]) >= _BLOCK_SHARE * width**2
-        bright_rows, bright_columns = np.nonzero((images >= chip.full_scale).any(axis=0) & inside)
-        saturated = np.zeros(shape, bool)
-        saturated[bright_rows // width, bright_columns // width] = True
-        used = held & ~ndimage.binary_dilation(saturated, np.ones((3, 3), bool)).ravel()
-        kept = used[number]
-        labels, block = np.unique(number[kept], return_inverse=True)
-        grid = np.stack(np.divmod(labels, shape[1]), axis=1)
-        return cls(rows[kept], columns[kept], block.reshape(-1), grid, int(held.sum()))
+    rows, columns = np.nonzero(inside)
+    shape = tuple(-(-size // width) for size in inside.shape)
+    number = (rows // width) * shape[1] + columns // width
+    held = np.bincount(number, minlength=shape[0] * shape[1]) >= _BLOCK_SHARE * width**2
+    bright_rows, bright_columns = np.nonzero((images >= chip.full_scale).any(axis=0) & inside)
+    saturated = np.zeros(shape, bool)
+    saturated[bright_rows // width, bright_columns // width] = True
+    used = held & ~ndimage.binary_dilation(saturated, np.ones((3, 3), bool)).ravel()
+    kept = used[number]
+    labels, block = np.unique(number[kept], return_inverse=True)
+    return rows[kept], columns[kept], block.reshape(-1), np.stack(np.divmod(labels, shape[1]), axis=1), int(held.sum())
 
 
-def _why_no_block(region: _CouponRegion, specimen: Specimen, width: int) -> str:
-    """Return the reason why a camera has no block on a coupon, in words."""
-    met = np.isfinite(region.points).all(axis=-1) & specimen.contains(
-        region.points[..., :2].reshape(-1, 2), np.zeros(region.points[..., 0].size)
-    ).reshape(region.points.shape[:2])
+def _why_no_block(inside: NDArray[np.bool_], points: Floats, white: Floats, specimen: Specimen, width: int) -> str:
+    on_coupon = specimen.contains(points[..., :2].reshape(-1, 2), np.zeros(inside.size)).reshape(inside.shape)
+    met = np.isfinite(points).all(axis=-1) & on_coupon
     if not met.any():
         return "the coupon is not in the image: its pose, or the plane of its cloud, is elsewhere"
-    lit = region.white > _UNLIT * max(float(region.white.max()), np.finfo(float).tiny)
-    if not (met & lit).any():
+    if not (met & (white > _UNLIT * max(float(white.max()), np.finfo(float).tiny))).any():
         return "the projector of the sensor file does not illuminate the coupon"
-    if not region.inside.any():
+    if not inside.any():
         return f"within {2 * _EDGE_PX:g} px the coupon has two edges: it is too small, or was not read out"
-    inside = int(region.inside.sum())
-    return f"its {inside} pixels, {_EDGE_PX:g} px inside the edge, fill half of no block of {width} x {width} px"
+    pixels = f"its {int(inside.sum())} pixels, {_EDGE_PX:g} px inside the edge"
+    return f"{pixels}, fill half of no block of {width} x {width} px"

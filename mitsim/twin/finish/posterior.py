@@ -88,11 +88,10 @@ class FinishPosterior:
 def finish_posterior(
     views: Sequence[CouponView], finish: MetalFinish, prior: Scatter, fit: Fit, name: str
 ) -> FinishPosterior:
-    """Return the posterior of a coupon's finish.
+    """Return the posterior of a coupon's finish; ``name`` is the id of its BSDF.
 
-    ``views``, ``finish``, ``fit``: views of the coupon, metal and process, and the fit of these views
-    (:func:`fit_views`), whose jackknife bounds the uncertainties at each tail from below. ``prior``, ``name``:
-    scattering of the coupon at the best estimate, which the scene gives; id of the BSDF in the scene.
+    ``fit`` is that of the views, whose jackknife bounds the uncertainties at each tail from below. ``prior`` is the
+    scattering at the best estimate, which the scene gives.
     """
     assert fit.log_alpha is not None and fit.wide_angle is not None and prior.beckmann_range is not None
     problem = Problem(views, finish)
@@ -111,7 +110,7 @@ def finish_posterior(
 
     def refined(beckmann: float) -> tuple[Problem, Floats]:
         other = Problem(views, finish.with_beckmann(beckmann))
-        return other, refine(other, start, variance, np.ones(other.count, bool))
+        return other, refine(other, start, variance)
 
     def misfit(beckmann: float) -> float:
         other, values = refined(beckmann)
@@ -147,10 +146,7 @@ def finish_posterior(
 
 
 def _tabulated(of_tail: Callable[[float], list[float]], misfit: Callable[[float], float]) -> tuple[Floats, Floats]:
-    """Return Beckmann shares (n,), close together where they are likely, and the results (n, 5) of ``of_tail``.
-
-    ``misfit`` is the chi-square of a share with one lobe.
-    """
+    """Return Beckmann shares (n,), close together where ``misfit`` makes them likely, and their ``of_tail`` (n, 5)."""
     likeliest = minimize_scalar(misfit, bounds=(0, 1), method="bounded", options={"xatol": _SHARE_ERROR}).x
     table = {share: of_tail(share) for share in (*_SHARES, float(likeliest))}
     for _ in range(_HALVINGS):

@@ -54,21 +54,22 @@ class Residual:
     @property
     def rms_dn(self) -> float:
         """Root mean square of the difference [DN]."""
-        if not self.view.size:
-            return float("nan")
-        return float(np.sqrt(np.mean((self.measured - self.predicted) ** 2)) * self.view.noise.gain)
+        return _rms(self.measured - self.predicted) * self.view.noise.gain
 
     @property
     def rms_relative(self) -> float:
         """Root mean square of the difference over the root mean square of the prediction [1]."""
-        if not self.view.size:
-            return float("nan")
-        return float(np.sqrt(np.mean((self.measured - self.predicted) ** 2) / np.mean(self.predicted**2)))
+        return _rms(self.measured - self.predicted) / _rms(self.predicted)
 
     @property
     def rms_in_noise(self) -> float:
         """Root mean square of :attr:`in_noise` [1]."""
-        return float(np.sqrt(np.mean(self.in_noise**2))) if self.view.size else float("nan")
+        return _rms(self.in_noise)
+
+
+def _rms(values: Floats) -> float:
+    """Return the root mean square; NaN without values."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
 
 
 def _sum_of_correlations(neighbours: float, widths: NDArray[np.int64]) -> Floats:
@@ -160,10 +161,8 @@ class Problem:
     def variance(self, values: Floats) -> tuple[Floats, float]:
         """Return the variance of the block means [e-^2], and the grain [1], at the predicted electrons."""
         predicted = self.pixels(values)
-        ends = np.cumsum([0, *(len(view.block) for view in self.views)])
-        noise = np.concatenate(
-            [view.noise.variance(predicted[a:b]) for view, a, b in zip(self.views, ends[:-1], ends[1:], strict=True)]
-        )
+        by_view = zip(self.views, self._of_views(predicted), strict=True)
+        noise = np.concatenate([view.noise.variance(pixels) for view, pixels in by_view])
         noise_mean, square = self.means(noise), self.means(predicted**2)
         # variance inside a block about its own mean, minus the noise of the imager
         off = self.electrons - predicted
@@ -182,10 +181,13 @@ class Problem:
             product = np.bincount(block, off[first] * off[second], self.count) / np.maximum(count, 1)
             share = float(np.sum(weight * product / np.where(lit, square, 1.0)) / max(weight.sum(), 1e-300)) / ratio
             sums *= _sum_of_correlations(min(max(share, 0.0), _MOST_CORRELATED), widths)
-        shared = np.concatenate(
-            [np.full(view.size, (view.noise.row + view.noise.column) / view.width) for view in self.views]
-        )
+        of_lines = [(view.noise.row + view.noise.column) / view.width for view in self.views]
+        shared = np.repeat(of_lines, [view.size for view in self.views])
         return (noise_mean + sums * grain**2 * square) / self.counts + shared, grain
+
+    def _of_views(self, pixels: Floats) -> list[Floats]:
+        """Return the values of the pixels of each view."""
+        return np.split(pixels, np.cumsum([len(view.block) for view in self.views[:-1]]))
 
     def _neighbours_in_blocks(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
         """Return the indices of pixels and of their neighbours in the same block, for both axes."""
@@ -204,7 +206,6 @@ class Problem:
     def neighbours(self, residual: Floats) -> float:
         """Return the correlation of the residuals of neighbouring blocks in a view, NaN without neighbours."""
         products, squares = 0.0, 0.0
-        pairs = 0
         for view, at in zip(self.views, self.starts, strict=False):
             mine = {(int(r), int(c)): residual[at + i] for i, (r, c) in enumerate(view.grid)}
             for (r, c), value in mine.items():
@@ -212,8 +213,7 @@ class Problem:
                     if beside in mine:
                         products += value * mine[beside]
                         squares += 0.5 * (value**2 + mine[beside] ** 2)
-                        pairs += 1
-        return float(products / squares) if pairs and squares > 0 else float("nan")
+        return float(products / squares) if squares > 0 else float("nan")
 
     def quarters(self) -> NDArray[np.int64]:
         """Return the number of each block's quarter of its view, divided at the median row and column of the blocks."""
@@ -227,13 +227,6 @@ class Problem:
     def by_view(self, values: Floats, variance: Floats) -> tuple[Residual, ...]:
         """Return the residuals of each view."""
         pixels = self.pixels(values)
-        means = self.means(pixels)
-        out, first = [], 0
-        for view, at in zip(self.views, self.starts, strict=False):
-            blocks = slice(at, at + view.size)
-            last = first + len(view.block)
-            out.append(
-                Residual(view, self.measured[blocks], means[blocks], np.sqrt(variance[blocks]), pixels[first:last])
-            )
-            first = last
-        return tuple(out)
+        of_blocks = (self.measured, self.means(pixels), np.sqrt(variance))
+        split = (np.split(numbers, self.starts[1:-1]) for numbers in of_blocks)
+        return tuple(map(Residual, self.views, *split, self._of_views(pixels)))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ from mitsim.twin.finish.observation import CouponCapture, CouponView, observe
 from mitsim.twin.finish.posterior import FinishPosterior, finish_posterior
 from mitsim.twin.finish.problem import Residual
 from mitsim.twin.finish.specimen import Specimen
-from mitsim.twin.finish.white_coupon import WhiteCouponRenderer, pattern_is_known, with_rig
+from mitsim.twin.finish.white_coupon import WhiteCouponRenderer
 
 #: side of a block with a known pattern [px]: several times the length of the grain, which is under 1 px
 KNOWN_BLOCK_PX = 8
@@ -50,15 +50,10 @@ DIFFUSE = "matt_white"
 
 @dataclass(frozen=True)
 class CouponFit:
-    """A fit and its inputs.
+    """A fit and its inputs; ``metal`` and ``posterior`` are None for a diffuse sheet.
 
-    - ``sensor``; ``finish``: name of metal and process, or of the diffuse sheet; ``metal``: None for a diffuse sheet.
-    - ``fit``: result of the fit.
-    - ``dots``: comparison of the dots by view, if the pattern is unknown.
-    - ``captures``: their folders; the coupon in them as ``specimens``; ``source`` of the captures.
-    - ``block_px``: side of a block [px].
-    - ``pattern_unknown``: whether the pattern of a capture is not known to be that of the sensor file.
-    - ``posterior``: what the captures say of the finish, for ``[unknowns.finish.measured]``; None for a diffuse sheet.
+    ``finish`` names metal and process, or the sheet. ``specimens`` are the coupon in the ``captures``. ``dots`` are
+    compared by view if the pattern of a capture is not known to be that of the sensor file.
     """
 
     sensor: Sensor = field(repr=False)
@@ -168,17 +163,14 @@ def fit_captures(
     Parameters
     ----------
     captures, sensor
-        Capture folders of one coupon, taken by one sensor: a preset, or the path of a sensor file; by default, the
-        preset that the captures name.
+        Folders; preset or path of a sensor file, by default the preset that the captures name.
     scene, parameters
         Scene file with size, metal and process of the coupon; its Ra sets only the prior of the finish. By default, the
-        scene that the first capture names, with its parameters. Values for its ``<default>`` elements come before
-        those.
+        scene that the first capture names, with its parameters; those given here come first.
     block_px
         Side of a block [px]; by default :data:`KNOWN_BLOCK_PX`, or :data:`UNKNOWN_BLOCK_PX` for an unknown pattern.
     roi
-        Region of the first camera's image [px] that shows only the coupon. The plane is then fitted to its points, and
-        the poses of the captures are not used.
+        Region of the first camera's image [px] that shows only the coupon: its points give the plane, not the poses.
     """
     if not captures:
         raise InputError("CAPTURES", "", "none", "one capture folder or more")
@@ -192,21 +184,19 @@ def fit_captures(
     finish = sample.scene.finishes[0]
     assert finish is not None  # load_sample checks this
     metal = None if finish.name == DIFFUSE else metal_finish(finish, chosen.wavelength_nm, str(path))
-    block = block_px or (KNOWN_BLOCK_PX if pattern_is_known(first, chosen) else UNKNOWN_BLOCK_PX)
+    block = block_px or (KNOWN_BLOCK_PX if first.decoding.pattern == chosen.pattern else UNKNOWN_BLOCK_PX)
 
-    views: list[CouponView] = []
-    dots: list[Dots] = []
-    specimens: list[Specimen] = []
-    renderer, calibration = WhiteCouponRenderer(with_rig(chosen, first.rig)), calibration_table(first.rig)
-    unknown, digests = False, dict[str, str]()
+    views, dots, specimens = list[CouponView](), list[Dots](), list[Specimen]()
+    calibration, unknown, digests = None, False, dict[str, str]()
     for index, folder in enumerate(track(list(captures), "captures", len(captures))):
         capture = read_capture(folder)
         if capture.sensor != first.sensor:
             raise InputError(folder, "sensor", capture.sensor, f"{first.sensor}, as in {captures[0]}")
         note_images(digests, capture.images, folder)
         if calibration_table(capture.rig) != calibration:
-            renderer, calibration = WhiteCouponRenderer(with_rig(chosen, capture.rig)), calibration_table(capture.rig)
-        pattern_known = pattern_is_known(capture, chosen)
+            rig = replace(capture.rig, projector=chosen.rig.projector)  # recordings do not describe their projector
+            renderer, calibration = WhiteCouponRenderer(replace(chosen, rig=rig)), calibration_table(capture.rig)
+        pattern_known = capture.decoding.pattern == chosen.pattern
         unknown |= not pattern_known
         specimen = find_coupon(capture, renderer.sensor, (sample.width, sample.height), str(folder), roi)
         lit = capture.source != "simulated" or has_emitters(sample.scene)
@@ -293,6 +283,5 @@ def _view_numbers(residual: Residual) -> dict[str, Any]:
 
 
 def _pooled(residuals: Sequence[Residual], name: str) -> float:
-    """Return the root mean square of a property of residuals, weighted by their numbers of blocks."""
     pairs = [(residual.view.size, getattr(residual, name)) for residual in residuals if residual.view.size]
     return math.sqrt(sum(size * rms**2 for size, rms in pairs) / sum(size for size, _ in pairs))

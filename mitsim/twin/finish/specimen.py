@@ -1,7 +1,5 @@
 """Find plane, outline and bend of a coupon, from the capture's pose, or from its decoded cloud.
 
-Signal chain with a known pose: the coupon's own frame.
-
 Signal chain without a pose: cloud -> plane through most of its points, by RANSAC, then by least squares -> frame with z
 along the normal, toward the sensor -> cells of a grid in the plane that contain points -> holes filled -> largest
 connected region. RANSAC: Fischler & Bolles, Commun. ACM 24, 1981.
@@ -31,6 +29,9 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
 from characterisation.region_of_interest import Roi
 from mitsim.sensor.transforms import Transform
+
+#: what to do about a specimen that is too small
+LARGER = "use a larger --window, or a nearer view"
 
 #: number of cells along the longer side of the recovered points
 _CELLS = 120
@@ -84,17 +85,29 @@ class Specimen:
     bend: Bend | None = None  # heights of the coupon over the plane, None for a flat one
 
     @property
+    def distance(self) -> float:
+        """Distance of the sensor from the origin [mm]."""
+        return float(np.linalg.norm(self.world_from_sensor.translation))
+
+    @property
+    def extent(self) -> Floats:
+        """Size (2,) [mm] of the rectangle of all cells, along x and y."""
+        return np.asarray(self.cell * self.occupied.shape[::-1])
+
+    @property
     def size(self) -> tuple[float, float]:
         """Width and height [mm] of a rectangle, centred at the origin, that contains the coupon."""
-        high = self.low + self.cell * self.occupied.shape[::-1]
-        width, height = 2 * np.maximum(np.abs(self.low), np.abs(high))
+        width, height = 2 * np.maximum(np.abs(self.low), np.abs(self.low + self.extent))
         return float(width), float(height)
 
     def corners(self) -> Floats:
         """Return the corners (4, 3) [mm] of the rectangle of all cells, in the sensor frame."""
-        high = self.low + self.cell * self.occupied.shape[::-1]
-        xs, ys = np.meshgrid([self.low[0], high[0]], [self.low[1], high[1]])
-        return self.world_from_sensor.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1).reshape(-1, 3))
+        return self.in_sensor(*np.stack([self.low, self.low + self.extent], axis=1)).reshape(-1, 3)
+
+    def in_sensor(self, x: Floats, y: Floats) -> Floats:
+        """Return the raster (rows, columns, 3) [mm] of coordinates of the plane, in the sensor frame."""
+        xs, ys = np.meshgrid(x, y)
+        return self.world_from_sensor.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1))
 
     def contains(self, points: NDArray[np.floating], margin: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Return which points (N, 2) [mm] lie ``margin`` (N,) [mm] inside the coupon, tested along x and y."""

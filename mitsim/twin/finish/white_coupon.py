@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 
 from characterisation.files.arrays import Floats
 from characterisation.region_of_interest import Roi
-from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.scene.differentiable import lambertian_coupon
 from mitsim.scene.light_transport.projected_codes import ProjectedPatterns
-from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.camera import Camera
 from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.working_volume import roi_around
@@ -53,45 +52,30 @@ class WhiteCouponRenderer:
 
         Parameters
         ----------
-        specimen, camera, roi
-            Pose and size of the coupon, name of the camera, and region of its image.
-        pattern
-            Image that the projector shows in place of the sensor's patterns.
+        specimen, camera, roi, pattern
+            Pose and size of the coupon, name of the camera, region of its image, and image of the projector.
         """
         if pattern not in self._lit:
             self._lit[pattern] = self._projected(pattern)
         self._simulated.patterns = self._lit[pattern]
         scene = lambertian_coupon(*specimen.size, self.sensor.wavelength_nm)
-        radiance = self._simulated.radiance(
-            scene, specimen.world_from_sensor, camera, Rendering(samples=self.samples, depth=1), seed=0, roi=roi
-        )
+        rendering = Rendering(samples=self.samples, depth=1)
+        radiance = self._simulated.radiance(scene, specimen.world_from_sensor, camera, rendering, seed=0, roi=roi)
         return np.asarray(radiance[0], np.float64) * self.sensor.electrons()
 
     def _projected(self, pattern: Pattern) -> ProjectedPatterns:
-        projector = self.sensor.projector
-        frames = self.sensor.patterns()
+        projector, frames = self.sensor.projector, self.sensor.patterns()
         if pattern == "first":
-            sent = projector.emit(frames[:1])
-        else:
-            total = np.zeros(frames.shape[1:])
-            for frame in frames:  # summed one by one to save memory
-                total += projector.emit(frame)
-            sent = np.asarray(total[None] / len(frames), np.float32)
+            frames = frames[:1]
+        total = np.zeros(frames.shape[1:])
+        for frame in frames:  # summed one by one to save memory
+            total += projector.emit(frame)
+        sent = np.asarray(total[None] / len(frames), np.float32)
         if pattern == "level":
             sent = np.full_like(sent, sent.mean())
         values = (sent - projector.black_level) / (1.0 - projector.black_level)
         values = np.clip(values, 0.0, 1.0) ** (1.0 / projector.gamma)
         return ProjectedPatterns(values.astype(np.float32), projector)
-
-
-def pattern_is_known(capture: Capture, sensor: Sensor) -> bool:
-    """Return whether the settings of a capture state the same pattern as the sensor file."""
-    return capture.decoding.pattern == sensor.pattern
-
-
-def with_rig(sensor: Sensor, rig: Rig) -> Sensor:
-    """Return the sensor with a recording's cameras, which do not describe their projector, and its own projector."""
-    return replace(sensor, rig=replace(rig, projector=sensor.rig.projector))
 
 
 def coupon_roi(camera: Camera, specimen: Specimen) -> Roi:

@@ -90,9 +90,8 @@ def fit_defocus(
 ) -> Defocus | None:
     """Fit the focus of a capture's projector; None if there are too few blocks.
 
-    ``source``, ``chip``: capture of a code with stripes, and the imager by which grey levels were made electrons.
-    ``white``, ``black``: (H, W) images of full light and of no light [e-]. ``pairs``, ``widths``: (n, 2, H, W) images
-    of stripes and of their inverses [e-], and widths (n,) of the stripes [projector px].
+    ``white`` and ``black`` (H, W) are images of full light and of no light [e-], ``pairs`` (n, 2, H, W) those of
+    stripes of ``widths`` (n,) [projector px] and of their inverses [e-], all by the imager ``chip``.
     """
     projector = source.capture.rig.projector
     assert projector is not None

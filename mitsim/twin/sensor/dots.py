@@ -94,9 +94,8 @@ class DotsFit:
 
         jacobian = np.empty((len(theta), len(theta)))
         for index, parameter in enumerate(self.parameters):
-            ends = np.clip(
-                theta[index] + _DIFFERENCE * spread[index] * np.array([-1, 1]), parameter.low, parameter.high
-            )
+            step = _DIFFERENCE * spread[index] * np.array([-1, 1])
+            ends = np.clip(theta[index] + step, parameter.low, parameter.high)
             low, high = (np.where(np.arange(len(theta)) == index, end, theta) for end in ends)
             jacobian[:, index] = (numbers(high) - numbers(low)) / max(float(ends[1] - ends[0]), 1e-12)
         values = [unscaled(x, p.scale) for x, p in zip(numbers(theta), self.parameters, strict=True)]
@@ -131,38 +130,26 @@ def fit_dots(
     room: Sequence[float] | None = None,
     draws: DotDraws = _DRAWS,
 ) -> DotsFit:
-    """Fit parameters to one capture of dots.
+    """Fit parameters to one capture of dots on a sheet, in messages ``where``.
 
-    Raises InputError if too little of the sheet is visible.
-
-    - ``capture``, ``specimen``, ``where``: capture of a flat sheet, pose and extent of the sheet, and name of the
-      capture in messages.
-    - ``sensor``: with the capture's own cameras and exposure, from :func:`mitsim.twin.compare.rebuild.like`.
-    - ``parameters``: parameters to vary or held, without those of the room unless it is known.
-    - ``room``: six terms of the irradiance [W/mm^2] of the room, if known from another capture; otherwise they are
-      fitted too.
-    - ``draws``: number and seed of the simulations.
+    ``sensor`` has the capture's own cameras and exposure, from :func:`mitsim.twin.compare.rebuild.like`. ``parameters``
+    are to vary or held, without those of the room unless it is known: ``room`` has its six terms of the irradiance
+    [W/mm^2], which are fitted if None. Raises InputError if too little of the sheet is visible.
     """
     name, camera = next(iter(capture.rig.cameras.items()))
-    seed = draws.seed
     field = SpecimenField.of(camera, image_mask(specimen, camera, MARGIN_PX), PATCH_PX)
     if len(field.corners) < FEWEST_PATCHES:
         seen = f"{len(field.corners)} patches of {PATCH_PX} px of it"
         raise InputError(where, "specimen", seen, f"{FEWEST_PATCHES} or more", "a larger --window, or a nearer view")
-    roi = field.roi
-    window = contrast_window(capture, specimen)
-    black = sensor.imager.black_level
-    real = field_figures(capture.images[name][0][roi.slices].astype(float), field, window, black)
-    simulator = SpecimenSimulator(sensor, specimen, roi)
-    unit = simulator.projector_irradiance(sensor, seed)
+    window, black = contrast_window(capture, specimen), sensor.imager.black_level
+    real = field_figures(capture.images[name][0][field.roi.slices].astype(float), field, window, black)
+    simulator = SpecimenSimulator(sensor, specimen, field.roi)
+    unit = simulator.projector_irradiance(sensor, draws.seed)
     free_parameters = list(parameters)
     if room is None:
         free_parameters += room_parameters(unit / sensor.projector.flux)
-        sensor = with_room(sensor, [_FIRST_ROOM * unit, 0.0, 0.0, 0.0, 0.0, 0.0])
-    else:
-        sensor = with_room(sensor, list(room))
-    even = np.isfinite(real.coefficients[1, 0])
-    terms = TERMS if even else TERMS[:1]
+    sensor = with_room(sensor, [_FIRST_ROOM * unit, 0.0, 0.0, 0.0, 0.0, 0.0] if room is None else list(room))
+    terms = TERMS if np.isfinite(real.coefficients[1, 0]) else TERMS[:1]
     names = [(figure, term) for figure in ("level", "contrast") for term in terms]
     names += [(alone, "1") for alone in _ALONE]
     spatial, count = np.array([term != "1" for _, term in names]), len(names)
@@ -172,9 +159,8 @@ def fit_dots(
     wanted, covariance = real.of(names)
 
     def simulate(theta: Floats, number: int) -> tuple[Floats, Floats]:
-        levels = simulator.levels(
-            _with_other_dots(with_values(sensor, free_parameters, theta), number), 1000 * seed + number
-        )
+        other = _with_other_dots(with_values(sensor, free_parameters, theta), number)
+        levels = simulator.levels(other, 1000 * draws.seed + number)
         return field_figures(levels.astype(float), field, window, black).of(names)
 
     start = np.array([parameter.get(sensor) for parameter in free_parameters])
@@ -190,9 +176,7 @@ def fit_dots(
     undetermined: list[Parameter] = []
     settled = uneven == 0
     while True:
-        known = np.array(
-            [_is_determined(moment_fit, index, parameter) for index, parameter in enumerate(free_parameters)]
-        )
+        known = np.array([_is_determined(moment_fit, index, one) for index, one in enumerate(free_parameters)])
         dropped = [parameter for parameter, is_known in zip(free_parameters, known, strict=True) if not is_known]
         if settled and not dropped:
             break
@@ -214,9 +198,8 @@ def fit_dots(
         moment_fit = match_moments(wanted, covariance, simulate, again, draws.number, f"{where}, once more")
         settled = True
     if _misses(moment_fit):
-        moment_fit = replace(
-            moment_fit, covariance=moment_fit.covariance * moment_fit.chi_square / max(moment_fit.freedom, 1)
-        )
+        wider = moment_fit.covariance * moment_fit.chi_square / max(moment_fit.freedom, 1)
+        moment_fit = replace(moment_fit, covariance=wider)
     misfits = field_misfits(names, moment_fit.off, field.basis)
     worst = max(misfits, key=lambda figure: misfits[figure])
     return DotsFit(
@@ -234,8 +217,7 @@ def fit_dots(
 def field_misfits(names: Sequence[tuple[str, str]], off: Floats, basis: Floats) -> dict[str, float]:
     """Return the root mean square over the patches of each feature's difference.
 
-    ``names`` are feature and term of each coefficient, ``off`` (n,) the differences of the coefficients, of logarithms,
-    ``basis`` (P, 6) the terms at the patches.
+    ``off`` (n,) are differences of the coefficients of features and terms, ``basis`` (P, 6) the terms at the patches.
     """
     over_field = dict[str, Floats]()
     for (figure, term), value in zip(names, off, strict=True):

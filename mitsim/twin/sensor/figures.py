@@ -31,8 +31,8 @@ FIGURES = ("level", "contrast", "crossings", "sharpness", "noise in the dark hal
 #: terms of their variation over the field
 TERMS = ("1", "x", "y", "xx", "xy", "yy")
 
-#: least number of patches for terms other than the constant
-_FEWEST_FOR_TERMS = 24
+#: least number of patches for terms other than the constant: four for each
+FEWEST_FOR_TERMS = 24
 
 #: least share of a patch that shows the specimen; chosen
 _LEAST_SHARE = 0.8
@@ -95,14 +95,12 @@ def _basis(camera: Camera, corners: NDArray[np.int64], patch_px: int) -> Floats:
 
 
 def field_figures(levels: Floats, field: SpecimenField, window_px: int, black: float = 0.0) -> FieldFigures:
-    """Return the features of an image over the field of the specimen.
+    """Return the features of the grey levels (h, w) [DN] of the field's window, from which ``black`` is subtracted.
 
-    ``levels``, ``black``: grey levels (h, w) [DN] of the field's window, and the level that is subtracted first [DN].
-    ``field``, ``window_px``: patches of the specimen; side of the window of local means [px], several run lengths of
-    the pattern wide.
+    ``window_px`` is the side of the window of local means, several run lengths of the pattern wide.
     """
     table = patch_figures(np.asarray(levels, float) - black, field, window_px)
-    basis = field.basis if len(table) >= _FEWEST_FOR_TERMS else field.basis[:, :1]
+    basis = field.basis if len(table) >= FEWEST_FOR_TERMS else field.basis[:, :1]
     inverse = np.linalg.inv(basis.T @ basis)
     solution = inverse @ basis.T @ table
     residual = table - basis @ solution

@@ -82,22 +82,20 @@ def repeats(input_captures: Sequence[InputCapture]) -> list[list[InputCapture]]:
     """Group captures that repeat one another, in the given order; a group of one has no repeat."""
     groups: list[list[InputCapture]] = []
     for source in input_captures:
-        for group in groups:
-            if group[0].kind == source.kind and _same_light(group[0], source):
-                group.append(source)
-                break
-        else:
+        group = next((group for group in groups if _repeats(group[0], source)), None)
+        if group is None:
             groups.append([source])
+        else:
+            group.append(source)
     return groups
 
 
-def _same_light(capture: InputCapture, other: InputCapture) -> bool:
-    """Return whether the first images of two captures differ by noise alone."""
-    if capture.image.shape != other.image.shape or capture.capture.bits != other.capture.bits:
+def _repeats(first: InputCapture, other: InputCapture) -> bool:
+    """Return whether two captures differ by the noise of their first images alone."""
+    told = [(one.kind, one.image.shape, one.capture.bits, one.capture.decoding.exposure_s) for one in (first, other)]
+    if told[0] != told[1]:
         return False
-    if capture.capture.decoding.exposure_s != other.capture.decoding.exposure_s:
-        return False
-    off = capture.image.astype(float) - other.image.astype(float)
+    off = first.image.astype(float) - other.image.astype(float)
     noise = float(np.abs(finest_detail(off)).mean()) * np.sqrt(np.pi / 2)
     smooth = float(np.sqrt(np.mean(uniform_filter(off, _MEAN_PX) ** 2)))
     return bool(smooth < _FACTOR * noise / _MEAN_PX + _ROUNDING_DN)

@@ -77,12 +77,9 @@ class Prior:
 def match_moments(
     real: Floats, covariance: Floats, simulate: Simulate, prior: Prior, draws: int = 2, label: str = ""
 ) -> MomentFit:
-    """Find the parameters at which simulations reproduce the features of a recording.
+    """Find the parameters at which the mean of simulations reproduces the finite features (n,) of a recording.
 
-    - ``real``, ``covariance``: features (n,) of the recording, finite, and their covariance (n, n).
-    - ``simulate``, ``draws``: the forward model, and the number of simulations to average.
-    - ``prior``: start, spread, derivative steps and bounds of the parameters.
-    - ``label``: name for progress messages; empty for none. The first message states the time of a round.
+    Progress messages begin with ``label``; there are none without it.
     """
 
     def figures(theta: Floats) -> tuple[Floats, Floats]:
@@ -107,8 +104,8 @@ def match_moments(
             other[index] += step if theta[index] + step <= prior.high[index] else -step
             jacobian[:, index] = (figures(other)[0] - seen) / (other[index] - theta[index])
         if label:
-            duration = f"{time.monotonic() - start:.0f} s each"
-            say_progress(f"{label}: {len(theta)} parameters, round {number} of at most {_ROUNDS}, about {duration}")
+            rounds = f"round {number} of at most {_ROUNDS}, about {time.monotonic() - start:.0f} s each"
+            say_progress(f"{label}: {len(theta)} parameters, {rounds}")
         weight = np.linalg.pinv(covariance + spread / draws)
         normal = jacobian.T @ weight @ jacobian + inverse_prior
         pull = jacobian.T @ weight @ (real - seen) - inverse_prior @ (theta - prior.start)

@@ -74,10 +74,13 @@ def fit_imager(groups: list[list[InputCapture]], sensor: Sensor, specimens: dict
     """Fit the noise of the reference camera's imager."""
     repeated = [group for group in groups if len(group) > 1]
     dark = [group for group in groups if group[0].kind == "dark"]
-    imager, estimates = sensor.imager, []
+    imager, estimates = sensor.imager, list[FittedKey]()
     if dark:
-        imager, level = _with_black_level(imager, dark)
-        estimates.append(level)
+        every = [source for group in dark for source in group]
+        level, spread = dark_level(_images(every))
+        names, method = tuple(source.name for source in every), "mean grey level in the dark"
+        estimates.append(FittedKey("imager.black_level_dn", level, spread, "DN", names, method))
+        imager = replace(imager, black_level=level)
     imager, curve = _with_curve(imager, groups, sensor)
     estimates += curve
     if repeated:
@@ -85,17 +88,13 @@ def fit_imager(groups: list[list[InputCapture]], sensor: Sensor, specimens: dict
         line = repeated_line([Repeats.of(images, mask, _PIXELS) for images, mask in masked], imager)
         if line is not None:
             names = tuple(source.name for group in repeated for source in group)
-            imager, noise_estimates = _with_line(
-                replace(imager, row_noise=0.0), line, names, "photon transfer of repeats"
-            )
+            imager = replace(imager, row_noise=0.0)
+            imager, noise_estimates = _with_line(imager, line, names, "photon transfer of repeats")
             imager, fixed, undetermined = _with_fixed(imager, sensor.imager, repeated, specimens)
             return ImagerFit(imager, (*estimates, *noise_estimates, *fixed), tuple(undetermined), repeated=True)
     for group in groups:
-        if group[0].kind == "off":
-            from_one_image = _from_one_image(group[0], imager, specimens)
-            if from_one_image is not None:
-                imager, noise_estimates = from_one_image
-                return ImagerFit(imager, (*estimates, *noise_estimates))
+        if group[0].kind == "off" and (found := _from_one_image(group[0], imager, specimens)) is not None:
+            return ImagerFit(found[0], (*estimates, *found[1]))
     return ImagerFit(imager, tuple(estimates), known=False)
 
 
@@ -105,10 +104,7 @@ def without_fixed_pattern(imager: Imager) -> Imager:
 
 
 def unseparated(imager: Imager) -> list[Undetermined]:
-    """Return the fixed pattern of pixels, which noise from single images contains.
-
-    It does not contain noise of whole rows and columns, of which finest detail has none.
-    """
+    """Return the fixed pattern of pixels, which noise from single images contains, unlike that of rows and columns."""
     needed = "repeats of one pose; until then read_noise_e and full_well_e include it"
     values = {"dsnu_e": imager.dsnu, "prnu": imager.prnu}
     return [Undetermined(f"imager.{key}", value, needed, True) for key, value in values.items()]
@@ -136,11 +132,9 @@ def smoothing_of(image: NDArray[np.unsignedinteger], mask: NDArray[np.bool_]) ->
     low, high = (_correlation(s) for s in _SMOOTHINGS)
 
     def at(value: float) -> float:
-        if value <= low:
-            return 0.0
-        if value >= high:
-            return _SMOOTHINGS[1]
-        return float(brentq(lambda s: _correlation(s) - value, *_SMOOTHINGS))
+        if low < value < high:
+            return float(brentq(lambda s: _correlation(s) - value, *_SMOOTHINGS))
+        return 0.0 if value <= low else _SMOOTHINGS[1]
 
     smoothing = at(correlation)
     return smoothing, max(at(correlation + spread) - smoothing, smoothing - at(correlation - spread), 1e-3)
@@ -180,24 +174,13 @@ def _with_curve(imager: Imager, groups: list[list[InputCapture]], sensor: Sensor
         knee = first_knee(levels, mask, imager)
         if knee is not None:
             method = f"noise by level of one image: the first knee, {SLOPE:g} times as steep beyond it"
-            knee_estimate = FittedKey(
-                "imager.companding_dn", knee.level, knee.uncertainty, "DN", (source.name,), method
-            )
-            return replace(imager, companding=knee.companding(imager.bits)), [knee_estimate]
+            estimate = FittedKey("imager.companding_dn", knee.level, knee.uncertainty, "DN", (source.name,), method)
+            return replace(imager, companding=knee.companding(imager.bits)), [estimate]
     return imager, []
 
 
 def _images(group: list[InputCapture]) -> NDArray[np.unsignedinteger]:
-    """Return the first images (n, H, W) of captures."""
     return np.stack([source.image for source in group])
-
-
-def _with_black_level(imager: Imager, dark: list[list[InputCapture]]) -> tuple[Imager, FittedKey]:
-    input_captures = [source for group in dark for source in group]
-    value, spread = dark_level(_images(input_captures))
-    names = tuple(source.name for source in input_captures)
-    estimate = FittedKey("imager.black_level_dn", value, spread, "DN", names, "mean grey level in the dark")
-    return replace(imager, black_level=value), estimate
 
 
 def dark_level(images: NDArray[np.unsignedinteger]) -> tuple[float, float]:
@@ -274,20 +257,19 @@ def _from_one_image(
     """Return the imager and its estimates; None without several levels: one determines a sum of both kinds of noise."""
     image, mask = source.image, _specimen_mask(source, specimens)
     names, method = (source.name,), "finest detail of one image by level, including its fixed pattern"
-    estimates = []
-    bare = without_fixed_pattern(imager)
+    bare, gain, estimates = without_fixed_pattern(imager), 1.0, list[FittedKey]()
     smoothing, spread = smoothing_of(image, mask)
     quiet = quiet_pixels(image.astype(float), denoised(image.astype(float), mask), mask)
     mask = quiet if quiet.mean() > _LEAST_QUIET * mask.mean() else mask
-    gain = 1.0
     if smoothing > max(_SURE * spread, 0.2):
         bare, gain = replace(bare, smoothing_px=smoothing), fine_gain(smoothing)
         by_neighbours = "correlation of neighbours in finest detail"
         estimates.append(FittedKey("imager.smoothing_px", smoothing, spread, "px", names, by_neighbours))
-    line = one_image_line(image, mask, imager)
-    if line is not None:
-        line = line.over(gain).not_negative()
-        if line.full_well(imager)[1] < 0.3 * line.full_well(imager)[0] and line.offset >= 0:
-            fitted_imager, from_line = _with_line(bare, line, names, method)
-            return fitted_imager, [*estimates, *from_line]
-    return None
+    if (line := one_image_line(image, mask, imager)) is None:
+        return None
+    line = line.over(gain).not_negative()
+    well, well_u = line.full_well(imager)
+    if not (well_u < 0.3 * well and line.offset >= 0):
+        return None
+    fitted_imager, from_line = _with_line(bare, line, names, method)
+    return fitted_imager, [*estimates, *from_line]

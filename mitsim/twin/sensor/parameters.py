@@ -8,8 +8,7 @@ The varied quantities are chosen so that each changes one feature:
 - logarithms of factors;
 - squares of blurs and of read noise, since variances add.
 
-The order of a list therefore matters: full well, power, room. ``determined_by`` describes the capture that determines a
-parameter if dots alone do not.
+The order of a list therefore matters: full well, power, room.
 """
 
 from __future__ import annotations
@@ -270,18 +269,14 @@ def with_room(sensor: Sensor, terms: list[float]) -> Sensor:
     return replace(sensor, room=room)
 
 
-def _terms(sensor: Sensor) -> list[float]:
-    room = sensor.room
-    if room is None:
-        return [0.0] * len(ROOM_KEYS)
-    return [room.irradiance_w_mm2 * share for share in (1.0, *room.gradient, *room.curvature)]
-
-
 def _read_room(index: int, sensor: Sensor) -> float:
     room = sensor.room
-    if room is None:
-        return 0.0
-    return float((room.irradiance_w_mm2, *room.gradient, *room.curvature)[index])
+    return 0.0 if room is None else float((room.irradiance_w_mm2, *room.gradient, *room.curvature)[index])
+
+
+def _terms(sensor: Sensor) -> list[float]:
+    level, *shares = (_read_room(index, sensor) for index in range(len(ROOM_KEYS)))
+    return [level, *(level * share for share in shares)]
 
 
 def _room_term(unit: float, index: int, sensor: Sensor) -> float:

@@ -195,20 +195,17 @@ def fixed_variance(
 ) -> tuple[float, float, float]:
     """Return mean level [e-], variance [e-^2] of the fixed pattern in uniform light, and its uncertainty.
 
-    ``images``, ``mask``: (n, H, W) repeats [DN], and the pixels (H, W) to use. ``chip``, ``gain``: imager by which grey
-    levels are made electrons; the effect of its smoothing is undone, with the variance of the finest detail after it
-    over that before it.
+    ``images`` are (n, H, W) repeats [DN]. The smoothing of the imager is undone, by the ``gain`` of the variance of the
+    finest detail, after it over before it.
     """
     electrons = linearised(images, chip)
     mean = electrons.mean(axis=0)
     temporal = float(electrons.var(axis=0, ddof=1)[mask].mean()) / kept_variance(chip.smoothing_px) ** 2
     levels, variances, counts = level_variances(mean, mask)
-    variances = variances / gain
-    weight = counts  # weights by estimated variances would favour bins that are small by chance
-    total = float((weight * variances).sum() / weight.sum())
+    # weights by estimated variances would favour bins that are small by chance
+    level, total = (float((counts * values).sum() / counts.sum()) for values in (levels, variances / gain))
     spread = np.sqrt(2 / (counts.sum() * _MEDIAN_EFFICIENCY * independent_share())) * total
     left = 2 / (mask.sum() * (len(images) - 1)) * temporal**2 / len(images) ** 2
-    level = float((weight * levels).sum() / weight.sum())
     return level, total - temporal / len(images), float(np.sqrt(spread**2 + left))
 
 

@@ -21,7 +21,7 @@ from mitsim.twin.finish.electrons import chip_of, linearised
 from mitsim.twin.finish.find_specimen import MARGIN_PX, image_mask
 from mitsim.twin.finish.specimen import Specimen
 from mitsim.twin.sensor.estimate import FittedKey
-from mitsim.twin.sensor.figures import SpecimenField
+from mitsim.twin.sensor.figures import FEWEST_FOR_TERMS, SpecimenField
 from mitsim.twin.sensor.input_captures import InputCapture
 from mitsim.twin.sensor.parameters import ROOM_KEYS
 
@@ -34,10 +34,6 @@ _SPECK = 5.0
 
 #: the same at least [DN]; chosen
 _SPECK_DN = 2.0
-
-#: least number of patches for all six terms: four for each; fewer give a constant
-_FEWEST_FOR_TERMS = 24
-
 
 #: standard uncertainties of the irradiance up to which it has no shape; chosen
 _SURE = 2.0
@@ -62,12 +58,8 @@ def fit_room(input_captures: list[InputCapture], sensor: Sensor, specimens: dict
         chip = chip_of(source.capture, sensor.imager, source.name)
         electrons = linearised(source.image, chip)
         loss = camera_illumination(sensor.imager.corner_illumination, camera)
-        scale = (
-            electrons_per_radiance(sensor.imager, sensor.wavelength_nm, capture_sensor.exposure.base_s)
-            * REFLECTANCE
-            / np.pi
-        )
-        irradiance = electrons / scale / (1.0 if loss is None else loss)
+        scale = electrons_per_radiance(sensor.imager, sensor.wavelength_nm, capture_sensor.exposure.base_s)
+        irradiance = electrons / (scale * REFLECTANCE / np.pi) / (1.0 if loss is None else loss)
         field = SpecimenField.of(camera, image_mask(specimens[source.name], camera, MARGIN_PX), _PATCH_PX)
         corners = field.corners + np.array([field.roi.top, field.roi.left])
         if not len(corners):
@@ -81,7 +73,7 @@ def fit_room(input_captures: list[InputCapture], sensor: Sensor, specimens: dict
     if not rows:
         return None
     design, seen = np.concatenate(rows), np.concatenate([np.array(means) for means in values])
-    if len(seen) < _FEWEST_FOR_TERMS:
+    if len(seen) < FEWEST_FOR_TERMS:
         design = design[:, :1]
     solution, covariance = _fitted(design, seen)
     if solution[0] <= _SURE * np.sqrt(covariance[0, 0]):

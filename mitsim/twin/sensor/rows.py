@@ -34,16 +34,15 @@ def row_turns(
 ) -> dict[str, tuple[float, float]]:
     """Return the rotations of a pair's second camera [mrad] with standard uncertainties, from its row errors.
 
-    ``row_mrad`` is that about its x axis, ``roll_mrad`` its roll; none for too few patches or no pair.
-
-    ``capture``, ``settings``, ``specimen``: capture of a pair of cameras, settings of its decoder, and pose and extent
-    of the specimen. ``prior``: standard deviations of rotation and roll before the measurement [mrad].
+    ``row_mrad`` is that about its x axis, ``roll_mrad`` its roll; none for too few patches or no pair. ``prior`` are
+    the standard deviations of both before the measurement [mrad].
     """
     geometry = capture_geometry(capture, settings)
     if not isinstance(geometry, StereoGeometry) or capture.technology == "structured_light":
         return {}
     errors, columns, rows = patch_rows(capture, settings, geometry, specimen)
-    focal, matrix = float(geometry.rectification.matrix_right[0, 0]), geometry.rectification.matrix_right
+    matrix = geometry.rectification.matrix_right
+    focal = float(matrix[0, 0])
     x, y = (columns - matrix[0, 2]) / focal, (rows - matrix[1, 2]) / focal
     used = np.isfinite(errors)
     design = focal * 1e-3 * np.column_stack([1 + y**2, -x])

@@ -14,8 +14,6 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from characterisation.words.progress import say
@@ -112,10 +110,8 @@ def fit_sensor(
     groups = repeats(input_captures)
     first = groups[0][0]
     base = _check_exposure(like(first.capture, chosen, first.name), first)
-    say(
-        f"captures: {len(input_captures)}: "
-        + ", ".join(f"{g[0].name} {g[0].kind}" + (f" x {len(g)}" if len(g) > 1 else "") for g in groups)
-    )
+    told = ", ".join(f"{g[0].name} {g[0].kind}" + (f" x {len(g)}" if len(g) > 1 else "") for g in groups)
+    say(f"captures: {len(input_captures)}: {told}")
     lit = [group[0] for group in groups if group[0].kind != "dark"]
     off_captures, on_captures = ([source for source in lit if source.kind == kind] for kind in ("off", "on"))
     specimens = _specimens(on_captures, off_captures, roi)
@@ -160,21 +156,17 @@ def sensor_path(name: str | Path) -> Path:
 
 def _check_exposure(sensor: Sensor, source: InputCapture) -> Sensor:
     if sensor.exposure.base_s is None:
-        raise InputError(
-            source.folder / "settings.json",
-            "exposure_s",
-            repr(source.capture.decoding.exposure_s),
-            "the exposure [s], since the sensor file has automatic exposure",
-        )
+        found, path = repr(source.capture.decoding.exposure_s), source.folder / "settings.json"
+        allowed = "the exposure [s], since the sensor file has automatic exposure"
+        raise InputError(path, "exposure_s", found, allowed)
     return sensor
 
 
 def _specimen(source: InputCapture, roi: Roi | None) -> Specimen:
     settings, _ = decoder_settings(source.capture)
     specimen = find_specimen(source.capture, settings, roi, source.name)
-    distance = float(np.linalg.norm(specimen.world_from_sensor.translation))
     bend = "flat" if specimen.bend is None else f"bent by {specimen.bend.rms:.2g} mm rms"
-    say(f"{source.name}: a sheet at {distance:.0f} mm, {bend}")
+    say(f"{source.name}: a sheet at {specimen.distance:.0f} mm, {bend}")
     return specimen
 
 
@@ -249,9 +241,7 @@ def _combined_estimates(
     dots: dict[str, DotsFit], base: Sensor, imager: ImagerFit, room: RoomFit | None
 ) -> tuple[list[FittedKey], list[Undetermined]]:
     """Combine the estimates of all captures of dots key by key, and list the keys that none determines."""
-    estimates: list[FittedKey] = []
-    undetermined: list[Undetermined] = list(imager.undetermined)
-    parameters: dict[str, Parameter] = {}
+    estimates, undetermined, parameters = list[FittedKey](), list(imager.undetermined), dict[str, Parameter]()
     for name, fit in dots.items():
         values, spreads = fit.in_file_units()
         determined = fit.moment_fit.determined.tolist()
@@ -266,9 +256,7 @@ def _combined_estimates(
         free = [parameter for parameter in fit.parameters if not parameter.held]
         parameters |= {parameter.key: parameter for parameter in (*free, *fit.undetermined)}
     keys = {estimate.key for estimate in estimates}
-    undetermined += [
-        Undetermined(p.key, p.read(base), p.determined_by) for p in parameters.values() if p.key not in keys
-    ]
-    if room is None and dots:
-        undetermined.append(Undetermined(BLACK_LEVEL.key, BLACK_LEVEL.read(base), BLACK_LEVEL.determined_by))
+    left = [parameter for parameter in parameters.values() if parameter.key not in keys]
+    left += [BLACK_LEVEL] * (room is None and bool(dots))
+    undetermined += [Undetermined(parameter.key, parameter.read(base), parameter.determined_by) for parameter in left]
     return pooled(estimates, common=True), undetermined

@@ -96,29 +96,19 @@ class SpecimenSimulator:
             while len(self._kept) >= _KEPT:
                 self._kept.pop(next(iter(self._kept)))
             bare = replace(sensor.imager, blur_px=0.0, corner_blur_px=None, corner_illumination=1.0)
-            pattern = sensor.pattern
+            pattern, rig = sensor.pattern, Rig({self.name: self.camera}, sensor.rig.projector)
             if getattr(pattern, "shifts_px", None):
                 pattern = pattern.model_copy(update={"shifts_px": []})  # type: ignore[union-attr]
-            bare_sensor = replace(
-                sensor,
-                projector=projector,
-                imager=bare,
-                pattern=pattern,
-                room=None,
-                ambient_image=False,
-                rig=Rig({self.name: self.camera}, sensor.rig.projector),
-            )
+            bare_sensor = replace(sensor, projector=projector, imager=bare, pattern=pattern, rig=rig)
+            bare_sensor = replace(bare_sensor, room=None, ambient_image=False)
             simulated = self._of(bare_sensor)
-            pose = self.specimen.world_from_sensor
+            pose, rays = self.specimen.world_from_sensor, simulated.pixel_rays(self.name)
             rng = np.random.default_rng(np.random.SeedSequence([seed, 2]))
-            speckle = draw_speckle(
-                self._scene, bare_sensor, self.camera, simulated.pixel_rays(self.name), pose, self.roi, rng
-            )
+            speckle = draw_speckle(self._scene, bare_sensor, self.camera, rays, pose, self.roi, rng)
             still = None if speckle is None else replace(speckle, gain=np.ones_like(speckle.gain))
+            shown: dict[str, Any] = {"seed": seed, "roi": self.roi, "speckle": still}
             rendering = Rendering(samples=_SAMPLES, depth=1)
-            radiance = simulated.radiance(
-                self._scene, pose, self.name, rendering, seed=seed, roi=self.roi, speckle=still
-            )[0]
+            radiance = simulated.radiance(self._scene, pose, self.name, rendering, **shown)[0]
             gain = np.ones_like(radiance) if speckle is None else np.asarray(speckle.gain, np.float32)
             self._kept[key] = np.stack([radiance, gain])
         lit, gain = self._kept[key]

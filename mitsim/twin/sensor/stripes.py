@@ -20,7 +20,6 @@ from mitsim.sensor.image_role import Role
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import LightCode, roles
 from mitsim.sensor.sensor import Sensor
-from mitsim.sensor.transforms import Transform
 from mitsim.twin.finish.electrons import linearised
 from mitsim.twin.finish.find_specimen import MARGIN_PX, image_mask
 from mitsim.twin.finish.specimen import Specimen
@@ -68,21 +67,15 @@ def stripes_of(source: InputCapture) -> StripeImages | None:
     images = next(iter(source.capture.images.values()))
     kinds: list[Role] = list(roles(code, projector.width, projector.height))
     names = [role.kind for role in kinds]
-    pairs, widths, across = [], [], []
-    for number, role in enumerate(kinds):
-        if role.kind != "gray":
-            continue
-        for other, inverse in enumerate(kinds):
-            if inverse.kind == "gray_inverse" and (inverse.axis, inverse.index) == (role.axis, role.index):
-                pairs.append((images[number], images[other]))
-                widths.append(2 * role.period)  # a bit of a Gray code changes every second time
-                across.append(role.axis == "columns")
-    if not pairs:
+    inverses = {(role.axis, role.index): n for n, role in enumerate(kinds) if role.kind == "gray_inverse"}
+    bits = [(n, role) for n, role in enumerate(kinds) if role.kind == "gray" and (role.axis, role.index) in inverses]
+    if not bits:
         return None
-    every = np.array(pairs, float)
-    white = images[names.index("white")].astype(float) if "white" in names else every.max(axis=(0, 1))
-    black = images[names.index("black")].astype(float) if "black" in names else every.min(axis=(0, 1))
-    return StripeImages(white, black, every, np.array(widths), np.array(across))
+    pairs = np.array([(images[n], images[inverses[role.axis, role.index]]) for n, role in bits], float)
+    white = images[names.index("white")].astype(float) if "white" in names else pairs.max(axis=(0, 1))
+    black = images[names.index("black")].astype(float) if "black" in names else pairs.min(axis=(0, 1))
+    widths = np.array([2 * role.period for _, role in bits])  # a bit of a Gray code changes every second time
+    return StripeImages(white, black, pairs, widths, np.array([role.axis == "columns" for _, role in bits]))
 
 
 def fit_stripes(source: InputCapture, sensor: Sensor, specimen: Specimen) -> list[FittedKey]:
@@ -108,16 +101,12 @@ def _levels(
     white, black = seen.white[even], seen.black[even]
     if len(white) < 500 or np.percentile(white, 95) < 2 * np.percentile(white, 5):
         return imager, []
-    rows, columns = np.nonzero(even)
-    block = (rows // _BLOCK_PX) * 10_000 + columns // _BLOCK_PX
-    lines = []
-    labels = np.unique(block)
-    whole = np.polyfit(white, black, 1)
-    for part in np.array_split(np.random.default_rng(0).permutation(labels), 20):  # a jackknife over blocks
+    block, lines = _block_of(even), []
+    slope, intercept = np.polyfit(white, black, 1).tolist()
+    for part in np.array_split(np.random.default_rng(0).permutation(np.unique(block)), 20):  # a jackknife over blocks
         kept = ~np.isin(block, part)
         lines.append(np.polyfit(white[kept], black[kept], 1))
     spread = np.sqrt(19 / 20 * ((np.array(lines) - np.mean(lines, axis=0)) ** 2).sum(axis=0))
-    slope, intercept = float(whole[0]), float(whole[1])
     # black = level + slope (white - level)
     level, share = max(intercept / (1 - slope), 0.0), float(np.clip(slope, 0.0, 0.95))
     method, names = "line of the black image over the white one through the print", (source.name,)
@@ -147,7 +136,6 @@ def _blur(
 ) -> list[FittedKey]:
     """Estimate the blur of camera and projector together from the modulation of stripes of every width, by blocks."""
     white, black = linearised(seen.white, chip), linearised(seen.black, chip)
-    depth = white - black
     usable = even & (seen.white - seen.black > _LEAST_DN)
     if usable.sum() < 500:
         return []
@@ -157,17 +145,14 @@ def _blur(
     focus = fit_defocus(source, chip, white, black, pairs, seen.widths)
     if focus is not None and focus.aperture_mm > _SURE * np.sqrt(focus.covariance[1, 1]):
         return _focus(source, focus, float(np.mean(scales)))
-    values = []
-    rows, columns = np.nonzero(usable)
-    block = (rows // _BLOCK_PX) * 10_000 + columns // _BLOCK_PX
+    values, block = [], _block_of(usable)
     width = seen.widths * np.where(seen.across, scales[0], scales[1])
     fine = width < 40 * max(scales)
-    for label in np.unique(block):
-        pixels = rows[block == label], columns[block == label]
-        if len(pixels[0]) < 200:
-            continue
-        ratio = off[:, *pixels].mean(axis=1) / depth[pixels].mean()
-        values.append(fitted_blur(width[fine], ratio[fine]))
+    off, depth = off[:, usable], (white - black)[usable]
+    for pixels in (block == label for label in np.unique(block)):
+        if pixels.sum() >= 200:
+            ratio = off[:, pixels].mean(axis=1) / depth[pixels].mean()
+            values.append(fitted_blur(width[fine], ratio[fine]))
     if len(values) < 4:
         return []
     blur, names = min(float(np.median(values)), 5.0), (source.name,)
@@ -177,6 +162,12 @@ def _blur(
         FittedKey("imager.blur_px", blur, spread, "px", names, method),
         FittedKey("projector.aperture_mm", 0.0, 0.0, "mm", names, "imager.blur_px includes its blur"),
     ]
+
+
+def _block_of(used: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return a number of the block of each used pixel."""
+    rows, columns = np.nonzero(used)
+    return np.asarray((rows // _BLOCK_PX) * 10_000 + columns // _BLOCK_PX)
 
 
 def _focus(source: InputCapture, focus: Defocus, scale: float) -> list[FittedKey]:
@@ -192,10 +183,7 @@ def _focus(source: InputCapture, focus: Defocus, scale: float) -> list[FittedKey
 
 
 def focused(estimates: list[FittedKey]) -> list[FittedKey]:
-    """Return the estimates of captures; if some tell the focus, without the blur of those that do not.
-
-    Their blur includes the projector's.
-    """
+    """Return the estimates; if some captures tell the focus, without the blur of others, which has the projector's."""
     telling = {estimate.captures for estimate in estimates if estimate.key == "projector.focus_mm"}
     mixed = "imager.blur_px", "projector.aperture_mm"
     return [one for one in estimates if not telling or one.captures in telling or one.key not in mixed]
@@ -205,13 +193,10 @@ def _pixels_per_stripe(source: InputCapture, specimen: Specimen) -> tuple[float,
     """Return the camera pixels per projector pixel, along columns and rows, at the centre of the specimen."""
     camera, projector = source.capture.rig.reference, source.capture.rig.projector
     assert projector is not None
-    pose: Transform = specimen.world_from_sensor.inverse()
-    middle = specimen.low + specimen.cell * specimen.occupied.shape[::-1] / 2
-    steps = np.array([[0, 0, 0], [1.0, 0, 0], [0, 1.0, 0]]) + np.array([*middle, 0.0])
-    points = pose.points(steps)
+    steps = np.array([[0, 0, 0], [1.0, 0, 0], [0, 1.0, 0]]) + np.array([*(specimen.low + specimen.extent / 2), 0.0])
+    points = specimen.world_from_sensor.inverse().points(steps)
     seen, sent = camera.project(points), projector.project(points)
-    to_camera = np.stack([seen[1] - seen[0], seen[2] - seen[0]], axis=1)
-    to_projector = np.stack([sent[1] - sent[0], sent[2] - sent[0]], axis=1)
+    to_camera, to_projector = ((pixels[1:] - pixels[0]).T for pixels in (seen, sent))
     # a stripe's edge moves along the gradient of its coordinate in the camera: 1 / |gradient| px for one of its pixels
     gradient = to_projector @ np.linalg.inv(to_camera)
     return float(1 / np.linalg.norm(gradient[0])), float(1 / np.linalg.norm(gradient[1]))

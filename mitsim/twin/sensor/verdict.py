@@ -53,16 +53,11 @@ class DotAgreement:
         return self.chi_square / max(self.freedom, 1)
 
     @property
-    def within_margin(self) -> bool:
-        """Return whether every feature lies within the margin of ``mitsim compare``."""
-        return self.misfit <= math.log(NOISE_FACTOR)
-
-    @property
     def word(self) -> Word:
         """Return the verdict of this capture alone."""
         if float(chi2.sf(self.chi_square, max(self.freedom, 1))) >= CHANCE:
             return "good"
-        return "fair" if self.reduced <= FAIR or self.within_margin else "bad"
+        return "fair" if self.reduced <= FAIR or self.misfit <= math.log(NOISE_FACTOR) else "bad"
 
 
 @dataclass(frozen=True)

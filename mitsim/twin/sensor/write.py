@@ -32,21 +32,17 @@ _EXPOSURE_RULE = re.compile(r"\s*(rule|reflectance|distance_mm|level|percentile|
 _KEY = re.compile(r"^(\s*)([A-Za-z0-9_]+)\s*=\s*(.*)$")
 #: a text in quotes, or a comment
 _QUOTED = re.compile(r"""\"([^\"]+)\"|'([^']+)'|#.*""")
+#: the value of a key with the texts in it, and the comment after it
+_VALUE = re.compile(r"""((?:"[^"]*"?|'[^']*'?|[^"'#])*)(?:#(.*))?""")
 _ARRAY = re.compile(r"^(.*)\[(\d+)\]$")
 
 
 def write_sensor(fit: SensorFit, sensor: str | Path, output: Path) -> None:
     """Write the sensor file of a fit: the file of ``sensor`` with the fitted numbers."""
-    path = sensor_path(sensor)
+    path, first = sensor_path(sensor), fit.input_captures[0]
     text = moved_paths(path.read_text(encoding="utf-8"), path.parent, output.parent)
-    first = fit.input_captures[0]
-    entries = {
-        "name": Entry(
-            f'"{output.stem}"',
-            f"fitted by `mitsim fit sensor` from {path.stem}\nverdict: {fit.verdict.word}: {fit.verdict.why}",
-        ),
-        "fitted_to": Entry(_list(fit.fitted_to), ""),
-    }
+    origin = f"fitted by `mitsim fit sensor` from {path.stem}\nverdict: {fit.verdict.word}: {fit.verdict.why}"
+    entries = {"name": Entry(f'"{output.stem}"', origin), "fitted_to": Entry(_list(fit.fitted_to), "")}
     entries |= _entries(fit)
     if "[calibration]" not in text and first.capture.source != "simulated":
         text = with_cameras(text, dict(first.capture.rig.cameras), first.name)
@@ -66,11 +62,11 @@ def write_sensor(fit: SensorFit, sensor: str | Path, output: Path) -> None:
 def fit_table(fit: SensorFit) -> str:
     """Return a Markdown table of the estimates and the undetermined numbers."""
     lines = ["| number | value | 95 % interval | unit | captures | how |", "| --- | --- | --- | --- | --- | --- |"]
-    for estimate in fit.estimates:
-        lines.append(
-            f"| {estimate.key} | {estimate.value:.4g} | {estimate.interval_in_words()} | {estimate.unit} | "
-            f"{', '.join(estimate.captures)} | {estimate.method} |"
-        )
+    lines += [
+        f"| {one.key} | {one.value:.4g} | {one.interval_in_words()} | {one.unit} | {', '.join(one.captures)} "
+        f"| {one.method} |"
+        for one in fit.estimates
+    ]
     kept = [entry for entry in fit.undetermined if entry.value]
     if kept:
         lines += ["", "| not determined | in the file | a capture that would determine it |", "| --- | --- | --- |"]
@@ -86,15 +82,13 @@ def fit_table(fit: SensorFit) -> str:
 
 
 def _entries(fit: SensorFit) -> dict[str, Entry]:
-    entries: dict[str, Entry] = {}
-    arrays: dict[str, dict[int, FittedKey]] = {}
+    entries, arrays = dict[str, Entry](), dict[str, dict[int, FittedKey]]()
     for estimate in fit.estimates:
         match = _ARRAY.match(estimate.key)
         if estimate.key == "imager.companding_dn":
             knees = ", ".join(numbers(knee, 6) for knee in fit.sensor.imager.companding)
-            entries[estimate.key] = Entry(
-                f"[{knees}]", _comment(estimate) + "; unknown beyond the brightest level seen"
-            )
+            comment = _comment(estimate) + "; unknown beyond the brightest level seen"
+            entries[estimate.key] = Entry(f"[{knees}]", comment)
         elif match:
             arrays.setdefault(match[1], {})[int(match[2])] = estimate
         else:
@@ -111,12 +105,12 @@ def _entries(fit: SensorFit) -> dict[str, Entry]:
     for kept in fit.undetermined:
         if kept.contained:
             entries[kept.key] = Entry("0", f"not determined; needs {kept.determined_by}", True)
-    if "misalignment.row_mrad" in entries:
-        row, roll = (next(e for e in fit.estimates if e.key == f"misalignment.{key}_mrad") for key in ("row", "roll"))
+    turns = {one.key: one for one in fit.estimates if one.key.startswith("misalignment.")}
+    if turns:
         comment = "rotation of one unit's second camera off its calibration, assumed for the next unit too"
-        sizes = {key: float(np.hypot(one.value, one.uncertainty)) for key, one in (("row", row), ("roll", roll))}
+        sizes = {key: float(np.hypot(one.value, one.uncertainty)) for key, one in turns.items()}
         for key, size in sizes.items():
-            entries[f"unknowns.calibration.{key}_mrad"] = Entry(number(size), comment)
+            entries[key.replace("misalignment", "unknowns.calibration")] = Entry(number(size), comment)
         vergence = float(np.sqrt(np.mean(np.square(list(sizes.values())))))
         if vergence > fit.sensor.unknowns.calibration.vergence_mrad:
             comment = "causes no row error; assumed as large as the other two rotations, whose mounts are the same"
@@ -146,7 +140,7 @@ def _list(captures: Sequence[FittedCapture]) -> str:
 
 def number(value: float) -> str:
     """Format a number for TOML with five digits."""
-    return f"{value:.5g}" if abs(value) < 1e15 else f"{value:.5e}"
+    return f"{value:.5g}"
 
 
 def numbers(values: Sequence[float] | np.ndarray, digits: int = 9) -> str:
@@ -165,16 +159,9 @@ def with_entries(text: str, entries: Mapping[str, Entry]) -> str:
 def with_cameras(text: str, cameras: Mapping[str, Camera], source: str) -> str:
     """Replace the tables of the cameras; comments on lines of their own are kept above them."""
     blocks = _blocks(text)
-    remarks = [
-        line
-        for table, lines in blocks
-        if table.startswith("cameras.")
-        for line in lines
-        if line.lstrip().startswith("#")
-    ]
-    kept = [lines for table, lines in blocks if not table.startswith("cameras.")]
-    index = next((n for n, (table, _) in enumerate(blocks) if table.startswith("cameras.")), 1)
-    made: list[str] = [*remarks, f"# cameras of this unit, from {source}"]
+    former = [n for n, (table, _) in enumerate(blocks) if table.startswith("cameras.")]
+    made = [line for n in former for line in blocks[n][1] if line.lstrip().startswith("#")]
+    made.append(f"# cameras of this unit, from {source}")
     for name, camera in cameras.items():
         matrix, pose = camera.matrix, camera.sensor_from_camera
         made += [
@@ -191,7 +178,8 @@ def with_cameras(text: str, cameras: Mapping[str, Camera], source: str) -> str:
             turn = Rotation.from_matrix(pose.rotation).as_euler("xyz", degrees=True)
             made += [f"position_mm = {numbers(pose.translation)}", f"rotation_deg = {numbers(turn)}"]
         made.append("")
-    kept.insert(index, made)
+    kept = [lines for n, (_, lines) in enumerate(blocks) if n not in former]
+    kept.insert(former[0] if former else 1, made)
     return "\n".join(line for lines in kept for line in lines)
 
 
@@ -286,21 +274,14 @@ def _replaced(lines: list[str], index: int, new: str) -> list[str]:
 
 
 def _end(lines: list[str]) -> int:
-    """Return the number of the line after the last one with a content."""
     return max((n for n, line in enumerate(lines) if line.strip()), default=-1) + 1
 
 
 def _value_and_remark(text: str) -> tuple[str, str]:
     """Return the value of a key and the comment after it; a # in quotes is part of the value."""
-    quote = ""
-    for index, letter in enumerate(text):
-        if quote:
-            quote = "" if letter == quote else quote
-        elif letter in "\"'":
-            quote = letter
-        elif letter == "#":
-            return text[:index].strip(), text[index + 1 :].strip()
-    return text.strip(), ""
+    match = _VALUE.match(text)
+    assert match is not None
+    return match[1].strip(), (match[2] or "").strip()
 
 
 def _end_of_value(lines: list[str], index: int) -> int:
