@@ -100,18 +100,14 @@ def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train
 
     Parameters
     ----------
-    sources, patterns
-        Captures, as :func:`find_sources` returns them; patterns of the shapes of each object (:func:`objects_of`).
-    output, split
-        Folder to write, and name of the split: train, val or test.
+    sources, output, split, patterns
+        Captures, as :func:`find_sources` returns them; the split is train, val or test; patterns as :func:`objects_of`.
     """
     output = Path(output).absolute()
     if output.exists():
         raise InputError("--output", "", f"{output}, which exists", "a new folder")
     finishes = list(dict.fromkeys(source.finish for source in sources))
-    tables: dict[str, dict[str, dict[str, Any]]] = {
-        finish: {"camera": {}, "gt": {}, "gt_info": {}} for finish in finishes
-    }
+    tables = {finish: {name: dict[str, Any]() for name in ("camera", "gt", "gt_info")} for finish in finishes}
     scenes: dict[tuple[Any, ...], tuple[Scene, list[Scene]]] = {}  # by file and parameters
     camera: dict[str, Any] = {}
     with atomic_folder(output) as partial:
@@ -162,23 +158,17 @@ def _levels(depth: NDArray[np.float64], scale: float) -> NDArray[np.uint16]:
 def _write_frame(frame: Frame, folder: Path, number: int, scale: float, tables: dict[str, dict[str, Any]]) -> None:
     name = f"{number:06d}"
     counts, true = (_levels(depth, scale) for depth in (frame.depth, frame.true_depth))
-    images: dict[str, NDArray[Any] | None] = {
-        f"gray/{name}": frame.grey,
-        f"depth/{name}": counts,
-        f"status/{name}": frame.status,
-        f"depth_true/{name}": true,
-        f"feature/{name}": (frame.shape + 1).astype(np.uint16),
-    }
+    images: dict[str, NDArray[Any]] = {} if frame.grey is None else {f"gray/{name}": frame.grey}
+    images |= {f"depth/{name}": counts, f"status/{name}": frame.status, f"depth_true/{name}": true}
+    images[f"feature/{name}"] = (frame.shape + 1).astype(np.uint16)
     for k, (silhouette, visible) in enumerate(frame.masks):
         images[f"mask/{name}_{k:06d}"] = np.where(silhouette, 255, 0).astype(np.uint8)
         images[f"mask_visib/{name}_{k:06d}"] = np.where(visible, 255, 0).astype(np.uint8)
     for path, image in images.items():
-        if image is not None:
-            (folder / path).parent.mkdir(parents=True, exist_ok=True)
-            (folder / f"{path}.png").write_bytes(encode_png(np.ascontiguousarray(image)))
-    pose, key = frame.camera_from_part, str(number)
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / f"{path}.png").write_bytes(encode_png(np.ascontiguousarray(image)))
+    pose, key, grid = frame.camera_from_part, str(number), frame.grid
     turn, shift = pose.rotation.ravel().tolist(), pose.translation.tolist()
-    grid = frame.grid
     matrix = [grid.fx, 0.0, grid.cx, 0.0, grid.fy, grid.cy, 0.0, 0.0, 1.0]
     tables["camera"][key] = {"cam_K": matrix, "depth_scale": scale, "cam_R_w2c": turn, "cam_t_w2c": shift}
     numbers = range(1, len(frame.masks) + 1)  # BOP counts objects from 1
@@ -216,9 +206,8 @@ def _write_models(folder: Path, objects: Sequence[Scene]) -> None:
     for number, scene in enumerate(objects, 1):
         corners = triangles(scene)
         if not len(corners):
-            raise InputError(
-                "--object", "", f"{', '.join(scene.names)}, which light passes", "at least one solid shape"
-            )
+            found = f"{', '.join(scene.names)}, which light passes"
+            raise InputError("--object", "", found, "at least one solid shape")
         mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
         written = trimesh.exchange.ply.export_ply(mesh, encoding="ascii", vertex_normal=True)
         (folder / f"obj_{number:06d}.ply").write_bytes(written)

@@ -59,10 +59,9 @@ def bop_frame(capture: Capture, scene: Scene, objects: Sequence[Scene], where: s
     depth, status = on_pinhole(cloud, grid)
     rays, there = PixelRays.of_grid(grid), capture.world_from_sensor
     seen, met = cast(scene, rays, there, np.zeros((0, 3))), shapes_met(scene, rays, there)
-    masks = tuple(
-        (shapes_met(part, rays, there) >= 0, np.isin(met, [scene.names.index(name) for name in part.names]))
-        for part in objects
-    )
+    numbers = [[scene.names.index(name) for name in part.names] for part in objects]
+    silhouettes = [shapes_met(part, rays, there) >= 0 for part in objects]
+    masks = tuple((whole, np.isin(met, mine)) for whole, mine in zip(silhouettes, numbers, strict=True))
     along = grid.rays() @ grid.rotation[:, 2]
     pose = (capture.world_from_sensor @ sensor_from_grid(grid)).inverse()
     frame = Frame(grid, _grey(capture, grid), depth, status, seen.shape, seen.distance * along, pose, masks)
@@ -87,9 +86,8 @@ def on_pinhole(cloud: PointCloud, grid: ViewGrid) -> tuple[NDArray[np.float64], 
     carried = inverse[row, column]
     for k, axis in enumerate((1, 0)):
         carried = carried + (exact - pixel)[..., k] * _slope(inverse, axis)[row, column]
-    return np.where(inside, 1 / carried, np.nan), np.where(
-        inside, cloud.status[row, column], np.uint8(Status.NO_SURFACE)
-    )
+    status = np.where(inside, cloud.status[row, column], np.uint8(Status.NO_SURFACE))
+    return np.where(inside, 1 / carried, np.nan), status
 
 
 def _slope(inverse: NDArray[np.float64], axis: int) -> NDArray[np.float64]:

@@ -86,16 +86,6 @@ def cloud_points(cloud: PointCloud, part_from_sensor: Transform | None = None) -
         points, rays = part_from_sensor.points(points), part_from_sensor.directions(rays)
     sigma = np.full(len(rows), np.nan) if cloud.sigma is None else cloud.sigma[rows, columns].astype(np.float64)
     feature = np.full(len(rows), -1) if cloud.feature is None else cloud.feature[rows, columns]
-    return CloudPoints(
-        points,
-        sigma,
-        rays,
-        rows.astype(np.uint16),
-        columns.astype(np.uint16),
-        feature.astype(np.int16),
-        cloud.feature_names,
-        "sensor" if part_from_sensor is None else "part",
-        "mm",
-        cloud.sensor,
-        cloud.source,
-    )
+    pixels = rows.astype(np.uint16), columns.astype(np.uint16), feature.astype(np.int16), cloud.feature_names
+    frame = "sensor" if part_from_sensor is None else "part"
+    return CloudPoints(points, sigma, rays, *pixels, frame, "mm", cloud.sensor, cloud.source)

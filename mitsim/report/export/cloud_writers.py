@@ -58,9 +58,8 @@ def write_cloud_pcd(points: CloudPoints, path: str | Path, part_from_sensor: Tra
     """
     pypcd4 = needed("pypcd4", "pypcd4", f"{path}: PCD")
     table = points.table()
-    cloud = pypcd4.PointCloud.from_points(
-        [table[name] for name in FIELDS], list(FIELDS), [np.dtype(kind).type for kind in FIELDS.values()]
-    )
+    types = [np.dtype(kind).type for kind in FIELDS.values()]
+    cloud = pypcd4.PointCloud.from_points([table[name] for name in FIELDS], list(FIELDS), types)
     if part_from_sensor is not None and points.frame == "sensor":
         scale = 0.001 if points.unit == "m" else 1.0
         x, y, z, w = quaternion(part_from_sensor)

@@ -74,10 +74,8 @@ def write_dcc(run_results: RunResults, declared: Declaration, issuer: Issuer, pa
 
     Parameters
     ----------
-    run_results, declared
-        Results of a run, and their declaration.
-    issuer, path
-        Who issues the certificate, and file to write.
+    run_results, declared, issuer, path
+        Results of a run, their declaration, who issues the certificate, and file to write.
     """
     register_namespace("dcc", DCC)
     register_namespace("si", SI)
@@ -119,12 +117,8 @@ def _administrative(to: Element, run_results: RunResults, declared: Declaration,
     _add(core, "mandatoryLangCodeISO639_1", "en")
     named = "/".join((declared.number, issuer.laboratory, issuer.customer, issuer.serial))
     _add(core, "uniqueIdentifier", str(uuid.uuid5(uuid.NAMESPACE_URL, f"{DCC}/{named}")))
-    _identified(
-        _add(core, "identifications"),
-        "calibrationLaboratory",
-        declared.number,
-        "first digits of the SHA-256 of statement.json",
-    )
+    of_number = "calibrationLaboratory", declared.number, "first digits of the SHA-256 of statement.json"
+    _identified(_add(core, "identifications"), *of_number)
     for name in ("beginPerformanceDate", "endPerformanceDate"):
         _add(core, name, declared.date)
     _add(core, "performanceLocation", "other")
@@ -156,9 +150,8 @@ def _methods(to: Element, run_results: RunResults, declared: Declaration) -> Non
     used = _add(_add(to, "usedMethods"), "usedMethod", refType="basic_methodMeasurementUncertainty")
     _text(used, "name", "Simulate and analyse, a virtual experiment")
     method = "rendered and decoded" if run_results.source == "render" else "drawn from a performance map"
-    _text(
-        used, "description", " ".join([f"Virtual measurements {method}.", *(note.in_full for note in declared.notes)])
-    )
+    words = [f"Virtual measurements {method}.", *(note.in_full for note in declared.notes)]
+    _text(used, "description", " ".join(words))
     for norm in ("JCGM 101:2008", "ISO/TS 15530-4:2008"):
         _add(used, "norm", norm)
 
@@ -172,49 +165,40 @@ def _software(to: Element) -> None:
 def _result(to: Element, expected_result: ExpectedResult) -> None:
     result = _add(to, "result")
     _text(result, "name", expected_result.measurement)
-    _text(
-        result,
-        "description",
-        f"{expected_result.kind.replace('_', ' ')} of {', '.join(expected_result.features)}, "
-        f"from view {expected_result.view}",
-    )
+    measured = f"{expected_result.kind.replace('_', ' ')} of {', '.join(expected_result.features)}"
+    _text(result, "description", f"{measured}, from view {expected_result.view}")
     table = _add(_add(result, "data"), "list")
     unit = _UNITS[expected_result.unit]
     _real(_quantity(table, "nominal value", "basic_nominalValue"), expected_result.nominal, unit)
+    bias, uncertainty = expected_result.bias, expected_result.uncertainty
     low, high = expected_result.error_low, expected_result.error_high
-    if (
-        expected_result.bias is not None
-        and expected_result.uncertainty is not None
-        and low is not None
-        and high is not None
-    ):
-        error = _real(
-            _quantity(table, "error, measured less true", "basic_measurementError"), expected_result.bias, unit
-        )
+    if bias is not None and uncertainty is not None and low is not None and high is not None:
+        error = _real(_quantity(table, "error, measured less true", "basic_measurementError"), bias, unit)
         interval = _si(error, "coverageInterval")
-        _si(interval, "standardUnc", _number(expected_result.uncertainty))
+        _si(interval, "standardUnc", _number(uncertainty))
         _si(interval, "intervalMin", _number(low))
         _si(interval, "intervalMax", _number(high))
         _si(interval, "coverageProbability", "0.95")
-        largest = max(expected_result.bias - low, high - expected_result.bias)
+        largest = max(bias - low, high - bias)
         if expected_result.expected is not None:
             part = "nominal part" if expected_result.errors_of == ANY_PART else expected_result.errors_of
-            reading = _real(
-                _quantity(table, f"expected reading of a {part}", "basic_measuredValue"), expected_result.expected, unit
-            )
-            if largest >= expected_result.uncertainty > 0:  # D-SI has no coverage factor below 1
+            quantity = _quantity(table, f"expected reading of a {part}", "basic_measuredValue")
+            reading = _real(quantity, expected_result.expected, unit)
+            if largest >= uncertainty > 0:  # D-SI has no coverage factor below 1
                 expanded = _si(reading, "expandedUnc")
                 _si(expanded, "uncertainty", _number(largest))
-                _si(expanded, "coverageFactor", f"{largest / expected_result.uncertainty:.4f}")
+                _si(expanded, "coverageFactor", f"{largest / uncertainty:.4f}")
                 _si(expanded, "coverageProbability", "0.95")
     deviations = effective_deviations(expected_result.nominal, expected_result.tolerance) or (None, None)
-    for name, value in zip(("lower deviation", "upper deviation"), deviations, strict=True):
+    limits = {
+        "tolerance, lower deviation": deviations[0],
+        "tolerance, upper deviation": deviations[1],
+        "accepted readings, lowest": expected_result.accepted_low,
+        "accepted readings, highest": expected_result.accepted_high,
+    }
+    for name, value in limits.items():
         if value is not None:
-            _real(_quantity(table, f"tolerance, {name}"), value, unit)
-    readings = expected_result.accepted_low, expected_result.accepted_high
-    for name, value in zip(("lowest", "highest"), readings, strict=True):
-        if value is not None:
-            _real(_quantity(table, f"accepted readings, {name}"), value, unit)
+            _real(_quantity(table, name), value, unit)
     if expected_result.tolerance is not None and expected_result.accepted_high is None:
         _text(_quantity(table, "accepted readings"), "noQuantity", "none")
     _real(_quantity(table, "number of virtual measurements"), float(expected_result.trials), r"\one")

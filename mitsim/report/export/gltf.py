@@ -52,8 +52,7 @@ def write_glb(scene: RunScene, path: str | Path) -> None:
         glb.file.materials.append(gltf.Material(name="part", pbrMetallicRoughness=metal, doubleSided=True))
         vertices, faces = np.asarray(scene.part.vertices), np.asarray(scene.part.faces)
         glb.node(root, "part", mesh=glb.mesh("part", vertices, faces, mode=_TRIANGLES, material=0))
-    grid = scene.grid
-    lines = camera = None
+    grid, lines, camera = scene.grid, None, None
     if grid is not None:
         lines = glb.mesh("frustum", *frustum(grid, FRUSTUM_MM), mode=_LINES)
         vertical, aspect = field_of_view(grid)

@@ -90,12 +90,6 @@ def write_map_kernel(performance_map: PerformanceMap, folder: str | Path, baseli
         far=distances.max(),
         surfaces=", ".join(name + ("" if np.isnan(ra) else f" Ra {ra:g}") for name, ra in performance_map.samples),
     )
-    write_folder(
-        folder,
-        {
-            "map.npz": packed.getvalue(),
-            "sensor_map.py": Path(map_kernel.__file__).read_bytes(),
-            "README.md": readme.encode("utf-8"),
-        },
-        overwrite=True,
-    )
+    kernel = Path(map_kernel.__file__).read_bytes()
+    files = {"map.npz": packed.getvalue(), "sensor_map.py": kernel, "README.md": readme.encode("utf-8")}
+    write_folder(folder, files, overwrite=True)

@@ -137,11 +137,8 @@ def _device(ids: Ids, run_results: RunResults) -> Element:
 def _features(ids: Ids, run_results: RunResults) -> dict[str, list[Element]]:
     definitions, nominals, items = list[Element](), list[Element](), list[Element]()
     for name, feature in run_results.task.features.items():
-        nominal, number, of_nominal = (
-            run_results.task.nominal(name),
-            ids.new("definition", name),
-            ids.of("nominal", name),
-        )
+        nominal = run_results.task.nominal(name)
+        number, of_nominal = ids.new("definition", name), ids.of("nominal", name)
         tag, head = f"{FEATURES[feature.kind]}Feature", {"Name": name, "FeatureDefinitionId": number}
         definitions.append(element(f"{tag}Definition", feature_size(nominal), id=number))
         nominals.append(element(f"{tag}Nominal", head | feature_geometry(nominal), id=of_nominal))
@@ -209,11 +206,10 @@ def _plan(ids: Ids, run_results: RunResults) -> dict[str, Any]:
 def _results(ids: Ids, run_results: RunResults) -> Element:
     number = ids.new("results")
     virtual = {"virtual": "expectations; no part was inspected", "study": run_results.study}
+    measured = [_measurement(ids, run_results, result) for result in run_results.results]
     content = {
         "Attributes": attributes(virtual),
-        "MeasuredCharacteristics": {
-            "CharacteristicMeasurements": [_measurement(ids, run_results, result) for result in run_results.results]
-        },
+        "MeasuredCharacteristics": {"CharacteristicMeasurements": measured},
         "InspectionStatus": {"InspectionStatusEnum": "NOT_CALCULATED"},
     }
     return element("MeasurementResults", content, id=number)

@@ -117,7 +117,7 @@ def decimal(value: float) -> str:
 
 
 def vector(values: Iterable[float]) -> str:
-    """Format three numbers."""
+    """Format numbers."""
     return " ".join(decimal(float(value)) for value in values)
 
 
@@ -192,10 +192,8 @@ def zone(name: str, task: Task, asked: Measurement, frame: str | None) -> dict[s
 
     Parameters
     ----------
-    name, frame
-        One of :data:`GEOMETRIC`, and id of the datum reference frame, None without datums.
-    task, asked
-        The task, and its measurement with a tolerance [mm].
+    name, task, asked, frame
+        One of :data:`GEOMETRIC`; a measurement of the task; id of the datum reference frame, None without datums.
     """
     shape = _zone_shape(name, *(task.features[feature].kind for feature in asked.features))
     return {

@@ -43,12 +43,8 @@ def write_rrd(scene: RunScene, path: str | Path, recording: str) -> None:
     classes = [(status.value, status.name.lower(), colour.tolist()) for status, colour in colours.items()]
     stream.log("views", rerun.AnnotationContext(classes), static=True)
     if scene.part is not None:
-        mesh = rerun.Mesh3D(
-            vertex_positions=scene.part.vertices,
-            triangle_indices=scene.part.faces,
-            vertex_normals=scene.part.vertex_normals,
-            albedo_factor=(180, 180, 185),
-        )
+        corners = {"vertex_positions": scene.part.vertices, "vertex_normals": scene.part.vertex_normals}
+        mesh = rerun.Mesh3D(triangle_indices=scene.part.faces, albedo_factor=(180, 180, 185), **corners)
         stream.log("part", mesh, static=True)
     for view in scene.views:
         _log_view(rerun, stream, scene, view)
@@ -58,12 +54,8 @@ def write_rrd(scene: RunScene, path: str | Path, recording: str) -> None:
 
 def _log_view(rerun: Any, stream: Any, scene: RunScene, view: ShownView) -> None:
     entity, pose = f"views/{view.name}", view.part_from_sensor
-    stream.log(
-        entity,
-        rerun.Transform3D(translation=pose.translation, mat3x3=pose.rotation),
-        rerun.AnyValues(best_of=list(view.best_of) or [""]),
-        static=True,
-    )
+    at = rerun.Transform3D(translation=pose.translation, mat3x3=pose.rotation)
+    stream.log(entity, at, rerun.AnyValues(best_of=list(view.best_of) or [""]), static=True)
     grid = scene.grid
     if grid is not None:
         pinhole = rerun.Pinhole(
@@ -74,20 +66,15 @@ def _log_view(rerun: Any, stream: Any, scene: RunScene, view: ShownView) -> None
             camera_xyz=rerun.ViewCoordinates.RDF,
             image_plane_distance=FRUSTUM_MM,
         )
-        stream.log(
-            f"{entity}/grid", rerun.Transform3D(translation=grid.origin, mat3x3=grid.rotation), pinhole, static=True
-        )
+        at = rerun.Transform3D(translation=grid.origin, mat3x3=grid.rotation)
+        stream.log(f"{entity}/grid", at, pinhole, static=True)
     for kind, cloud in view.clouds.items():
         stream.log(f"{entity}/grid/{kind}_status", rerun.SegmentationImage(cloud.status), static=True)
         points = cloud_points(cloud)
-        stream.log(
-            f"{entity}/{kind}",
-            rerun.Points3D(points.points, colors=_colours(points.sigma), radii=-1.5),
-            rerun.AnyValues(
-                sigma=points.sigma.astype(np.float32), covariance=points.covariance.astype(np.float32).ravel()
-            ),
-            static=True,
-        )
+        shown = rerun.Points3D(points.points, colors=_colours(points.sigma), radii=-1.5)
+        noise = {"sigma": points.sigma, "covariance": points.covariance.ravel()}
+        numbers = rerun.AnyValues(**{name: values.astype(np.float32) for name, values in noise.items()})
+        stream.log(f"{entity}/{kind}", shown, numbers, static=True)
 
 
 def _colours(sigma: NDArray[np.float64]) -> NDArray[np.uint8]:

@@ -90,13 +90,9 @@ def read_results(folder: str | Path, task_file: str | Path | None = None) -> Run
         raise InputError(Path(folder) / "statement.json", "", "no such file", "a run with a statement", _GO_ON)
     task = run.task() if task_file is None else read_task(task_file)
     if list(task.measurements) != list(run.about.measurements):
-        raise InputError(
-            task_file or run.folder / TASK,
-            "measurements",
-            ", ".join(task.measurements),
-            f"{', '.join(run.about.measurements)}: the task of the run",
-            "give the run's own: --task FILE",
-        )
+        where, found = task_file or run.folder / TASK, ", ".join(task.measurements)
+        allowed = f"{', '.join(run.about.measurements)}: the task of the run"
+        raise InputError(where, "measurements", found, allowed, "give the run's own: --task FILE")
     if task_file is not None and run.has(TASK):
         _check_same(task_file, task, run.task())
     view = run.statement.view
@@ -120,10 +116,9 @@ def _check_same(task_file: str | Path, given: Task, own: Task) -> None:
 def write_results_csv(run_results: RunResults, path: str | Path) -> None:
     """Write one row for every measurement; missing numbers are empty fields."""
     out = io.StringIO()
-    rows = [asdict(result) | {"features": " ".join(result.features)} for result in run_results.results]
-    for row in rows:  # lower and upper deviation have a space between
-        if isinstance(row["tolerance"], tuple):
-            row["tolerance"] = " ".join(map(repr, row["tolerance"]))
+    rows = [asdict(result) for result in run_results.results]
+    for row in rows:  # several features, and lower and upper deviation, have a space between
+        row |= {name: " ".join(map(str, value)) for name, value in row.items() if isinstance(value, tuple)}
     writer = csv.DictWriter(out, list(ExpectedResult.__dataclass_fields__), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
@@ -132,24 +127,20 @@ def write_results_csv(run_results: RunResults, path: str | Path) -> None:
 
 def write_results_json(run_results: RunResults, path: str | Path) -> None:
     """Write the results and the plan as JSON."""
-    plan: list[dict[str, Any]] = [
-        {"view": number, "part_from_sensor": pose.matrix().tolist(), "measurements": list(names)}
-        for number, pose, names in run_results.plan
-    ]
-    results = [asdict(result) for result in run_results.results]
-    write_json(
-        path,
-        {
-            "schema_version": 1,
-            "software": f"mitsim {__version__}",
-            "sensor": run_results.sensor,
-            "study": run_results.study,
-            "measured_by": run_results.source,
-            "coverage_probability": 0.95,
-            "results": results,
-            "plan": plan,
-        },
-    )
+    document: dict[str, Any] = {
+        "schema_version": 1,
+        "software": f"mitsim {__version__}",
+        "sensor": run_results.sensor,
+        "study": run_results.study,
+        "measured_by": run_results.source,
+        "coverage_probability": 0.95,
+        "results": [asdict(result) for result in run_results.results],
+        "plan": [
+            {"view": number, "part_from_sensor": pose.matrix().tolist(), "measurements": list(names)}
+            for number, pose, names in run_results.plan
+        ],
+    }
+    write_json(path, document)
 
 
 def expected_result(name: str, asked: Measurement, stated: StatedMeasurement, view: int) -> ExpectedResult:
@@ -159,27 +150,11 @@ def expected_result(name: str, asked: Measurement, stated: StatedMeasurement, vi
         None if end is None or value is None else value + end for end in (stated.bias, *stated.interval)
     )
     accepted = None if stated.decision is None else stated.decision.accepted
-    return ExpectedResult(
-        name,
-        asked.kind,
-        asked.features,
-        asked.unit,
-        asked.nominal,
-        asked.tolerance,
-        view,
-        expected,
-        stated.bias,
-        stated.bias_uncertainty,
-        stated.standard_uncertainty,
-        low,
-        high,
-        stated.trials,
-        stated.without_value,
-        stated.verdict,
-        *stated.interval,
-        stated.errors_of,
-        *(accepted or (None, None)),
-    )
+    task = asked.kind, asked.features, asked.unit, asked.nominal, asked.tolerance
+    uncertainty = stated.bias, stated.bias_uncertainty, stated.standard_uncertainty
+    counts = stated.trials, stated.without_value, stated.verdict
+    ends = *stated.interval, stated.errors_of, *(accepted or (None, None))
+    return ExpectedResult(name, *task, view, expected, *uncertainty, low, high, *counts, *ends)
 
 
 def _part_value(asked: Measurement, errors_of: str) -> float | None:

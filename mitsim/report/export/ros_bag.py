@@ -101,15 +101,6 @@ def _message(store: Any, kind: str, *values: Any, **named: Any) -> Any:
 
 def _latched(interfaces: Any) -> Any:
     """Return the quality of service of ``/tf_static``: transient local, reliable, keep the last."""
-    forever = interfaces.QosTime(9223372036, 854775807)
-    return interfaces.Qos(
-        interfaces.QosHistory.KEEP_LAST,
-        1,
-        interfaces.QosReliability.RELIABLE,
-        interfaces.QosDurability.TRANSIENT_LOCAL,
-        forever,
-        forever,
-        interfaces.QosLiveliness.AUTOMATIC,
-        forever,
-        False,
-    )
+    forever, last = interfaces.QosTime(9223372036, 854775807), (interfaces.QosHistory.KEEP_LAST, 1)
+    kept = interfaces.QosReliability.RELIABLE, interfaces.QosDurability.TRANSIENT_LOCAL
+    return interfaces.Qos(*last, *kept, forever, forever, interfaces.QosLiveliness.AUTOMATIC, forever, False)
