@@ -49,13 +49,8 @@ def author_page(about: Authored, served: str = "") -> str:
     InputError if the scene was not read from a file, or has more than :data:`MOST_FACES` shapes.
     """
     data = page_data(about, served)
-    content = {
-        "data": as_json(data),
-        "title": data["name"],
-        "served": bool(served),
-        "metals": list(CONSTANTS),
-        "processes": list(PROCESSES),
-    }
+    content = {"data": as_json(data), "title": data["name"], "served": bool(served)}
+    content |= {"metals": list(CONSTANTS), "processes": list(PROCESSES)}
     return rendered("author_page.html.j2", content | script_content(joined_script(SCRIPTS)))
 
 
@@ -98,14 +93,8 @@ def findings_data(findings: Sequence[SceneFinding]) -> list[dict[str, str]]:
 
 def _definition(kind: Any) -> dict[str, Any]:
     definition = DEFINITIONS[kind]
-    return {
-        "kinds": definition.kinds,
-        "unit": definition.unit,
-        "datums": definition.datums,
-        "many": definition.many,
-        "zone": definition.zone,
-        "outline": "outline" in definition.needs,
-    }
+    facts = {name: getattr(definition, name) for name in ("kinds", "unit", "datums", "many", "zone")}
+    return facts | {"outline": "outline" in definition.needs}
 
 
 def characterised(sensor: str) -> dict[str, list[float]] | None:
@@ -163,7 +152,6 @@ def fair_share(counts: Sequence[int], most: int) -> int:
 
 
 def _shaded(corners: np.ndarray, most: int) -> trimesh.Trimesh:
-    """Return a shape with at most ``most`` triangles and vertex normals that are smooth except at creases."""
     if not len(corners):
         return trimesh.Trimesh(np.empty((0, 3)), np.empty((0, 3), int))
     merged = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=True)
@@ -174,8 +162,7 @@ def _measures(corners: np.ndarray) -> dict[str, Any]:
     """Return a point on the surface near the centre, the box and the area of triangles (n, 3, 3)."""
     if not len(corners):
         return {"anchor": None, "size": [0.0, 0.0, 0.0], "area": 0.0}
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    middles = corners.mean(axis=1)
+    areas, middles = trimesh.triangles.area(corners), corners.mean(axis=1)
     middle = areas @ middles / max(float(areas.sum()), 1e-12)
     anchor = middles[int(np.linalg.norm(middles - middle, axis=1).argmin())]
     size = np.ptp(corners.reshape(-1, 3), axis=0)

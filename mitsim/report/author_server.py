@@ -145,14 +145,13 @@ class AuthorServer:
 
         with tempfile.TemporaryDirectory() as folder:
             for key, name in self.names.items():
-                if name not in texts or key == "scene":
-                    continue
-                path = Path(folder) / name
-                path.write_text(texts[name], encoding="utf-8")
-                if key == "task":
-                    read_features(path)
-                else:
-                    read_toml(path, StudyFile)
+                if name in texts and key != "scene":
+                    path = Path(folder) / name
+                    path.write_text(texts[name], encoding="utf-8")
+                    if key == "task":
+                        read_features(path)
+                    else:
+                        read_toml(path, StudyFile)
 
 
 def _restore(path: Path, data: bytes | None) -> None:

@@ -9,21 +9,11 @@ import xarray as xr
 
 from characterisation.words.numbers import percent, two_digits
 from mitsim.report.findings import ranked_views
+from mitsim.report.pose_texts import limit_words
 from mitsim.views.no_view import why_no_view
 
-_HEAD = (
-    "rank",
-    "view",
-    "azimuth",
-    "elevation",
-    "roll",
-    "standoff",
-    "u",
-    "u/tolerance",
-    "chance",
-    "V_m rank",
-    "limited by",
-)
+_POSE = {"azimuth": "azimuth_deg", "elevation": "elevation_deg", "roll": "roll_deg", "standoff": "standoff_mm"}
+_HEAD = ("rank", "view", *_POSE, "u", "u/tolerance", "chance", "V_m rank", "limited by")
 
 
 def best_views(scores: xr.Dataset, measurement: str, count: int, shapes: Sequence[str]) -> str:
@@ -33,10 +23,8 @@ def best_views(scores: xr.Dataset, measurement: str, count: int, shapes: Sequenc
 
     Parameters
     ----------
-    scores, measurement, count
-        Scores of all views, name of the measurement, and largest number of views.
-    shapes
-        Names of the shapes that the measurement depends on.
+    scores, measurement, count, shapes
+        Scores of all views; largest number of views in the text; shapes that the measurement depends on.
     """
     measured = scores.sel(measurement=measurement)
     unit, tolerance = str(measured["unit"].values), float(measured["tolerance"].values)
@@ -47,31 +35,16 @@ def best_views(scores: xr.Dataset, measurement: str, count: int, shapes: Sequenc
     if not len(ranked):
         return f"{title}\n  {why_no_view(scores, measurement, shapes)}\n"
     rows = [_HEAD, *(_row(measured, int(v), tolerance) for v in ranked[:count])]
-    widths = [max(len(row[k]) for row in rows) for k in range(len(_HEAD))]
-    lines = [
-        "  ".join(
-            text.rjust(width) if k < len(row) - 1 else text
-            for k, (text, width) in enumerate(zip(row, widths, strict=True))
-        )
-        for row in rows
-    ]
-    return "\n".join([title, *lines, ""])
+    *columns, limits = zip(*rows, strict=True)
+    columns = [[text.rjust(max(map(len, column))) for text in column] for column in columns]
+    return "\n".join([title, *map("  ".join, zip(*columns, limits, strict=True)), ""])
 
 
 def _row(measured: xr.Dataset, view: int, tolerance: float) -> tuple[str, ...]:
-    at = {str(name): values.values[view] for name, values in measured.data_vars.items() if values.dims == ("view",)}
-    feature, limit = str(at["limiting_feature"]), str(at["limit"])
-    u = float(at["predicted_uncertainty"])
-    return (
-        str(at["uncertainty_rank"]),
-        str(view),
-        f"{at['azimuth_deg']:.0f}",
-        f"{at['elevation_deg']:.0f}",
-        f"{at['roll_deg']:.0f}",
-        f"{at['standoff_mm']:.0f}",
-        two_digits(u),
-        "" if math.isnan(tolerance) else two_digits(u / tolerance),
-        percent(float(at["chance"])),
-        str(at["rank"]),
-        f"{limit} on {feature}" if feature and limit else limit,
-    )
+    here = measured.isel(view=view)
+    u = float(here["predicted_uncertainty"])
+    pose = [f"{float(here[name]):.0f}" for name in _POSE.values()]
+    share = "" if math.isnan(tolerance) else two_digits(u / tolerance)
+    rank, score_rank = (str(int(here[name])) for name in ("uncertainty_rank", "rank"))
+    chance = percent(float(here["chance"]))
+    return rank, str(view), *pose, two_digits(u), share, chance, score_rank, limit_words(here)

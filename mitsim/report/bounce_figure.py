@@ -12,13 +12,12 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from characterisation.plots.style import FIELD, MUTED, OTHER_SHAPE, SEQUENTIAL, SHAPES, bare, drawing
+from characterisation.plots.style import FIELD, OTHER_SHAPE, SEQUENTIAL, SHAPES, bare, drawing
 from characterisation.region_of_interest import Roi
 from characterisation.words.numbers import percent
-from mitsim.report.style import colour_scale
+from mitsim.report.style import colour_scale, legend_patch
 from mitsim.scene.light_transport.light_from_faces import LightFromFaces, light_from_faces
 from mitsim.scene.load import Scene
 from mitsim.scene.visible_surfaces import VisibleSurfaces
@@ -69,13 +68,9 @@ def bounced_light(scene: Scene, sensor: Sensor, pose: Transform, visible: Visibl
     coarse = camera.binned(step)
     if not len(rows):
         return light_from_faces(scene, coarse, sensor.projector, pose, 1, _SEED)
-    left, top = (max(0, int(indices.min()) // step - 2) for indices in (columns, rows))
-    right, bottom = (
-        min(size, int(indices.max()) // step + 3)
-        for indices, size in ((columns, coarse.width), (rows, coarse.height))
-    )  # fmt: skip
-    roi = Roi(left, top, right - left, bottom - top)
-    return light_from_faces(scene, coarse, sensor.projector, pose, _SAMPLES, _SEED, roi)
+    shown = np.zeros((coarse.height, coarse.width), bool)
+    shown[np.minimum(rows // step, coarse.height - 1), np.minimum(columns // step, coarse.width - 1)] = True
+    return light_from_faces(scene, coarse, sensor.projector, pose, _SAMPLES, _SEED, Roi.around(shown, 2))
 
 
 def bounce_figure(light: LightFromFaces, names: Sequence[str], title: str) -> Figure:
@@ -105,14 +100,12 @@ def bounce_figure(light: LightFromFaces, names: Sequence[str], title: str) -> Fi
             bare(axes)
             axes.set_title(words, loc="left")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
-        handles = [Patch(facecolor=colour, edgecolor=MUTED, lw=0.5, label=names[k]) for k, colour in colours.items()]
+        handles = [legend_patch(colour, names[k]) for k, colour in colours.items()]
         if len(strong) < len({int(k) for k in np.unique(main) if k >= 0}):
-            handles.append(Patch(facecolor=OTHER_SHAPE, edgecolor=MUTED, lw=0.5, label="other faces"))
-        at = bottom - 0.06 / scale
+            handles.append(legend_patch(OTHER_SHAPE, "other faces"))
+        at, words = bottom - 0.06 / scale, "\n".join(shown) or "no face is lit"
         figure.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.99 - wide, at), ncols=2, borderaxespad=0.0)
-        figure.text(
-            0.01, at - 0.03 / scale, "\n".join(shown) or "no face is lit", va="top", fontsize=8, linespacing=1.5
-        )
+        figure.text(0.01, at - 0.03 / scale, words, va="top", fontsize=8, linespacing=1.5)
     return figure
 
 
@@ -131,7 +124,5 @@ def _line(light: LightFromFaces, names: Sequence[str], shape: int) -> str:
     if not np.isfinite(shares).all():
         return ""
     best = [int(k) for k in np.argsort(-shares, kind="stable")[:_SOURCES] if shares[k] >= _LEAST]
-    of = ", ".join(f"{names[k]} {percent(float(shares[k]))}" for k in best)
-    return f"{names[shape]}: {percent(float(shares.sum()))} of its light met another face before" + (
-        f": {of}" if of else ""
-    )
+    met = f"{names[shape]}: {percent(float(shares.sum()))} of its light met another face before"
+    return ": ".join(filter(None, [met, ", ".join(f"{names[k]} {percent(float(shares[k]))}" for k in best)]))

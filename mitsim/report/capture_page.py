@@ -36,23 +36,16 @@ def write_capture_page(folder: Path, preamble: str, table: str, real: Shown, sim
 
     Parameters
     ----------
-    folder, preamble, table
-        Folder to write, which exists, and texts of the page, in Markdown.
-    real, simulated
-        Data of the specimen in the two captures.
+    folder, preamble, table, real, simulated
+        The folder exists; the texts are Markdown.
     """
     write_png(capture_figure(real, simulated), folder / PICTURE, dpi=_DPI)
-    page = folder / "index.md"
-    text = [
-        "# Simulated against real\n\n",
-        preamble,
-        "\n",
-        table,
-        f"\n![Images, residuals, grey levels and statuses of both captures]({PICTURE})\n",
-        "\n`u` is the standard uncertainty of the difference, from a block bootstrap over patches. A quantity agrees "
-        "if the difference is at most 2 u, or at most the margin.\n",
-    ]
-    write_text(page, "".join(text))
+    page, picture = folder / "index.md", f"![Images, residuals, grey levels and statuses of both captures]({PICTURE})"
+    note = (
+        "`u` is the standard uncertainty of the difference, from a block bootstrap over patches. A quantity agrees "
+        "if the difference is at most 2 u, or at most the margin."
+    )
+    write_text(page, f"# Simulated against real\n\n{preamble}\n{table}\n{picture}\n\n{note}\n")
     return page
 
 

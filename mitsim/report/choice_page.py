@@ -34,7 +34,7 @@ def write_choice_page(folder: Path) -> Path:
 
 def page_content(choice: ChoiceDocument, folder: Path) -> dict[str, Any]:
     """Return everything that the template shows."""
-    tolerances = choice.toleranced > 0
+    tolerances, asked = choice.toleranced > 0, [_asked(choice, name) for name in choice.measurements]
     taking_part = [sensor for sensor in choice.sensors if sensor.status != "excluded"]
     return {
         "choice": choice,
@@ -42,16 +42,8 @@ def page_content(choice: ChoiceDocument, folder: Path) -> dict[str, Any]:
         "first": of_choice(choice, read_scene_geometry(folder), best_statement(choice, folder)),
         "tolerances": tolerances,
         "best": taking_part[0].name if taking_part else "no sensor",
-        "names": [
-            (
-                breakable(name),
-                tolerance_words(measurement.tolerance, measurement.nominal, measurement.unit)
-                if measurement.tolerance
-                else "",
-            )
-            for name, measurement in choice.measurements.items()
-        ],
-        "asked": [_asked(choice, name) for name in choice.measurements],
+        "names": [(breakable(one["name"]), one["tolerance"].removeprefix(NONE)) for one in asked],
+        "asked": asked,
         "rows": [_row(choice, entry) for entry in taking_part],
         "screened": any(entry.status == "screened" or entry.roughness_in_words for entry in taking_part),
         "sensors": [_details(choice, entry, tolerances) for entry in taking_part],
@@ -96,17 +88,12 @@ def _exposures(entry: SensorEntry) -> str:
 
 
 def _cell(cell: CellEntry, unit: str) -> dict[str, str]:
+    verdict = {"verdict": cell.verdict, "colour": VERDICTS[cell.verdict]}
     if cell.uncertainty is None:
         why = f"no value in {cell.trials} trials" if cell.trials else "no view, by screening"
-        return {"u": "none", "view": why, "verdict": cell.verdict, "colour": VERDICTS[cell.verdict], "by": "none"}
+        return verdict | {"u": "none", "view": why, "by": "none"}
     share = "" if cell.share_of_tolerance is None else f"{share_words(cell.share_of_tolerance)}; "
-    return {
-        "u": quantity(cell.uncertainty, unit),
-        "view": f"{share}view {cell.view}",
-        "verdict": cell.verdict,
-        "colour": VERDICTS[cell.verdict],
-        "by": cell.by,
-    }
+    return verdict | {"u": quantity(cell.uncertainty, unit), "view": f"{share}view {cell.view}", "by": cell.by}
 
 
 def _details(choice: ChoiceDocument, entry: SensorEntry, tolerances: bool) -> dict[str, Any]:

@@ -58,15 +58,15 @@ def part_window(camera: Camera, points: NDArray[np.floating]) -> tuple[slice, sl
 def camera_images(capture: Capture, part: NDArray[np.floating] | None = None) -> tuple[dict[str, str], str]:
     """Return the first image of each camera as a PNG data URI by camera name, and a description of the display stretch.
 
-    ``part`` (n, 3) [mm], sensor frame, are points of the part, to which the images are cropped. The grey value shown is
+    Images are cropped to ``part`` (n, 3) [mm], sensor frame. The grey value shown is
     ((DN - black) / (white - black))^0.7, with the same black and white for all cameras of the capture.
     """
     frames = {}
     for name, stack in capture.images.items():
-        camera = capture.rig.cameras.get(name)
-        croppable = part is not None and camera is not None and stack.shape[1:] == (camera.height, camera.width)
-        cut = part_window(camera, part) if croppable and camera is not None and part is not None else (slice(None),) * 2
-        frames[name] = shrink(stack[0][cut])
+        camera, image = capture.rig.cameras.get(name), stack[0]
+        if part is not None and camera is not None and image.shape == (camera.height, camera.width):
+            image = image[part_window(camera, part)]
+        frames[name] = shrink(image)
     black, white = grey_limits(list(frames.values()))
     uris = {}
     for name, frame in frames.items():
@@ -124,16 +124,9 @@ def cloud_figure(predicted: PointCloud, decoded: PointCloud) -> Figure:
         beside = {"shrink": 1.0 if tall else 0.5, "anchor": (0.0, 1.0), "aspect": 22}
         colour_scale(figure, depth, grid.ravel().tolist(), "distance along the view ray [mm]", **beside)
         shares = reason_shares([(predicted, decoded)])
-        legend = [
-            Patch(facecolor=REASONS[s][1], label=f"{REASONS[s][0]}: {' | '.join(map(percent, shares.get(s, (0, 0))))}")
-            for s in present
-        ]
-        figure.legend(
-            handles=legend,
-            loc="outside lower center",
-            ncols=2,
-            handlelength=1.1,
-            title="share of the pixels that could show the part: predicted | decoded",
-            title_fontsize=8.0,
-        )
+        both = {status: " | ".join(map(percent, shares.get(status, (0, 0)))) for status in present}
+        legend = [Patch(facecolor=REASONS[s][1], label=f"{REASONS[s][0]}: {words}") for s, words in both.items()]
+        title = "share of the pixels that could show the part: predicted | decoded"
+        place: dict[str, Any] = {"loc": "outside lower center", "ncols": 2, "handlelength": 1.1}
+        figure.legend(handles=legend, title=title, title_fontsize=8.0, **place)
     return figure

@@ -119,9 +119,9 @@ def read_declaration(folder: Path, geometry: SceneGeometry | None) -> Declaratio
 
 
 def _of_run(run: Run, geometry: SceneGeometry | None) -> Declaration:
-    first, document = of_run(run, geometry), run.statement
-    part = _part(run.about.scene, list(run.about.features.values()), document)
-    facts = [("Part", part), ("Sensor", run.about.sensor)]
+    first, document, part = of_run(run, geometry), run.statement, Path(run.about.scene).stem
+    finishes = list(run.about.features.values())
+    facts = [("Part", _part(run.about.scene, finishes, document)), ("Sensor", run.about.sensor)]
     if document is not None:
         facts.append(("Pose of the sensor", pose_in_full(pose_of_view(run, document.view))))
         facts += _of_statement(document, "" if document.exposure else run.about.exposure_rule)
@@ -129,12 +129,10 @@ def _of_run(run: Run, geometry: SceneGeometry | None) -> Declaration:
         facts += _rules(stated_rules(document))
     else:
         facts.append(("Made by", "screening, from a performance map: u is predicted. The same mitsim run continues"))
-    digests = _digests(run.folder, ("statement.json", "task.json", "part.ply", "map.nc"))
+    digests = _digests(*(run.folder / name for name in ("statement.json", "task.json", "part.ply", "map.nc")))
     facts.append(("Made with", f"mitsim {run.about.mitsim}, seed {run.about.seed}; SHA-256 of {digests}"))
-    date = run.about.date or _day(run.folder / "run.json")
-    return _declared(
-        run.folder, f"{run.about.sensor} measures {Path(run.about.scene).stem}", date, first, document, facts
-    )
+    title, date = f"{run.about.sensor} measures {part}", run.about.date or _day(run.folder / "run.json")
+    return _declared(run.folder, title, date, first, document, facts)
 
 
 def _of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None, folder: Path) -> Declaration:
@@ -163,7 +161,7 @@ def _of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None, folder: P
         facts.append(("Made by", "screening alone, from a performance map: no virtual measurement, no statement"))
     facts += _rules({name: measurement.rule for name, measurement in choice.measurements.items()})
     facts += _others(choice, best)
-    digests = _digests(folder, (CHOICE,), own, ("statement.json",))
+    digests = _digests(folder / CHOICE, own / "statement.json")
     maps = f"; map {best.map_digest}" if best.map_digest else ""
     facts.append(("Made with", f"mitsim {choice.mitsim}, seed {choice.seed}; SHA-256 of {digests}{maps}"))
     title = f"{best.name} measures {Path(choice.scene).stem}"
@@ -190,7 +188,7 @@ def _declared(
 ) -> Declaration:
     stated: Mapping[str, StatedMeasurement] = {} if document is None else document.measurements
     rows = [_row(row, stated.get(row.name)) for row in first.rows]
-    number = _digest(folder / "statement.json")[:_DIGITS] if document is not None else ""
+    number = _digest(folder / "statement.json") if document is not None else ""
     return Declaration(title, date, number, first, rows, facts, _notes(document))
 
 
@@ -218,25 +216,22 @@ def _notes(document: StatementDocument | None) -> list[Note]:
         "k = U / u; N = number of virtual measurements. The interval leaves 2.5 % on either side. If y is read, the "
         "true value lies between y − (upper end) and y − (lower end)."
     )
-    known = document.measurements
+    known, rough = document.measurements, dict[str, list[str]]()
+    at_limit = [name for name, one in known.items() if one.errors_of == AT_THE_LIMIT]
+    far = [name for name, one in known.items() if one.errors_of == FAR_FROM_NOMINAL]
     not_settled = [name for name, one in known.items() if not one.settled and one.trials]
-    of_some = {
-        ("†", "errors for a part at the limit of its tolerance."): [
-            name for name, one in known.items() if one.errors_of == AT_THE_LIMIT
-        ],
-        ("‡", "errors for a part far from nominal."): [
-            name for name, one in known.items() if one.errors_of == FAR_FROM_NOMINAL
-        ],
-        ("*", "not settled after JCGM 101, 7.9: more virtual measurements may change a digit."): not_settled,
-    }
-    rough: dict[str, list[str]] = {}
     for name, one in known.items():
         if few := roughness_in_words(round(one.trials * (1 - one.without_value))):
             rough.setdefault(few, []).append(name)
-    of_some |= {("§" * (k + 1), f"{few}."): rough[few] for k, few in enumerate(rough)}
+    of_some = [
+        ("†", "errors for a part at the limit of its tolerance.", at_limit),
+        ("‡", "errors for a part far from nominal.", far),
+        ("*", "not settled after JCGM 101, 7.9: more virtual measurements may change a digit.", not_settled),
+        *(("§" * k, f"{few}.", names) for k, (few, names) in enumerate(rough.items(), 1)),
+    ]
     notes = [
         Note(text, tuple(names), mark) if len(names) < len(known) else Note(f"All: {text}")
-        for (mark, text), names in of_some.items()
+        for mark, text, names in of_some
         if names
     ]
     return [Note(words), *notes, *(Note(f"{one}.") for one in document.doubts("the influences listed below"))]
@@ -305,25 +300,22 @@ def _rules(rules: Mapping[str, str]) -> list[tuple[str, str]]:
 
 
 def _others(choice: ChoiceDocument, best: SensorEntry) -> list[tuple[str, str]]:
-    asked = choice.toleranced
-    words = []
+    asked, words = choice.toleranced, []
     for sensor in choice.sensors:
-        if sensor is best or sensor.status == "excluded":
-            continue
-        by = "" if sensor.status == "stated" else ", by screening alone"
-        fits = sensor.fits_in_words(asked) if asked else sensor.possible_in_words or "all possible"
-        words.append(f"{sensor.name} ({fits}{by})")
+        if sensor is not best and sensor.status != "excluded":
+            by = "" if sensor.status == "stated" else ", by screening alone"
+            fits = sensor.fits_in_words(asked) if asked else sensor.possible_in_words or "all possible"
+            words.append(f"{sensor.name} ({fits}{by})")
     return [("Also compared", ", ".join(words))] if words else []
 
 
-def _digests(folder: Path, names: Sequence[str], other: Path | None = None, more: Sequence[str] = ()) -> str:
-    """Return the first digits of the SHA-256 of the files that exist."""
-    paths = [folder / name for name in names] + [other / name for name in more if other is not None]
-    return ", ".join(f"{path.name} {_digest(path)[:_DIGITS]}" for path in paths if path.exists())
+def _digests(*paths: Path) -> str:
+    """Return the names and the first digits of the SHA-256 of the files that exist."""
+    return ", ".join(f"{path.name} {_digest(path)}" for path in paths if path.exists())
 
 
 def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:_DIGITS]
 
 
 def _day(path: Path) -> str:

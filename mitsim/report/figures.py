@@ -29,6 +29,12 @@ from characterisation.words.numbers import count, finish_name
 from mitsim.report.findings import incidence_of_nodes
 from mitsim.report.style import colour_scale, write_png
 
+#: colours of the quantities of a map, the labels of their scales, and the ends beyond which values lie
+SCALES = {
+    "recovered_fraction": (SEQUENTIAL, "fraction of points recovered F [1]", "neither"),
+    "ray_noise_std": (NOISE, "standard deviation along the view ray σ [mm], without outliers", "both"),
+}
+
 #: cells across a disc in which patches are counted
 _CELLS = 61
 
@@ -49,21 +55,17 @@ def matt_to_shiny(samples: list[tuple[str, float]]) -> list[int]:
 
 def fraction_figure(performance_map: PerformanceMap) -> Figure:
     """Draw F over the orientation, a disc for each sample (across) and distance (down); all colours run from 0 to 1."""
-    fraction = performance_map.data["recovered_fraction"].values
-    return _map_figure(performance_map, fraction, Normalize(0, 1), SEQUENTIAL, "fraction of points recovered F [1]")
+    return _map_figure(performance_map, "recovered_fraction", Normalize(0, 1))
 
 
 def noise_figure(performance_map: PerformanceMap) -> Figure:
     """Draw sigma [mm] over the orientation as in :func:`fraction_figure`, on one logarithmic scale."""
-    sigma = performance_map.data["ray_noise_std"].values
-    label = "standard deviation along the view ray σ [mm], without outliers"
-    return _map_figure(performance_map, sigma, LogNorm(*noise_limits(sigma)), NOISE, label)
+    norm = LogNorm(*noise_limits(performance_map.data["ray_noise_std"].values))
+    return _map_figure(performance_map, "ray_noise_std", norm)
 
 
-def _map_figure(
-    performance_map: PerformanceMap, values: NDArray[np.floating], norm: Normalize, colours: str, label: str
-) -> Figure:
-    data = performance_map.data
+def _map_figure(performance_map: PerformanceMap, name: str, norm: Normalize) -> Figure:
+    data, (colours, label, extend) = performance_map.data, SCALES[name]
     order, distances = matt_to_shiny(performance_map.samples), data["distance"].values
     covered = np.isfinite(data["recovered_fraction"].values).any(axis=(0, 1))
     incidence = incidence_of_nodes(performance_map)
@@ -76,13 +78,12 @@ def _map_figure(
         for row, distance in enumerate(distances):
             for column, sample in enumerate(order):
                 axes = grid[row, column]
-                disc_image(axes, values[sample, row], axis, largest).set(norm=norm, cmap=colours)
+                disc_image(axes, data[name].values[sample, row], axis, largest).set(norm=norm, cmap=colours)
                 disc_view(axes, largest)
                 if row == 0:
                     axes.set_title(finish_name(*performance_map.samples[sample]).replace(", ", "\n"))
                 if column == 0:
                     axes.set_ylabel(f"|V| = {distance:g} mm", labelpad=6)
-        extend = "both" if isinstance(norm, LogNorm) else "neither"
         colour_bar(figure, grid, norm, colours, label, extend)
         legend = [Patch(facecolor=FIELD, label="no value (not measured, or no point returned)")]
         figure.legend(handles=legend, loc="outside lower right")
@@ -96,10 +97,8 @@ def colour_bar(
 
     Parameters
     ----------
-    figure, grid, label
-        The figure, its axes, and quantity with unit.
-    norm, colours, extend
-        Scale of the values, name of the colours, and ends beyond which values lie: ``neither``, ``both`` or ``max``.
+    figure, grid, norm, colours, label, extend
+        ``extend``: ends beyond which values lie, ``neither``, ``both`` or ``max``.
     """
     mappable, below = ScalarMappable(norm=norm, cmap=colours), {"location": "bottom", "aspect": 45, "shrink": 0.75}
     bar = colour_scale(figure, mappable, grid.ravel().tolist(), label, extend=extend, pad=0.03, **below)
@@ -118,10 +117,8 @@ def patches_figure(patches: xr.Dataset) -> Figure:
     largest = float(np.arccos(n_z.min())) if len(n_z) else math.radians(75)
     reach = 2 * math.sin(largest / 2)
     edges = np.linspace(-reach, reach, _CELLS + 1)
-    counts = []
-    for sample in range(len(samples)):
-        mine = number == sample
-        counts.append(np.histogram2d(positions[mine, 1], positions[mine, 0], bins=(edges, edges))[0])
+    of_samples = [positions[number == sample] for sample in range(len(samples))]
+    counts = [np.histogram2d(mine[:, 1], mine[:, 0], bins=(edges, edges))[0] for mine in of_samples]
     norm = LogNorm(1, max(2.0, max((c.max() for c in counts), default=2.0)))
     with drawing():
         figure = Figure((max(2.35 * len(samples) + 0.4, 5.5), 4.0), layout="constrained")

@@ -36,9 +36,8 @@ def fit_table(coupon_fit: CouponFit) -> str:
     if fit.ambient is not None:
         lines += [("light of the room [e-/s]", _with(fit.ambient.value, fit.ambient.uncertainty), "")]
     for dots in coupon_fit.dots:
-        words = (
-            f"by its dots: blur {dots.blur_px:.2f} px, contrast {dots.contrast:.2f}, file's {dots.file_contrast:.2f}"
-        )
+        contrasts = f"contrast {dots.contrast:.2f}, file's {dots.file_contrast:.2f}"
+        words = f"by its dots: blur {dots.blur_px:.2f} px, {contrasts}"
         lines += [(f"power by {dots.camera}{times}", f"{dots.power * coupon_fit.sensor.projector.flux:.3f}", words)]
     lines += [
         ("reduced chi-square", f"{fit.reduced_chi_square:.3f}", f"{fit.blocks} blocks of {coupon_fit.block_px} px"),
@@ -54,10 +53,8 @@ def fit_table(coupon_fit: CouponFit) -> str:
         if view.size:
             low, high = np.degrees(view.off_mirror())
             seen, missed = f"{low:.0f} to {high:.0f}", f"{residual.rms_dn:.3g}\t{residual.rms_in_noise:.2f}"
-        text += (
-            f"{Path(view.name).name}\t{view.camera}\t{view.exposure_s:.3g}\t{seen}\t{missed}\t"
-            f"{100 * view.censored:.0f} %\n"
-        )
+        text += f"{Path(view.name).name}\t{view.camera}\t{view.exposure_s:.3g}\t{seen}\t{missed}\t"
+        text += f"{100 * view.censored:.0f} %\n"
     return text
 
 
@@ -71,21 +68,18 @@ def remarks(coupon_fit: CouponFit) -> list[str]:
         elif fit.log_alpha.uncertainty > 0.3:
             lines.append("alpha is very uncertain: use poses closer to the mirror direction, or shorter exposures")
         if math.isnan(coupon_fit.roughness[0]):
-            ends = [f"{end:g}" for end in np.round(coupon_fit.metal.roughness_range, 3)]
-            lines.append(
-                f"no Ra-equivalent: {coupon_fit.finish} has alpha {low:.3f} to {high:.3f}, of Ra {' to '.join(ends)} um"
-            )
+            ends = " to ".join(f"{end:g}" for end in np.round(coupon_fit.metal.roughness_range, 3))
+            of_ra = f"alpha {low:.3f} to {high:.3f}, of Ra {ends} um"
+            lines.append(f"no Ra-equivalent: {coupon_fit.finish} has {of_ra}")
     if fit.reduced_chi_square > 2:
         lines.append("the residuals exceed the noise: uncertainties are increased accordingly, but the bias is unknown")
     if fit.neighbours > _ALIKE:
         lines.append("residuals of neighbouring blocks are correlated: light, form or lobe differ from the model")
     if coupon_fit.pattern_unknown:
         lines.append("the pattern is not known to be that of the sensor file: block means were compared, not dots")
-    if any(not math.isnan(specimen.off_plane) for specimen in coupon_fit.specimens):
-        worst = max(specimen.off_plane for specimen in coupon_fit.specimens if not math.isnan(specimen.off_plane))
-        lines.append(
-            f"the place of the coupon is the plane of its cloud, which scatters by up to {worst:.2g} mm about it"
-        )
+    if scatters := [one.off_plane for one in coupon_fit.specimens if not math.isnan(one.off_plane)]:
+        by = f"{max(scatters):.2g} mm"
+        lines.append(f"the place of the coupon is the plane of its cloud, which scatters by up to {by} about it")
     return lines
 
 
@@ -111,11 +105,9 @@ def fit_figure(coupon_fit: CouponFit) -> Figure:
             drawn = axes.imshow(values, **colours)
             axes.set(facecolor=FIELD, title=title, xticks=[], yticks=[])
             figure.colorbar(drawn, ax=axes, orientation="horizontal", label=unit, fraction=0.06, pad=0.03)
-        figure.suptitle(
-            f"{Path(view.name).name}, {view.camera} ({coupon_fit.source}): residual {worst.rms_dn:.2g} DN rms, "
-            f"{worst.rms_in_noise:.2g} standard deviations",
-            fontsize=10,
-        )
+        where = f"{Path(view.name).name}, {view.camera} ({coupon_fit.source})"
+        size = f"{worst.rms_dn:.2g} DN rms, {worst.rms_in_noise:.2g} standard deviations"
+        figure.suptitle(f"{where}: residual {size}", fontsize=10)
     return figure
 
 
@@ -135,5 +127,4 @@ def _with(value: float, uncertainty: float) -> str:
     if not math.isfinite(uncertainty) or uncertainty <= 0:
         return f"{value:.4g}"
     spread = two_digits(uncertainty)
-    decimals = len(spread.partition(".")[2])
-    return f"{value:.{decimals}f} +- {spread}"
+    return f"{value:.{len(spread.partition('.')[2])}f} +- {spread}"

@@ -8,9 +8,9 @@ part coloured by the worst verdict of its measurements -> picture, its caption w
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal
 
 import xarray as xr
@@ -34,7 +34,7 @@ from characterisation.words.numbers import NONE, count, how_many, or_nan, with_d
 from mitsim.report.first_rows import ResultRow, RowValues, measured_words
 from mitsim.report.page_pictures import placement_picture
 from mitsim.report.placement_figure import face_verdicts
-from mitsim.report.pose_texts import pose_of_view, pose_words
+from mitsim.report.pose_texts import limit_words, pose_of_view, pose_words
 from mitsim.report.set_words import with_sets
 from mitsim.report.style import Picture
 from mitsim.study.choice_document import TIME_OVER, ChoiceDocument, SensorEntry, judged
@@ -48,23 +48,25 @@ from mitsim.views.no_view import TOGETHER, apart_in_words
 #: good: every tolerance fits; plain: there are no tolerances; warn: values are missing, or a verdict is open; bad: a
 #: tolerance does not fit, or a set of views exceeds a limit
 Tone = Literal["good", "plain", "warn", "bad"]
+Poses = list[tuple[str, ArrayLike]]
 
 
 @dataclass(frozen=True)
 class FirstScreen:
     """Content of the first screen: the ``reasons`` of the result, its ``tone``, rows and picture.
 
-    ``draw`` makes the picture of ``poses`` (label, part_from_sensor) and ``verdicts`` by feature. ``trials`` is the
-    largest number of virtual measurements behind a row. ``remedies`` are changes with which the other measurements fit,
-    ``doubts`` are reasons to check the statement.
+    The picture has the ``poses`` (label, part_from_sensor), the ``verdicts`` by feature, and a ``caption``. ``trials``
+    is the largest number of virtual measurements behind a row. ``remedies`` are changes with which the other
+    measurements fit, ``doubts`` are reasons to check the statement.
     """
 
     reasons: Sequence[Reason]
     tone: Tone
-    rows: list[ResultRow]
-    draw: Callable[[], Picture | None] | None
-    poses: list[tuple[str, ArrayLike]]
-    verdicts: dict[str, str]
+    rows: list[ResultRow] = field(default_factory=list)
+    geometry: SceneGeometry | None = None
+    poses: Poses = field(default_factory=list)
+    verdicts: dict[str, str] = field(default_factory=dict)
+    caption: str = ""
     trials: int = 0
     remedies: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
@@ -72,7 +74,7 @@ class FirstScreen:
     @cached_property
     def picture(self) -> Picture | None:
         """Return the picture, drawn at the first use: a sheet and the files of a run need none."""
-        return self.draw() if self.draw is not None else None
+        return placement_picture(self.geometry, self.poses, self.verdicts, self.caption)
 
     def words(self, kept: int | None = None) -> str:
         """Return the result in words, by default with all its reasons."""
@@ -154,17 +156,16 @@ def of_run(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
         name: (run.about.measurements[name].shapes, measurement.verdict)
         for name, measurement in document.measurements.items()
     }
-    poses: list[tuple[str, ArrayLike]] = [(f"view {document.view}", view_scores["world_from_sensor"].values)]
-    verdicts = face_verdicts(asked)
     result = with_sets(result_reasons(results), fits_all(results), run.about.view_sets)
     first, *reasons = result.reasons
     return FirstScreen(
         [Reason(first.says[:1].upper() + first.says[1:]), *reasons],
         tone_of(results) if result.good else "bad",
         [_run_row(run, view_scores, name, measurement) for name, measurement in document.measurements.items()],
-        partial(placement_picture, geometry, poses, verdicts, _caption(run, document.view)),
-        poses,
-        verdicts,
+        geometry,
+        [(f"view {document.view}", view_scores["world_from_sensor"].values)],
+        face_verdicts(asked),
+        _caption(run, document.view),
         max((measurement.trials for measurement in document.measurements.values()), default=0),
         tuple(with_degree_signs(line) for line in remedies_in_words(run.about.remedies)),
         (*document.doubts(), *filter(None, [_apart(run, document)])),
@@ -176,9 +177,8 @@ def _without_statement(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
     about, leader = run.about, run.about.leader
     if leader is None:
         reasons = with_sets([Reason("No view can make the measurements")], False, about.view_sets).reasons
-        return FirstScreen(reasons, "bad", [], None, [], {})
+        return FirstScreen(reasons, "bad")
     scores = run.scores.sel(view=leader)
-    poses: list[tuple[str, ArrayLike]] = [(f"view {leader}", scores["world_from_sensor"].values)]
     rows = [
         RowValues(
             name=name,
@@ -193,17 +193,16 @@ def _without_statement(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
         ).texts()
         for name, measurement in about.measurements.items()
     ]
-    verdicts = face_verdicts(
-        {name: (measurement.shapes, "not decided") for name, measurement in about.measurements.items()}
-    )
+    asked = {name: (measurement.shapes, "not decided") for name, measurement in about.measurements.items()}
     made = f"and {how_many(about.race_trials, 'virtual measurement')}" if about.race_trials else "alone"
     return FirstScreen(
         [Reason(f"View {leader} leads so far, by the performance map {made}; no uncertainty is stated yet")],
         "warn",
         rows,
-        partial(placement_picture, geometry, poses, verdicts, _caption(run, leader)),
-        poses,
-        verdicts,
+        geometry,
+        [(f"view {leader}", scores["world_from_sensor"].values)],
+        face_verdicts(asked),
+        _caption(run, leader),
         about.race_trials,
         doubts=(f"Standard uncertainties are expected by the performance map {made}, and include the bias",),
     )
@@ -227,13 +226,10 @@ def of_choice(
     """Return the first screen of the page that compares sensors, which shows the best one and its ``statement``."""
     best, reasons = choice.best, best_reasons(choice.sensors, choice.measurements)
     if best is None:
-        return FirstScreen(reasons, "bad", [], None, [], {})
-    verdicts = face_verdicts(
-        {name: (choice.measurements[name].features, cell.verdict) for name, cell in best.measurements.items()}
-    )
-    poses: list[tuple[str, ArrayLike]] = [(f"view {pose.view}", pose.world_from_sensor) for pose in best.poses]
+        return FirstScreen(reasons, "bad")
+    asked = {name: (choice.measurements[name].features, cell.verdict) for name, cell in best.measurements.items()}
     of = sum(sensor.status != "excluded" for sensor in choice.sensors)
-    caption = f"{best.name}, the best of {of} sensor{'s' if of > 1 else ''}"
+    caption = f"{best.name}, the best of {how_many(of, 'sensor')}"
     if best.possible_in_words:
         caption += f" ({best.possible_in_words})"
     if best.poses:
@@ -245,9 +241,10 @@ def of_choice(
         [*reasons, *map(Reason, filter(None, [lost]))],
         tone_of(results),
         sensor_rows(choice, best),
-        partial(placement_picture, geometry, poses, verdicts, caption),
-        poses,
-        verdicts,
+        geometry,
+        [(f"view {pose.view}", pose.world_from_sensor) for pose in best.poses],
+        face_verdicts(asked),
+        caption,
         max((cell.trials for cell in best.measurements.values()), default=0),
         doubts=(
             *filter(None, [best.roughness_in_words]),
@@ -295,7 +292,7 @@ def sensor_rows(choice: ChoiceDocument, sensor_entry: SensorEntry) -> list[Resul
 def _run_row(run: Run, view_scores: xr.Dataset, name: str, measurement: StatedMeasurement) -> ResultRow:
     """Return the row of a measurement of a run; ``view_scores`` are the scores of the stated view."""
     entry, decision, largest = run.about.measurements[name], measurement.decision, largest_line(measurement.budget)
-    limit, feature = (str(view_scores[key].sel(measurement=name).values) for key in ("limit", "limiting_feature"))
+    limited, feature = limit_words(here := view_scores.sel(measurement=name)), str(here["limiting_feature"].values)
     points = float(view_scores["n"].sel(feature=feature)) if feature in view_scores["feature"].values else None
     return RowValues(
         name=name,
@@ -307,8 +304,8 @@ def _run_row(run: Run, view_scores: xr.Dataset, name: str, measurement: StatedMe
         share=measurement.share_of_tolerance,
         **_same_names(measurement, _MEASURED),
         **({} if decision is None else _same_names(decision, ("rule", *_DECIDED))),
-        limited=f"{limit} on {feature}" if limit and feature else limit,
-        points=points if limit else None,
+        limited=limited,
+        points=points if limited else None,
         source="" if largest is None else f"mostly {GROUPS.get(largest.group, ('', largest.group))[1]}",
     ).texts()
 

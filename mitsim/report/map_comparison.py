@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.plots.discs import disc, disc_image, disc_view, noise_limits
-from characterisation.plots.style import NOISE, SEQUENTIAL, drawing
+from characterisation.plots.style import drawing
 from characterisation.words.numbers import finish_name
-from mitsim.report.figures import colour_bar, matt_to_shiny
+from mitsim.report.figures import SCALES, colour_bar, matt_to_shiny
 
 Sample = tuple[str, float]
 
@@ -31,17 +31,10 @@ _LARGEST = math.radians(75)
 #: tilts in the strip [deg], about the axis across the baseline; at 0 deg the highlight of a shiny surface saturates
 TILTS_DEG = (0, 20, 40)
 
-_LABELS = {
-    "fraction": "fraction of points recovered F [1]",
-    "noise": "standard deviation along the view ray σ [mm], without outliers",
-}
-
 
 def common_samples(maps: Sequence[PerformanceMap]) -> list[Sample]:
     """Return the samples (finish, Ra [um]) of all maps, matt ones first, then by falling Ra."""
-    every = list(
-        dict.fromkeys((name, f"{roughness}") for performance_map in maps for name, roughness in performance_map.samples)
-    )
+    every = dict.fromkeys(_key(sample) for performance_map in maps for sample in performance_map.samples)
     samples = [(name, float(roughness)) for name, roughness in every]
     return [samples[i] for i in matt_to_shiny(samples)]
 
@@ -53,8 +46,8 @@ def comparison_figure(
     samples = common_samples(maps)
     limits = np.array([noise_limits(performance_map.data["ray_noise_std"].values) for performance_map in maps])
     norm = Normalize(0, 1) if quantity == "fraction" else LogNorm(float(limits[:, 0].min()), float(limits[:, 1].max()))
-    colours = SEQUENTIAL if quantity == "fraction" else NOISE
     variable = "recovered_fraction" if quantity == "fraction" else "ray_noise_std"
+    colours, label, extend = SCALES[variable]
     with drawing():
         figure = Figure((1.75 * len(samples) + 1.1, 1.7 * len(maps) + 1.3), layout="constrained")
         grid = np.asarray(figure.subplots(len(maps), len(samples), squeeze=False))
@@ -72,7 +65,7 @@ def comparison_figure(
                     axes.set_title(finish_name(*sample).replace(", ", "\n"), fontsize=8)
             distance = float(performance_map.data["distance"].values[knot])
             row[0].set_ylabel(f"{sensor_name(performance_map)}\n{distance:g} mm", labelpad=6, fontsize=7.5)
-        colour_bar(figure, grid, norm, colours, _LABELS[quantity], "neither" if quantity == "fraction" else "both")
+        colour_bar(figure, grid, norm, colours, label, extend)
     return figure
 
 
@@ -113,9 +106,7 @@ def strip_figure(maps: Sequence[PerformanceMap]) -> Figure:
         lower[0].set_ylabel("σ [mm]")
         handles, labels = upper[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=7)
-        tilts = ", ".join(
-            f"{tilt}° {kind}" for tilt, kind in zip(TILTS_DEG, ("solid", "dashed", "dotted"), strict=True)
-        )
+        tilts = "{}° solid, {}° dashed, {}° dotted".format(*TILTS_DEG)
         figure.suptitle(f"over distance; tilted across the baseline by {tilts}", fontsize=9)
     return figure
 
@@ -149,5 +140,9 @@ def sensor_name(performance_map: PerformanceMap) -> str:
 
 
 def _index(performance_map: PerformanceMap, sample: Sample) -> int | None:
-    samples = [(name, f"{roughness}") for name, roughness in performance_map.samples]  # as texts, NaN equals NaN
-    return samples.index(key) if (key := (sample[0], f"{sample[1]}")) in samples else None
+    samples = list(map(_key, performance_map.samples))
+    return samples.index(_key(sample)) if _key(sample) in samples else None
+
+
+def _key(sample: Sample) -> tuple[str, str]:
+    return sample[0], f"{sample[1]}"  # as texts, NaN equals NaN

@@ -1,13 +1,9 @@
 """Write ``report.html``, one self-contained page, from the folder of a run.
 
 Signal chain: run folder -> results (:mod:`mitsim.report.findings`, :mod:`mitsim.report.agreement`) and pictures
-(:mod:`mitsim.report.page_pictures`) -> the template ``page.html.j2`` -> one HTML file. The file contains all its fonts
-and images, opens without a network, and supports light and dark themes.
-
-Only the sphere of views (:mod:`mitsim.report.view_sphere`) needs a script, which the page contains. The template
-escapes all names given by a user.
-
-The report sorts views by their predicted standard uncertainty u, and shows the talk's view score V_m beside it.
+(:mod:`mitsim.report.page_pictures`) -> the template ``page.html.j2``, which escapes all names given by a user -> one
+HTML file. It opens without a network. Views are sorted by their predicted standard uncertainty u, with the talk's view
+score V_m beside it.
 """
 
 from __future__ import annotations
@@ -29,7 +25,7 @@ from mitsim.report.cloud_figures import REASONS
 from mitsim.report.first_rows import exact
 from mitsim.report.first_screen import of_run
 from mitsim.report.page_pictures import camera_view, cloud_picture, map_pictures, measurement_pictures
-from mitsim.report.pose_texts import expected_texts, pose_of_view, pose_texts
+from mitsim.report.pose_texts import TOP, best_rows, expected_texts, pose_of_view, pose_texts
 from mitsim.report.statement_section import rules_in_words, stated_rules, statement_section
 from mitsim.report.templates import write_page
 from mitsim.report.view_sphere import view_sphere
@@ -37,9 +33,6 @@ from mitsim.study.run_document import RunnerUp
 from mitsim.study.run_folder import Run, read_run
 from mitsim.study.scene_geometry import read_scene_geometry
 from mitsim.study.virtual.race import ALL
-
-#: rows of the ranked table; scores.csv holds all views
-TOP = 10
 
 #: largest number of rolls that are listed individually
 MOST_LISTED = 8
@@ -119,8 +112,8 @@ def page_content(run: Run) -> dict[str, Any]:
 
 def _standoffs(run: Run) -> str:
     standoffs = run.scores["standoff_mm"].values
-    nearest, farthest = rounded(float(standoffs.min())), rounded(float(standoffs.max()))
-    return nearest if nearest == farthest else f"{nearest} to {farthest}"
+    ends = rounded(float(standoffs.min())), rounded(float(standoffs.max()))
+    return " to ".join(dict.fromkeys(ends))
 
 
 def _by_finish(features: dict[str, str]) -> dict[str, str]:
@@ -174,7 +167,6 @@ def _answer(run: Run, name: str) -> dict[str, Any]:
 
 
 def _runner_up(run: Run, up: RunnerUp) -> dict[str, Any]:
-    """Return the texts of a view that comes next for all measurements."""
     stated = NONE if up.stated_ratio is None else rounded(up.stated_ratio, 2)
     texts = {"ratio": rounded(up.ratio, 2), "near": percent(up.near), "trials": count(up.trials), "stated": stated}
     return pose_texts(pose_of_view(run, up.view)) | texts
@@ -182,6 +174,7 @@ def _runner_up(run: Run, up: RunnerUp) -> dict[str, Any]:
 
 def _agreement_row(name: str, comparison: Agreement) -> dict[str, str]:
     size = "u too small" if comparison.optimistic else "u holds" if comparison.trials else ""
+    interval = f"{percent(comparison.low)} to {percent(comparison.high)}, n = {comparison.trials}"
     return {
         "name": name,
         "count": f"{comparison.count} of {len(comparison.views)}",
@@ -189,9 +182,7 @@ def _agreement_row(name: str, comparison: Agreement) -> dict[str, str]:
         "score_spearman": rounded(comparison.score_spearman, 2),
         "chance": rounded(chance_level(comparison.count), 2),
         "coverage": percent(comparison.coverage),
-        "interval": f"{percent(comparison.low)} to {percent(comparison.high)}, n = {comparison.trials}"
-        if comparison.trials
-        else "",
+        "interval": interval if comparison.trials else "",
         "ratio": two_digits(comparison.ratio),
         "order": comparison.order,
         "size": size,
@@ -213,19 +204,10 @@ def _reason_rows(run: Run) -> list[dict[str, str]]:
 
 
 def _table(run: Run, name: str) -> dict[str, Any]:
-    entry = run.about.measurements[name]
-    numbers = run.scores["view"].values
-    rows = []
-    for rank, i in enumerate(findings.ranked_views(run.scores, name)[:TOP], 1):
-        view, points = int(numbers[i]), run.scores["n"].isel(view=int(i))
-        rows.append(
-            pose_texts(pose_of_view(run, view))
-            | expected_texts(run, name, view)
-            | {
-                "rank": rank,
-                "points": [count(round(float(points.sel(feature=feature)))) for feature in entry.shapes],
-                "checked": view in run.checked,
-            }
-        )
+    entry, rows = run.about.measurements[name], best_rows(run, name)
+    for row in rows:
+        points = run.scores["n"].sel(view=int(row["view"]))
+        row["points"] = [count(round(float(points.sel(feature=feature)))) for feature in entry.shapes]
+        row["checked"] = int(row["view"]) in run.checked
     tolerance = math.isfinite(float(run.scores["tolerance"].sel(measurement=name)))
     return {"name": name, "features": entry.shapes, "tolerance": tolerance, "rows": rows}

@@ -157,11 +157,7 @@ def cloud_picture(run: Run, view: int) -> Picture:
 def placement_picture(
     geometry: SceneGeometry | None, poses: Sequence[tuple[str, ArrayLike]], verdicts: Mapping[str, str], caption: str
 ) -> Picture | None:
-    """Return the picture of a page, wide and narrow, with its caption; None without a part or a pose.
-
-    ``geometry``, ``poses``, ``verdicts``: as of :func:`mitsim.report.placement_figure.draw_placement`. ``caption``:
-    words on sensor and pose.
-    """
+    """Return the picture of :func:`draw_placement`, wide and narrow, with a caption; None without a part or a pose."""
     if geometry is None or not len(geometry.corners) or not poses:
         return None
     by_verdict: dict[str, Any] = {}

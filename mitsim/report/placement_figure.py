@@ -108,13 +108,10 @@ def draw_placement(
     verdicts: Mapping[str, str],
     stacked: bool = False,
 ) -> None:
-    """Draw a part with a sensor at each pose into a figure.
+    """Draw a part with a sensor at each pose, label and part_from_sensor (4, 4) [mm], the first in full.
 
-    - ``figure``, ``stacked``: figure or subfigure, about 1.9 times as wide as high; if ``stacked``, 0.7 times: the
-      enlarged part is then below, not on the right.
-    - ``geometry``, ``verdicts``: triangles of the part, and eyes of the sensor [mm]; verdict of each feature, a key of
-      :data:`VERDICTS`.
-    - ``poses``: label and part_from_sensor (4, 4) [mm] of each pose; the first sensor is drawn in full.
+    The figure is about 1.9 times as wide as high; if ``stacked``, 0.7 times: the enlarged part is then below, not on
+    the right. ``verdicts`` of features are keys of :data:`VERDICTS`.
     """
     matrices = [np.asarray(pose, float) for _, pose in poses]
     with drawing():
@@ -225,22 +222,11 @@ def _sensor(
         axes.plot(loop[:, 0], loop[:, 1], color=colour, lw=0.8, ls="--", zorder=1)
         axes.fill(corners[:, 0], corners[:, 1], color=MUTED, alpha=0.08, zorder=0, lw=0)
     body, _ = _projected(centres, turn)
-    axes.plot(
-        body[:, 0], body[:, 1], color=colour, lw=5 if strong else 3, solid_capstyle="round", zorder=5, alpha=alpha
-    )
-    axes.plot(body[:, 0], body[:, 1], "o", ms=5 if strong else 3, mfc="white", mec=colour, mew=1.2, zorder=6)
-    axes.annotate(
-        label,
-        tuple(body[np.argmax(body[:, 1])]),
-        (0, 8),
-        textcoords="offset points",
-        ha="center",
-        va="bottom",
-        fontsize=8.5,
-        color=colour,
-        zorder=9,
-        path_effects=_HALO,
-    )
+    size, place = 5 if strong else 3, tuple(body[np.argmax(body[:, 1])])
+    axes.plot(body[:, 0], body[:, 1], color=colour, lw=size, solid_capstyle="round", zorder=5, alpha=alpha)
+    axes.plot(body[:, 0], body[:, 1], "o", ms=size, mfc="white", mec=colour, mew=1.2, zorder=6)
+    words: dict[str, Any] = {"ha": "center", "va": "bottom", "fontsize": 8.5, "color": colour, "path_effects": _HALO}
+    axes.annotate(label, place, (0, 8), textcoords="offset points", zorder=9, **words)
 
 
 def _labels(axes: Axes, geometry: SceneGeometry, flat: Floats, depth: Floats, verdicts: Mapping[str, str]) -> None:
@@ -265,14 +251,8 @@ def _axes_of_part(axes: Axes, turn: Floats) -> None:
     below, origin = ((low + high) / 2, bottom), np.array([0.0, -1.4 * _AXES_PT])
     for number, name in enumerate("xyz"):
         way = _AXES_PT * turn[:2, number]
-        axes.annotate(
-            "",
-            below,
-            below,
-            xycoords=at(origin + way),
-            textcoords=at(origin),
-            arrowprops={"arrowstyle": "->", "color": MUTED, "lw": 1.0, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 8},
-        )
+        arrow = {"arrowstyle": "->", "color": MUTED, "lw": 1.0, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 8}
+        axes.annotate("", below, below, xycoords=at(origin + way), textcoords=at(origin), arrowprops=arrow)
         beyond = origin + way + 5.0 * way / max(float(np.linalg.norm(way)), 0.2 * _AXES_PT)
         axes.text(*below, name, transform=at(beyond), ha="center", va="center", fontsize=8, color=MUTED)
 

@@ -4,9 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
+import xarray as xr
+
 from characterisation.words.numbers import NONE, SPACE, count, percent, quantity, rounded, two_digits
+from mitsim.report.findings import ranked_views
 from mitsim.study.choice_document import PoseEntry
 from mitsim.study.run_folder import Run
+
+#: rows of a table of the best views; scores.csv holds all views
+TOP = 10
 
 
 def pose_of_view(run: Run, view: int) -> PoseEntry:
@@ -54,12 +60,26 @@ def expected_texts(run: Run, name: str, view: int) -> dict[str, str]:
     """Return the predicted figures of a view and a measurement that it can make, as texts."""
     here = run.scores.sel(measurement=name, view=view)
     u, tolerance = float(here["predicted_uncertainty"]), float(here["tolerance"])
-    limit, feature = str(here["limit"].values), str(here["limiting_feature"].values)
     return {
         "chance": percent(float(here["chance"])),
         "uncertainty": quantity(u, run.about.measurements[name].unit),
         "margin": two_digits(tolerance / u) if u > 0 else NONE,
-        "limit": f"{limit} on {feature}" if limit and feature else limit,
+        "limit": limit_words(here),
         "score": rounded(float(here["V_m"]), 2),
         "score_rank": count(int(here["rank"])),
     }
+
+
+def best_rows(run: Run, name: str) -> list[dict[str, Any]]:
+    """Return the texts of the :data:`TOP` best views of a measurement, with their rank."""
+    views = run.scores["view"].values[ranked_views(run.scores, name)[:TOP]].tolist()
+    return [
+        pose_texts(pose_of_view(run, view)) | expected_texts(run, name, view) | {"rank": rank}
+        for rank, view in enumerate(views, 1)
+    ]
+
+
+def limit_words(here: xr.Dataset) -> str:
+    """Return the limit of a view and a measurement, ``noise on plane``, from their scores."""
+    limit, feature = str(here["limit"].values), str(here["limiting_feature"].values)
+    return f"{limit} on {feature}" if limit and feature else limit

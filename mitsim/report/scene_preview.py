@@ -23,6 +23,7 @@ from characterisation.plots.labels import cut, round_length, scale_bar
 from characterisation.plots.part_pictures import EDGE_SHADE, shape_edges
 from characterisation.plots.style import FIELD, INK, MUTED, OTHER_SHAPE, SHAPES, bare, drawing
 from characterisation.words.numbers import finish_name
+from mitsim.report.style import legend_patch
 from mitsim.scene.first_hits import first_hits
 from mitsim.scene.inspect import SceneFacts, ShapeFacts
 from mitsim.scene.load import Scene
@@ -82,14 +83,11 @@ def preview_figure(
 
     Parameters
     ----------
-    scene, facts, visible
-        The loaded scene, its shapes, and the surfaces that the reference camera's pixels see.
-    sensor, pose
-        The sensor, and world_from_sensor [mm].
-    first
-        Names of the shapes that get the first colours; the largest of the others follow.
-    measured
-        Names of the shapes that measurements need: only they get a colour. Empty without measurements.
+    scene, facts, sensor, pose, visible
+        Shapes of the scene, world_from_sensor [mm], and the surfaces that the reference camera's pixels see.
+    first, measured
+        Names of the shapes that get the first colours; the largest of the others follow. Names of the shapes that
+        measurements need: only they get a colour. Empty without measurements.
     """
     colours = _colours(facts, first, measured)
     with drawing():
@@ -320,12 +318,9 @@ def _axes_mark(axes: Axes) -> None:
 
 def _features(facts: SceneFacts, colours: list[str], measured: Collection[str]) -> list[Patch | Line2D]:
     named = [i for i, colour in enumerate(colours) if colour != OTHER_SHAPE]
-    handles: list[Patch | Line2D] = [
-        Patch(facecolor=colours[i], edgecolor=MUTED, lw=0.5, label=_label(facts.shapes[i])) for i in named
-    ]
+    handles: list[Patch | Line2D] = [legend_patch(colours[i], _label(facts.shapes[i])) for i in named]
     if grey := len(colours) - len(named):
-        label = f"{grey} {'not measured' if measured else 'more shapes'}"
-        handles.append(Patch(facecolor=OTHER_SHAPE, edgecolor=MUTED, lw=0.5, label=label))
+        handles.append(legend_patch(OTHER_SHAPE, f"{grey} {'not measured' if measured else 'more shapes'}"))
     return handles
 
 
@@ -336,8 +331,8 @@ def _marks(sensor: Sensor) -> list[Patch | Line2D]:
         Line2D([], [], color=INK, lw=0.9, ls=":", label=f"seen by all eyes, {far:g} mm deep"),
         Line2D([], [], color=INK, lw=0.9, ls="-.", label="working volume at half height"),
         Line2D([], [], ls="none", label="sensor", **_SENSOR_MARK),
-        Patch(facecolor=FIELD, edgecolor=MUTED, lw=0.5, label="pale: not visible to every eye"),
-        Patch(facecolor=_BACK, edgecolor=MUTED, lw=0.5, label="black: back of a face"),
+        legend_patch(FIELD, "pale: not visible to every eye"),
+        legend_patch(_BACK, "black: back of a face"),
     ]
 
 

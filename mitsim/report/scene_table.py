@@ -32,10 +32,8 @@ def as_text(
 
     Parameters
     ----------
-    facts, visible, findings
-        About the scene: its shapes, the surfaces that the sensor sees, and the findings.
-    measured
-        Names of the shapes that a task measures: they come first.
+    facts, visible, findings, measured
+        Shapes of the scene, the surfaces that the sensor sees, and names of measured shapes, which come first.
     every
         Whether every shape has a row and every finding a line; else other shapes than the measured ones have rows up
         to :data:`MOST_ROWS` in all, and warnings and notes that differ in their shapes only share a line.
@@ -45,21 +43,11 @@ def as_text(
     for number, shape in sorted(enumerate(facts.shapes), key=lambda item: item[1].name not in measured):
         material, roughness = _material(shape)
         low, high = shape.bounds
-        pixels = int(((visible.shape == number) & visible.front & visible.seen_by_all).sum())
+        area = f"{shape.area:.5g}" if math.isfinite(shape.area) else "not known"
+        lengths = _lengths(high - low, " x "), _lengths(low, ", "), _lengths(high, ", ")
         triangles = str(len(shape.mesh.triangles)) if shape.mesh else _NONE
-        features.append(
-            (
-                shape.name,
-                material,
-                roughness,
-                f"{shape.area:.5g}" if math.isfinite(shape.area) else "not known",
-                _lengths(high - low, " x "),
-                _lengths(low, ", "),
-                _lengths(high, ", "),
-                triangles,
-                str(pixels),
-            )
-        )
+        pixels = str(int(((visible.shape == number) & visible.front & visible.seen_by_all).sum()))
+        features.append((shape.name, material, roughness, area, *lengths, triangles, pixels))
         row = (material, roughness, _alpha(shape), _number(shape.alpha_factor, "x"), shape.provenance or _NONE)
         if row not in materials:
             materials.append(row)

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from characterisation.statements.verdict_words import OFTEN, Reason, in_words
-from characterisation.words.numbers import two_digits
+from characterisation.words.numbers import how_many, two_digits
 from mitsim.study.run_document import ConfirmedEntry, ViewSetEntry
 
 _OUT_OF_REACH = " is out of reach"
@@ -37,10 +37,9 @@ def set_result(entry: ViewSetEntry) -> SetResult:
     """Compare every limit with the root mean square error of the virtual measurements of the set."""
     limits, reached = entry.limits, {name: entry.feasible.get(name, True) for name in entry.limits}
     out_of_reach = [Reason(_OUT_OF_REACH, (name,)) for name, able in reached.items() if not able]
-    count = len(entry.views)
-    if not count:
+    if not entry.views:
         return SetResult((Reason("no set of views keeps the limits"), *out_of_reach), False)
-    which = f"the set of {count} view{'s' if count > 1 else ''} ({', '.join(map(str, entry.views))})"
+    which = f"the set of {views_in_words(entry.views)}"
     if not entry.confirmed:
         able = sum(reached.values())
         words = f"{which} is predicted to keep {able} of {len(limits)} limits, which no virtual measurement confirms"
@@ -56,6 +55,11 @@ def set_result(entry: ViewSetEntry) -> SetResult:
             often.append(Reason(f": no value in {share}", (name,)))
     words = f"{which}, measured together, keeps {len(limits) - len(missed)} of {len(limits)} limits"
     return SetResult((Reason(words), *missed, *often), not missed)
+
+
+def views_in_words(views: Sequence[int]) -> str:
+    """Return the number of views, and which: ``2 views (3, 12)``."""
+    return f"{how_many(len(views), 'view')} ({', '.join(map(str, views))})"
 
 
 def with_sets(reasons: Sequence[Reason], good: bool, entries: Sequence[ViewSetEntry]) -> SetResult:

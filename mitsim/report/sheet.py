@@ -116,26 +116,22 @@ def sheet_figures(declaration: Declaration, geometry: SceneGeometry | None) -> l
     """Return the sheet as A4 figures: one, unless the task has too many measurements for a page."""
     with drawing():
         shown = geometry is not None and len(geometry.corners) and declaration.first.poses
-        rows = [
-            replace(row, result=replace(row.result, name=declaration.marked(row.result.name)))
-            for row in declaration.rows
-        ]
+        names = [declaration.marked(row.result.name) for row in declaration.rows]
+        of_rows = zip(declaration.rows, names, strict=True)
+        rows = [replace(row, result=replace(row.result, name=name)) for row, name in of_rows]
         for layout in (*_LAYOUTS, _LAYOUTS[0]):
             page, columns = Page(), Columns([_cells(row) for row in rows], _HEADS, layout.table)
             _head(page, declaration, layout.lines)
             above = layout.picture if shown else 0.0
             below = _SIGNATURE + _facts_height(declaration, layout.facts)
-            whole = above + _table_height(rows, columns) + below
-            if whole <= page.room:
+            if whole := above + _table_height(rows, columns) + below <= page.room:
                 break
-        pages = [page]
-        here = _taken(rows, page.room - above - (below if whole <= page.room else 0.0), columns)
+        pages, foot = [page], below if whole else 0.0
+        here = _taken(rows, page.room - above - foot, columns)
         if shown:
             assert geometry is not None
-            free = page.room - _table_height(here, columns) - (below if whole <= page.room else 0.0)
-            height = max(above, min(_PICTURE, free))
-            grid = [HEIGHT - page.place, height, page.place - height]
-            _picture(page.figure, grid, declaration, geometry)
+            height = max(above, min(_PICTURE, page.room - _table_height(here, columns) - foot))
+            _picture(page.figure, [HEIGHT - page.place, height, page.place - height], declaration, geometry)
             page.place -= height
         _table(page, here, columns)
 
@@ -193,21 +189,9 @@ def _result(first: FirstScreen, lines: int) -> str:
 
 
 def _cells(row: DeclaredRow) -> list[str]:
-    result = row.result
-    toleranced = result.tolerance != NONE
-    return [
-        result.name,
-        result.tolerance if toleranced else "none",
-        row.bias,
-        result.uncertainty,
-        row.expanded,
-        row.factor,
-        row.interval,
-        row.trials,
-        result.without_value,
-        result.accepted,
-        f"● {result.verdict}",
-    ]
+    result, tolerance = row.result, "none" if row.result.tolerance == NONE else row.result.tolerance
+    numbers = [row.bias, result.uncertainty, row.expanded, row.factor, row.interval, row.trials]
+    return [result.name, tolerance, *numbers, result.without_value, result.accepted, f"● {result.verdict}"]
 
 
 def _about(row: DeclaredRow) -> str:
@@ -255,13 +239,11 @@ def _table(page: Page, rows: Sequence[DeclaredRow], columns: Columns) -> None:
     page.place -= 0.04
     for row in rows:
         top = page.place
+        if not columns.above:
+            _write_values(page, row, columns)
+        _write_name(page, row, columns)
         if columns.above:
-            _write_name(page, row, columns)
             _write_values(page, row, columns)
-        else:
-            _write_values(page, row, columns)
-            page.place = top
-            _write_name(page, row, columns)
         page.place = top - _row_height(row, columns)
 
 
@@ -338,7 +320,6 @@ def _sign(page: Page) -> None:
 def _foot(page: Page, number: int, of: int) -> None:
     page.place = MARGIN
     words = "Simulated, not traceable: no real sensor has measured this part."
-    words += " Verdicts are about the measurement, not about a part."
-    page.put(0, words, _SMALL, MUTED)
+    page.put(0, f"{words} Verdicts are about the measurement, not about a part.", _SMALL, MUTED)
     right = f"Page {number} of {of}"
     page.put(ACROSS - text_width(right, _SMALL), right, _SMALL, MUTED)

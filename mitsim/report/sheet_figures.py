@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -40,9 +41,7 @@ def noise_figure(sheets: Sequence[DataSheet]) -> Figure:
     with drawing():
         figure, panels = _panels(len(sheets), 2.9)
         for sheet, axes in zip(sheets, panels, strict=False):
-            distance = np.array([point.distance for point in sheet.noise])
-            sigma = np.array([point.sigma for point in sheet.noise])
-            spread = np.array([point.spread for point in sheet.noise])
+            distance, sigma, spread = np.array([(p.distance, p.sigma, p.spread) for p in sheet.noise]).reshape(-1, 3).T
             axes.loglog(distance, spread, "o-", color=BLUE, ms=4, lw=1.4, label="simulated, whole plate")
             axes.loglog(distance, sigma, "o", color=BLUE, ms=4, mfc="white", label="simulated, in discs of 113 px")
             for style, published in zip(_LINES, sheet.sensor.published_noise, strict=False):
@@ -50,9 +49,8 @@ def noise_figure(sheets: Sequence[DataSheet]) -> Figure:
                 source = textwrap.shorten(published.source.split(":")[0].split(" (")[0], 48, placeholder=" ...")
                 axes.loglog(published.distance_mm, published.sigma_mm, color=VERMILION, lw=1.1, label=source, **mark)  # type: ignore[arg-type]
             axes.set(title=sheet.sensor.name, xlabel="distance [mm]", ylabel="sigma along V [mm]")
-            largest = np.nanmax(
-                [*spread, *(s for published in sheet.sensor.published_noise for s in published.sigma_mm)]
-            )
+            of_others = [s for published in sheet.sensor.published_noise for s in published.sigma_mm]
+            largest = np.nanmax([*spread, *of_others])
             axes.set_ylim(max(axes.get_ylim()[0], largest / 300), 2.5 * largest)
             axes.set_xticks([round(float(d)) for d in distance[::2]], [f"{d:.0f}" for d in distance[::2]])
             axes.minorticks_off()
@@ -71,18 +69,14 @@ def residual_figure(sheets: Sequence[DataSheet]) -> Figure:
             if not spread > 0:
                 continue
             reach = 4.5 * spread
-            axes.hist(
-                residuals.values, bins=np.linspace(-reach, reach, 91).tolist(), density=True, color=BLUE, alpha=0.75
-            )
+            bins = np.linspace(-reach, reach, 91).tolist()
+            axes.hist(residuals.values, bins=bins, density=True, color=BLUE, alpha=0.75)
             x = np.linspace(-reach, reach, 200)
             axes.plot(x, np.exp(-0.5 * (x / spread) ** 2) / (spread * math.sqrt(2 * math.pi)), color=INK, lw=0.9)
-            axes.set(
-                yticks=[], xlabel="residual along V [mm]", title=f"{sheet.sensor.name}, {residuals.distance:.0f} mm"
-            )
-            label = (
-                f"kurtosis {residuals.excess_kurtosis:+.2f}\n"
-                f"{residuals.independent} independent: p = {residuals.p_normal:.2g}"
-            )
+            title = f"{sheet.sensor.name}, {residuals.distance:.0f} mm"
+            axes.set(yticks=[], xlabel="residual along V [mm]", title=title)
+            normal = f"{residuals.independent} independent: p = {residuals.p_normal:.2g}"
+            label = f"kurtosis {residuals.excess_kurtosis:+.2f}\n{normal}"
             axes.text(0.02, 0.97, label, transform=axes.transAxes, va="top", fontsize=7, color=MUTED)
     return figure
 
@@ -107,9 +101,8 @@ def gallery_figure(sensor: str, gallery: Sequence[tuple[str, Capture, PointCloud
                 axes.set(xticks=[], yticks=[])
         figure.suptitle(sensor, fontsize=10)
         legend = [Patch(facecolor=REASONS[Status(s)][1], label=REASONS[Status(s)][0]) for s in sorted(present)]
-        figure.legend(
-            handles=legend, loc="outside lower center", ncols=3, handlelength=1.1, title=_DARK, title_fontsize=7.5
-        )
+        place: dict[str, Any] = {"loc": "outside lower center", "ncols": 3, "handlelength": 1.1}
+        figure.legend(handles=legend, title=_DARK, title_fontsize=7.5, **place)
     return figure
 
 
@@ -122,9 +115,8 @@ def image_on_grid(capture: Capture, cloud: PointCloud) -> NDArray[np.float64]:
     if image.shape != (camera.height, camera.width):  # a device's own map
         return image if image.shape == cloud.status.shape else np.full(cloud.status.shape, np.nan)
     pixels = camera.project(cloud.grid.origin + _FAR_MM * cloud.grid.rays())
-    return np.asarray(
-        map_coordinates(image, [pixels[..., 1], pixels[..., 0]], order=1, mode="constant", cval=math.nan), float
-    )
+    places = [pixels[..., 1], pixels[..., 0]]
+    return np.asarray(map_coordinates(image, places, order=1, mode="constant", cval=math.nan), float)
 
 
 def sheet_table(sheets: Sequence[DataSheet]) -> str:
@@ -164,19 +156,9 @@ def _row(sheet: DataSheet) -> str:
     square, tilted = (f"{_mm(p.offset)}, {_mm(p.flatness)}" for p in sheet.planes)
     chosen = (sheet.noise[0], sheet.noise[len(sheet.noise) // 2], sheet.noise[-1])
     noise = ", ".join(f"{_mm(p.sigma)} and {_mm(p.spread)} at {p.distance:.0f}" for p in chosen)
-    ground = [p for p in sheet.metal if p.finish.startswith("ground")]
-    polished = [p for p in sheet.metal if p.finish.startswith("polished")]
-    cells = [
-        sheet.sensor.name,
-        square,
-        tilted,
-        f"{sheet.radius_mm:.0f}, {_mm(sheet.radius_error)}",
-        noise,
-        _ratios(sheet),
-        _fractions(ground),
-        _fractions(polished),
-    ]
-    return "| " + " | ".join(cells) + " |"
+    ball = f"{sheet.radius_mm:.0f}, {_mm(sheet.radius_error)}"
+    metal = [_fractions([p for p in sheet.metal if p.finish.startswith(kind)]) for kind in ("ground", "polished")]
+    return "| " + " | ".join([sheet.sensor.name, square, tilted, ball, noise, _ratios(sheet), *metal]) + " |"
 
 
 def _ratios(sheet: DataSheet) -> str:
@@ -184,14 +166,12 @@ def _ratios(sheet: DataSheet) -> str:
     recovered = [point for point in sheet.noise if point.spread > 0]
     if not recovered:
         return "none in range"
-    distance = np.log([point.distance for point in recovered])
-    spread = np.log([point.spread for point in recovered])
+    distance, spread = np.log([(point.distance, point.spread) for point in recovered]).T
     ratios: list[float] = []
     for published in sheet.sensor.published_noise:
-        published_distances = np.log(published.distance_mm)
-        inside = (published_distances >= distance[0] - 1e-6) & (published_distances <= distance[-1] + 1e-6)
-        ours = np.interp(published_distances, distance, spread)
-        ratios += np.exp(np.log(published.sigma_mm) - ours)[inside].tolist()
+        at = np.log(published.distance_mm)
+        inside = (at >= distance[0] - 1e-6) & (at <= distance[-1] + 1e-6)
+        ratios += np.exp(np.log(published.sigma_mm) - np.interp(at, distance, spread))[inside].tolist()
     if not ratios:
         return "none in range"
     low, high = two_digits(min(ratios)), two_digits(max(ratios))

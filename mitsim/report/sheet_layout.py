@@ -6,8 +6,10 @@ wide as their widest cell, set smaller until the table fits -> texts on a figure
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import accumulate
 from typing import Any
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -41,6 +43,9 @@ LINE = 1.35 / 72
 #: sizes that a table may have [pt], largest first
 _SIZES = (8.0, 7.5, 7.0, 6.5, 6.0, 5.5)
 
+#: least width of the first column of a table, unless no size leaves it [in]
+_FIRST = 1.3
+
 _DPI = 200
 
 #: relative difference of a line's width from the sum of those of its pieces, which kerning stays below; chosen
@@ -64,23 +69,18 @@ def text_width(text: str, size: float, weight: str = "normal") -> float:
 
 
 def wrapped(text: str, size: float, across: float, weight: str = "normal") -> list[str]:
-    """Return the lines of a text that are at most ``across`` [in] wide.
+    """Return the lines of a text of a size [pt] that are at most ``across`` [in] wide.
 
     A line breaks at a space, or after an underscore or a slash; a longer word breaks where it must.
-
-    ``text``, ``size``, ``weight``, ``across``: the text, size [pt] and weight of the font, and largest width of a line
-    [in].
     """
     lines, line, width = list[str](), "", 0.0
     for word in text.split(" "):
-        for number, piece in enumerate(_pieces(word)):
+        for number, piece in enumerate(re.split("(?<=[_/])(?=.)", word)):
             added = (" " if line and number == 0 else "") + piece
             longer = width + text_width(added, size, weight)
-            # only a line that nearly fits needs its own width
-            if abs(longer - across) < _KERNING * across:
+            fits = longer < across
+            if abs(longer - across) < _KERNING * across:  # only a line that nearly fits needs its own width
                 fits = text_width(line + added, size, weight) <= across
-            else:
-                fits = longer < across
             if fits:
                 line, width = line + added, longer
                 continue
@@ -95,17 +95,6 @@ def wrapped(text: str, size: float, across: float, weight: str = "normal") -> li
     return [*lines, line]
 
 
-def _pieces(word: str) -> list[str]:
-    """Return a word divided after its underscores and slashes."""
-    out, piece = [], ""
-    for character in word:
-        piece += character
-        if character in "_/":
-            out.append(piece)
-            piece = ""
-    return [*out, piece] if piece or not out else out
-
-
 class Page:
     """One A4 page; ``place`` [in] above its lower edge is where the next line goes."""
 
@@ -118,39 +107,15 @@ class Page:
         """Return the height that is left above the last line of the page [in]."""
         return self.place - MARGIN - FOOT
 
-    def put(self, left: float, text: str, size: float = 8.0, colour: str = INK, weight: str = "normal") -> None:
-        """Write one line, its top at ``place``.
-
-        Parameters
-        ----------
-        left, text
-            Distance from the margin [in], and the line.
-        size, colour, weight
-            Of the font; the size in pt.
-        """
+    def put(self, left: float, text: str, size: float, colour: str = INK, weight: str = "normal") -> None:
+        """Write one line of a size [pt], its top at ``place``, ``left`` [in] from the margin."""
         x, y = (MARGIN + left) / WIDTH, self.place / HEIGHT
         self.figure.text(x, y, text, fontsize=size, color=colour, fontweight=weight, va="top")
 
-    def write(
-        self,
-        text: str,
-        size: float = 8.0,
-        colour: str = INK,
-        weight: str = "normal",
-        left: float = 0.0,
-        across: float = ACROSS,
-    ) -> None:
-        """Write wrapped lines, and move down by each.
-
-        Parameters
-        ----------
-        text, size, colour, weight
-            The text, and its font; the size in pt.
-        left, across
-            Distance from the margin, and largest width of a line [in].
-        """
-        for line in wrapped(text, size, across, weight):
-            self.put(left, line, size, colour, weight)
+    def write(self, text: str, size: float, colour: str = INK, weight: str = "normal") -> None:
+        """Write wrapped lines of a size [pt], and move down by each."""
+        for line in wrapped(text, size, ACROSS, weight):
+            self.put(0, line, size, colour, weight)
             self.place -= size * LINE
 
     def rule(self, colour: str, left: float = 0.0, right: float = ACROSS) -> None:
@@ -163,25 +128,15 @@ class Page:
 class Columns:
     """Columns of a table as wide as their widest cell, at the largest size of text at which they fit a page.
 
-    ``lefts`` [in] from the margin, ``widths`` [in], ``size`` [pt]. Cells of the first column wrap if they are wider
-    than ``first`` [in] and the other columns leave no more. Where one would wrap, all are ``above``: they have lines of
-    their own, over the other cells, which are a little to the right, and the first column has no head.
-
-    Parameters
-    ----------
-    rows, heads
-        Texts of the cells; of the heads, in lines.
-    largest, first
-        Largest size of text [pt]; least width of the first column at the size that is chosen, unless no size leaves it
-        [in].
+    ``lefts`` [in] from the margin, ``widths`` [in], ``size`` up to ``largest`` [pt]; ``heads`` in lines. Cells of the
+    first column wrap if they are wider than :data:`_FIRST` and the other columns leave no more. Where one would wrap,
+    all are ``above``: they have lines of their own, over the other cells, which are a little to the right, and the
+    first column has no head.
     """
 
-    def __init__(
-        self, rows: Sequence[Sequence[str]], heads: Sequence[Sequence[str]], largest: float = 8.0, first: float = 1.3
-    ) -> None:
-        self._fit(rows, heads, largest, first)
-        names = [row[0] for row in rows]
-        self.above = any(len(wrapped(name, self.size, self.widths[0], "bold")) > 1 for name in names)
+    def __init__(self, rows: Sequence[Sequence[str]], heads: Sequence[Sequence[str]], largest: float) -> None:
+        self._fit(rows, heads, largest, _FIRST)
+        self.above = any(len(wrapped(row[0], self.size, self.widths[0], "bold")) > 1 for row in rows)
         if self.above:
             self._fit([["", *row[1:]] for row in rows], [[""], *heads[1:]], largest, 0.3)
 
@@ -198,6 +153,4 @@ class Columns:
                 break
         self.widths[0] = max(min(self.widths[0], ACROSS - remaining_width), first / 2)
         spare = max(0.0, ACROSS - self.widths[0] - remaining_width) / max(len(heads) - 1, 1)
-        self.lefts = [0.0]
-        for width in self.widths[:-1]:
-            self.lefts.append(self.lefts[-1] + width + GAP + spare)
+        self.lefts = list(accumulate(self.widths[:-1], lambda left, width: left + width + GAP + spare, initial=0.0))

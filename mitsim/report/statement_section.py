@@ -13,7 +13,7 @@ from typing import Any
 from characterisation.plots.statements import GROUPS
 from characterisation.statements.losses import Loss, lost_features
 from characterisation.statements.statement import AT_THE_LIMIT, FAR_FROM_NOMINAL
-from characterisation.words.numbers import NONE, SPACE, interval_text, listed, percent, quantity
+from characterisation.words.numbers import NONE, SPACE, interval_text, listed, or_nan, percent, quantity
 from mitsim.report.first_rows import bias_words, exact, share_words
 from mitsim.report.unknowns_words import unknowns_in_words
 from mitsim.study.dependence_words import dependences_in_words, remedies_in_words
@@ -90,16 +90,13 @@ def exposed_in_words(exposure_entry: ExposureEntry | None) -> str:
 
 
 def _row(name: str, measurement: StatedMeasurement) -> dict[str, str]:
-    has_value = measurement.bias is not None and measurement.standard_uncertainty is not None
+    uncorrected = math.hypot(or_nan(measurement.bias), or_nan(measurement.standard_uncertainty))
     return {
         "name": name,
         "bias": bias_words(measurement.bias, measurement.bias_uncertainty, measurement.unit),
         "bias_uncertainty": quantity(measurement.bias_uncertainty, measurement.unit),
         "uncertainty": quantity(measurement.standard_uncertainty, measurement.unit),
-        "uncorrected": quantity(
-            math.hypot(measurement.bias or 0, measurement.standard_uncertainty or 0) if has_value else None,
-            measurement.unit,
-        ),
+        "uncorrected": quantity(uncorrected, measurement.unit),
         "interval": interval_words(measurement.interval, measurement.unit),
         "corrected": interval_words(measurement.interval_corrected, measurement.unit),
         "without": percent(measurement.without_value),
@@ -128,25 +125,22 @@ def _bar(name: str, measurement: StatedMeasurement) -> dict[str, Any]:
 
 def _budget_row(name: str, measurement: StatedMeasurement, groups: list[str]) -> dict[str, Any]:
     by_group = {line.group: line for line in measurement.budget}
-    cells = []
-    for group in groups:
-        line = by_group.get(group)
-        if line is None:
-            cells.append({"u": NONE, "share": ""})
-            continue
-        if line.settled:
-            u, share = (
-                quantity(math.sqrt(line.variance), measurement.unit),
-                f"{percent(line.share)}; {_share_interval(line)}",
-            )
-        else:
-            u, share = "too few trials", _share_interval(line)
-        cells.append({"u": u, "share": share})
+    cells = [_budget_cell(by_group.get(group), measurement.unit) for group in groups]
     return {"name": name, "cells": cells, "whole": quantity(measurement.standard_uncertainty, measurement.unit)}
 
 
+def _budget_cell(line: BudgetEntry | None, unit: str) -> dict[str, str]:
+    if line is None:
+        return {"u": NONE, "share": ""}
+    if not line.settled:
+        return {"u": "too few trials", "share": _share_interval(line)}
+    return {
+        "u": quantity(math.sqrt(line.variance), unit),
+        "share": f"{percent(line.share)}; {_share_interval(line)}",
+    }
+
+
 def _share_interval(line: BudgetEntry) -> str:
-    """Return the 95 % interval of a line's share in words."""
     low, high = line.share_interval
     return f"{100 * low:.0f} to {100 * high:.0f}{SPACE}%"
 

@@ -19,6 +19,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from PIL import Image
 
@@ -78,21 +79,17 @@ def write_png(figure: Figure, path: Path, dpi: int = _DPI, colours: int | None =
 
     Parameters
     ----------
-    figure, path, dpi
-        The figure, the file to write, and pixels per inch.
-    colours
-        Number of colours of a palette, which halves the size of a noisy image; None for all colours.
+    figure, path, dpi, colours
+        ``colours`` of a palette, which halves the size of a noisy image; None for all colours.
     """
     picture = io.BytesIO()
     with drawing():
         FigureCanvasAgg(figure)
         figure.savefig(picture, format="png", dpi=dpi, facecolor="white")
     if colours is not None:
-        full = Image.open(picture).convert("RGB")
-        picture = io.BytesIO()
-        full.quantize(colours, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
-            picture, format="png", optimize=True
-        )
+        full, picture = Image.open(picture).convert("RGB"), io.BytesIO()
+        few = full.quantize(colours, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+        few.save(picture, format="png", optimize=True)
     with atomic_write(path) as file:  # Pillow, given the file itself, would report "encoder error" on a full disk
         file.write_bytes(picture.getvalue())
     return path
@@ -103,18 +100,17 @@ def colour_scale(figure: Figure, shown: Any, axes: Any, label: str, **options: A
 
     Parameters
     ----------
-    figure, axes
-        The figure, and the axes beside which the scale lies.
-    shown, label
-        Image or other artist with the colours, and quantity and unit.
-    options
-        Further arguments of :meth:`matplotlib.figure.Figure.colorbar`.
+    figure, shown, axes, label, options
+        Of :meth:`matplotlib.figure.Figure.colorbar`.
     """
-    options.setdefault("extend", "both")
-    options.setdefault("pad", 0.01)
-    bar = figure.colorbar(shown, ax=axes, label=label, **options)
+    bar = figure.colorbar(shown, ax=axes, label=label, **({"extend": "both", "pad": 0.01} | options))
     bar.outline.set_visible(False)  # type: ignore[operator]
     return bar
+
+
+def legend_patch(colour: str, label: str) -> Patch:
+    """Return a framed area of a colour for a legend."""
+    return Patch(facecolor=colour, edgecolor=MUTED, lw=0.5, label=label)
 
 
 def pixel_axes(axes: Axes) -> None:

@@ -57,13 +57,8 @@ def script_content(script: str) -> dict[str, str]:
 
 @cache
 def _environment() -> Environment:
-    environment = Environment(
-        loader=FileSystemLoader(_FOLDER),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = Environment(loader=FileSystemLoader(_FOLDER), autoescape=True, undefined=StrictUndefined)
+    environment.trim_blocks = environment.lstrip_blocks = True
     environment.filters["breakable"] = breakable
     return environment
 
@@ -100,7 +95,6 @@ def _labelled_row(row: str, labels: list[str]) -> str:
 
 
 def _text(heading: str) -> str:
-    """Return the words of a head."""
     words = re.sub(r"<br>", " ", heading).replace("<wbr>", _BREAK).replace("<small>", ", ")
     words = unescape(re.sub(r"<[^>]*>", "", words))
     return " ".join(words.split()).removeprefix(", ")

@@ -82,8 +82,8 @@ def box_around(clouds: Iterable[Floats]) -> CoordinateRaster:
     filled = [points for points in clouds if len(points)]
     if not filled:
         return CoordinateRaster(np.zeros(3), 1.0)
-    low = np.min([points.min(axis=0) for points in filled], axis=0)
-    high = np.max([points.max(axis=0) for points in filled], axis=0)
+    every = np.concatenate(filled)
+    low, high = every.min(axis=0), every.max(axis=0)
     return CoordinateRaster(low, max(float((high - low).max()), 1e-6) / LAST_STEP)
 
 

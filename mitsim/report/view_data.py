@@ -93,8 +93,7 @@ _BY_MEASUREMENT = {
 
 def _measurement(run: Run, name: str) -> dict[str, Any]:
     here, entry = run.scores.sel(measurement=name), run.about.measurements[name]
-    features = [str(feature) for feature in run.scores["feature"].values]
-    comparison = agreement(run.scores, run.checks, name)
+    features, comparison = _features(run), agreement(run.scores, run.checks, name)
     errors = zip(comparison.views.tolist(), _numbers(comparison.error), strict=True)
     return {
         "name": name,
@@ -126,14 +125,11 @@ def target(scores: xr.Dataset) -> NDArray[np.float64]:
 
 def solids(run: Run) -> tuple[list[tuple[int, Markup]], dict[str, Any]]:
     """Return the data blocks of the clouds by view, and the script's description of the clouds and of the part."""
-    features = [str(name) for name in run.scores["feature"].values]
+    features, poses, part = _features(run), run.scores["world_from_sensor"], run.part()
     first = [*run.checked, *(view for entry in run.about.view_sets for view in entry.views)]
-    there = run.clouds
-    chosen = choose_clouds(run.scores, there, first)
+    chosen = choose_clouds(run.scores, run.clouds, first)
     most = min(MOST_POINTS, MOST_POINTS_IN_ALL // max(len(chosen), 1))
-    poses = run.scores["world_from_sensor"]
     clouds = {view: shown_cloud(run.predicted(view), poses.sel(view=view).values, features, most) for view in chosen}
-    part = run.part()
     box = box_around([*(cloud.points for cloud in clouds.values()), *([] if part is None else [part.vertices])])
     ends = noise_ends(clouds)
     shares = [len(cloud.points) / cloud.count for cloud in clouds.values() if cloud.count]
@@ -154,6 +150,10 @@ def solids(run: Run) -> tuple[list[tuple[int, Markup]], dict[str, Any]]:
         },
     }
     return [(view, Markup(packed_cloud(cloud, box, ends))) for view, cloud in clouds.items()], about
+
+
+def _features(run: Run) -> list[str]:
+    return [str(name) for name in run.scores["feature"].values]
 
 
 def _colours(name: str) -> list[str]:

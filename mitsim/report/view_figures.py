@@ -7,6 +7,7 @@ rings of elevation. The projection is equal-area, so that evenly spread views lo
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -48,11 +49,7 @@ def uncertainty_limits(uncertainty: Floats) -> tuple[float, float]:
 def uncertainty_figure(scores: xr.Dataset, measurement: str, unit: str, checked: list[int], best: int | None) -> Figure:
     """Draw the predicted u of every view for one measurement, a disc for each roll, on a logarithmic scale.
 
-    Bright is a small u. If views share a position, the best is on top.
-
-    ``scores``, ``measurement``, ``unit``: scores of a run, over ``view`` and ``measurement``; name of the measurement,
-    and its unit: mm or deg. ``checked``, ``best``: numbers of the views that were rendered, and of the best one; None
-    if no view can make the measurement.
+    Bright is a small u. If views share a position, the best is on top. ``checked`` views were rendered.
     """
     worst_first = np.argsort(-scores["uncertainty_rank"].sel(measurement=measurement).values, kind="stable")
     scores = scores.isel(view=worst_first)
@@ -83,9 +80,9 @@ def uncertainty_figure(scores: xr.Dataset, measurement: str, unit: str, checked:
         extend = "max" if (u[possible] > norm.vmax).any() else "neither"
         colour_bar(figure, grid, norm, colours, f"predicted standard uncertainty u [{unit_symbol(unit)}]", extend)
         legend = [
-            Line2D([], [], marker="o", ls="none", mec=VERMILION, mfc="none", mew=2, ms=10, label="best"),
-            Line2D([], [], marker="D", ls="none", mec=INK, mfc="none", ms=6, label="rendered to check"),
-            Line2D([], [], marker="x", ls="none", mec=MUTED, ms=5, label="not possible"),
+            _mark("best", "o", 10, mec=VERMILION, mfc="none", mew=2),
+            _mark("rendered to check", "D", 6, mec=INK, mfc="none"),
+            _mark("not possible", "x", 5, mec=MUTED),
         ]
         figure.legend(handles=legend, loc="outside lower center", ncols=3, handletextpad=0.2, columnspacing=1.2)
     return figure
@@ -104,15 +101,8 @@ def sphere_of_views(axes: Axes, reach: float) -> None:
     for azimuth, name in ((0, "x, 0°"), (90, "y, 90°"), (180, "180°"), (-90, "−90°")):
         c, s = math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))
         axes.plot([0, reach * c], [0, reach * s], color=MUTED, lw=0.4, zorder=1)
-        axes.text(
-            1.03 * reach * c,
-            1.03 * reach * s,
-            name,
-            fontsize=6.5,
-            color=INK,
-            ha={1: "left", -1: "right", 0: "center"}[round(c)],
-            va={1: "bottom", -1: "top", 0: "center"}[round(s)],
-        )
+        across, up = {1: "left", -1: "right", 0: "center"}[round(c)], {1: "bottom", -1: "top", 0: "center"}[round(s)]
+        axes.text(1.03 * reach * c, 1.03 * reach * s, name, fontsize=6.5, color=INK, ha=across, va=up)
 
 
 def agreement_figure(agreement: Agreement, unit: str) -> Figure:
@@ -145,16 +135,18 @@ def agreement_figure(agreement: Agreement, unit: str) -> Figure:
         highest = max(float(agreement.score.max(initial=0.0)), 0.1)
         right.set_xlim(1.06 * highest, -0.04 * highest)  # as on the left, better views are on the left
         right.set_title(_rank(agreement.score_spearman))
-        handles = [Line2D([], [], marker="o", ls="none", color=BLUE, ms=5, label="mean of repeats; bar: min to max")]
+        handles = [_mark("mean of repeats; bar: min to max", "o", 5, color=BLUE)]
         if (np.isfinite(agreement.error) & (agreement.failed > 0)).any():
-            handles.append(
-                Line2D([], [], marker="o", ls="none", mec=BLUE, mfc="none", ms=5, label="some repeats failed")
-            )
+            handles.append(_mark("some repeats failed", "o", 5, mec=BLUE, mfc="none"))
         if missing:
-            handles.append(Line2D([], [], marker="X", ls="none", color=VERMILION, ms=6, label="not measurable"))
+            handles.append(_mark("not measurable", "X", 6, color=VERMILION))
         handles += lines
         figure.legend(handles=handles, loc="outside lower center", ncols=2, handletextpad=0.4, columnspacing=1.2)
     return figure
+
+
+def _mark(label: str, marker: str, size: float, **style: Any) -> Line2D:
+    return Line2D([], [], ls="none", marker=marker, ms=size, label=label, **style)
 
 
 def _rank(spearman: float) -> str:
@@ -181,8 +173,7 @@ def _errors(axes: Axes, x: NDArray[np.float64], agreement: Agreement, failed_at:
     at = np.isfinite(x)
     measured, failed = at & np.isfinite(agreement.error), at & ~np.isfinite(agreement.error)
     axes.vlines(x[measured], agreement.least[measured], agreement.most[measured], color=BLUE, lw=1.0, zorder=2)
-    whole = measured & (agreement.failed == 0)
+    whole, part = measured & (agreement.failed == 0), measured & (agreement.failed > 0)
     axes.plot(x[whole], agreement.error[whole], "o", color=BLUE, ms=5, zorder=3)
-    part = measured & (agreement.failed > 0)
     axes.plot(x[part], agreement.error[part], "o", mec=BLUE, mfc=PAPER, ms=5, zorder=3)
     axes.plot(x[failed], np.full(failed.sum(), failed_at), "X", color=VERMILION, mec="none", ms=6, zorder=3)

@@ -19,17 +19,14 @@ from __future__ import annotations
 from typing import Any
 
 from characterisation.tasks.covariance import LEAST_CHANCE
-from characterisation.words.numbers import count, percent, quantity, rounded, two_digits
-from mitsim.report import findings
+from characterisation.words.numbers import SPACE, count, percent, quantity, two_digits
 from mitsim.report.first_rows import bias_words
-from mitsim.report.pose_texts import expected_texts, pose_of_view, pose_texts
+from mitsim.report.pose_texts import best_rows
+from mitsim.report.set_words import views_in_words
 from mitsim.report.templates import joined_script, script_content
 from mitsim.report.view_data import as_json, solids, view_data
 from mitsim.study.run_document import TriedEntry, ViewSetEntry
 from mitsim.study.run_folder import Run
-
-#: views in the table that replaces the sphere
-TOP = 10
 
 #: in the order in which they are joined to one script
 SCRIPTS = ("view_scene.js", "view_panel.js", "view_sphere.js", "view_controls.js")
@@ -37,70 +34,46 @@ SCRIPTS = ("view_scene.js", "view_panel.js", "view_sphere.js", "view_controls.js
 
 def view_sphere(run: Run) -> dict[str, Any]:
     """Return the content of the sphere's section for the template."""
-    about = view_data(run)
-    clouds, bodies = solids(run)
+    about, (clouds, bodies) = view_data(run), solids(run)
     first = run.measurements[0] if run.measurements else ""
+    rows = best_rows(run, first) if first else []
     return {
         "data": as_json(about | bodies),
         "clouds": clouds,
         "measurements": run.measurements,
         "first": first,
-        "rows": _rows(run, first),
+        "rows": [row | {"standoff": row["standoff"].removesuffix(f"{SPACE}mm")} for row in rows],
         "least_chance": percent(LEAST_CHANCE),
         "directions": count(max(about["views"]["site"], default=-1) + 1),
         "checked": run.checked,
         "sets": [_set_words(run, entry) for entry in run.about.view_sets],
         "shown": bodies["shown"],
         "part": bodies["part"],
-    } | script_content(page_script())
-
-
-def page_script() -> str:
-    """Return the one script of the page."""
-    return joined_script(SCRIPTS)
-
-
-def _rows(run: Run, name: str) -> list[dict[str, str]]:
-    """Return the best views of a measurement, for readers without scripts; the script writes all others."""
-    if not name:
-        return []
-    numbers = run.scores["view"].values
-    rows = list[dict[str, str]]()
-    for rank, i in enumerate(findings.ranked_views(run.scores, name)[:TOP], 1):
-        pose = pose_of_view(run, int(numbers[i]))
-        texts = {"rank": str(rank), "standoff": rounded(pose.standoff_mm)}
-        rows.append(pose_texts(pose) | expected_texts(run, name, pose.view) | texts)
-    return rows
+    } | script_content(joined_script(SCRIPTS))
 
 
 def _set_words(run: Run, entry: ViewSetEntry) -> dict[str, Any]:
     lines = []
     for name, limit in entry.limits.items():
         unit = run.about.measurements[name].unit if name in run.about.measurements else ""
-        u = entry.uncertainty.get(name)
         reach = "" if entry.feasible.get(name, True) else ": not reached, even with all views together"
-        lines.append(
-            f"{name}: {quantity(u, unit)}, limit {quantity(limit, unit)}{reach}" + _confirmed_words(entry, name)
-        )
-    minimal = "proven" if entry.exact else "not proven: a smaller set may exist"
+        line = f"{name}: {quantity(entry.uncertainty.get(name), unit)}, limit {quantity(limit, unit)}{reach}"
+        lines.append(line + _confirmed_words(entry, name))
     return {
         "views": entry.views,
         "limits": lines,
-        "exact": minimal,
+        "exact": "proven" if entry.exact else "not proven: a smaller set may exist",
         "joined": entry.joined,
         "tried": [_tried_words(tried) for tried in entry.tried if set(tried.views) != set(entry.views)],
     }
 
 
 def _tried_words(tried: TriedEntry) -> str:
-    """Describe a set that was measured and not chosen."""
     excess = "a measurement without a value" if tried.excess is None else f"{two_digits(tried.excess)} times a limit"
-    views = f"{len(tried.views)} view{'s' if len(tried.views) > 1 else ''} ({', '.join(map(str, tried.views))})"
-    return f"also measured: {views}, {excess}"
+    return f"also measured: {views_in_words(tried.views)}, {excess}"
 
 
 def _confirmed_words(entry: ViewSetEntry, name: str) -> str:
-    """Describe the result of the virtual measurements of the set."""
     confirmed = entry.confirmed.get(name)
     if confirmed is None:
         return ""

@@ -45,7 +45,7 @@ def test_the_bar_is_green_only_if_something_fits_and_nothing_is_lost(results, to
 
 
 def screen(*reasons: Reason) -> FirstScreen:
-    return FirstScreen(reasons, "bad", [], None, [], {})
+    return FirstScreen(reasons, "bad")
 
 
 def test_a_headline_has_four_names_at_most_and_the_fold_has_all():

@@ -23,6 +23,7 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.report import view_clouds
 from mitsim.report.page import _rolls, _standoffs, write_report
+from mitsim.report.templates import joined_script
 from mitsim.report.view_clouds import (
     CoordinateRaster,
     box_around,
@@ -33,7 +34,7 @@ from mitsim.report.view_clouds import (
 )
 from mitsim.report.view_data import sites, target
 from mitsim.report.view_figures import uncertainty_figure
-from mitsim.report.view_sphere import LEAST_CHANCE, page_script, view_sphere
+from mitsim.report.view_sphere import LEAST_CHANCE, SCRIPTS, view_sphere
 from mitsim.study.run_folder import read_run
 from tests.report.conftest import CHECKED, FEATURES, MEASUREMENTS
 from tests.report.test_page import Tags
@@ -120,7 +121,7 @@ def test_table_without_scripts_has_the_best_views_in_order(text):
 def test_only_the_one_script_of_the_page_may_run_and_it_is_the_projects(text):
     found = re.findall(r"<script([^>]*)>(.*?)</script>", text, re.DOTALL)
     running = [body for attributes, body in found if not attributes]
-    assert running == [page_script()]
+    assert running == [joined_script(SCRIPTS)]
     assert {re.search('type="([^"]+)"', a)[1] for a, _ in found if a} == {"application/json", "text/plain"}
     digest = base64.b64encode(hashlib.sha256(running[0].encode()).digest()).decode()
     assert html.unescape(text).count(f"script-src 'sha256-{digest}'\">") == 1
@@ -133,21 +134,21 @@ def test_nothing_is_fetched_and_nothing_is_made_into_markup(text):
     assert all(r.startswith(("#", "data:image/png;base64,")) for r in references)
     assert not re.search(r"https?://|@import|url\((?!#)", text)
     refused = r"fetch\(|XMLHttp|WebSocket|import\(|eval\(|innerHTML|document\.write|Function\("
-    assert not re.search(refused, page_script())
+    assert not re.search(refused, joined_script(SCRIPTS))
     assert "plane<i>" not in text and "<b>$" not in text
-    assert "<!--" not in page_script() and "</" not in page_script()
+    assert "<!--" not in joined_script(SCRIPTS) and "</" not in joined_script(SCRIPTS)
 
 
 def test_every_name_that_the_script_looks_for_is_there_once(text):
     tags = Tags(text)
     ids = [a["id"] for _, a in tags.tags if "id" in a]
     assert all(ids.count(name) == 1 for name in ids if name.startswith("sphere"))
-    wanted = {f"sphere-{name}" for name in re.findall(r"place\('([a-z-]+)'\)", page_script())}
-    listed = re.search(r"\[('title'.*?)\]", page_script())[1]  # the panel's places
+    wanted = {f"sphere-{name}" for name in re.findall(r"place\('([a-z-]+)'\)", joined_script(SCRIPTS))}
+    listed = re.search(r"\[('title'.*?)\]", joined_script(SCRIPTS))[1]  # the panel's places
     wanted |= {f"sphere-{name}" for name in re.findall(r"'([a-z-]+)'", listed)}
     assert len(wanted) > 15 and wanted <= set(ids)
     acts = {a["data-act"] for _, a in tags.tags if "data-act" in a}
-    assert acts == set(re.findall(r"'((?:sphere|seen)-\w+)': ", page_script())) and len(acts) == 6
+    assert acts == set(re.findall(r"'((?:sphere|seen)-\w+)': ", joined_script(SCRIPTS))) and len(acts) == 6
 
 
 def test_pictures_and_buttons_can_be_reached_and_have_names(text):

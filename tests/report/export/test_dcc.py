@@ -86,7 +86,7 @@ FORMS = {
 
 
 def declared():
-    first = FirstScreen([Reason("fits")], "good", [], None, [], {})
+    first = FirstScreen([Reason("fits")], "good")
     facts = [("Varied", "pose"), ("Left out", "coatings"), ("Exposure", ""), ("Decision rule", "simple acceptance")]
     return Declaration(
         "sensor measures part", "2026-11-27", "0123456789abcdef", first, [], facts, [Note("Error = a − b.")]
