@@ -36,8 +36,8 @@ def best_views(scores: xr.Dataset, measurement: str, count: int, shapes: Sequenc
         return f"{title}\n  {why_no_view(scores, measurement, shapes)}\n"
     rows = [_HEAD, *(_row(measured, int(v), tolerance) for v in ranked[:count])]
     *columns, limits = zip(*rows, strict=True)
-    columns = [[text.rjust(max(map(len, column))) for text in column] for column in columns]
-    return "\n".join([title, *map("  ".join, zip(*columns, limits, strict=True)), ""])
+    padded = [[text.rjust(max(map(len, column))) for text in column] for column in columns]
+    return "\n".join([title, *map("  ".join, zip(*padded, limits, strict=True)), ""])
 
 
 def _row(measured: xr.Dataset, view: int, tolerance: float) -> tuple[str, ...]:

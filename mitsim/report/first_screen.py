@@ -292,7 +292,8 @@ def sensor_rows(choice: ChoiceDocument, sensor_entry: SensorEntry) -> list[Resul
 def _run_row(run: Run, view_scores: xr.Dataset, name: str, measurement: StatedMeasurement) -> ResultRow:
     """Return the row of a measurement of a run; ``view_scores`` are the scores of the stated view."""
     entry, decision, largest = run.about.measurements[name], measurement.decision, largest_line(measurement.budget)
-    limited, feature = limit_words(here := view_scores.sel(measurement=name)), str(here["limiting_feature"].values)
+    here = view_scores.sel(measurement=name)
+    limited, feature = limit_words(here), str(here["limiting_feature"].values)
     points = float(view_scores["n"].sel(feature=feature)) if feature in view_scores["feature"].values else None
     return RowValues(
         name=name,

@@ -103,7 +103,8 @@ def colour_scale(figure: Figure, shown: Any, axes: Any, label: str, **options: A
     figure, shown, axes, label, options
         Of :meth:`matplotlib.figure.Figure.colorbar`.
     """
-    bar = figure.colorbar(shown, ax=axes, label=label, **({"extend": "both", "pad": 0.01} | options))
+    options = {"extend": "both", "pad": 0.01, **options}
+    bar = figure.colorbar(shown, ax=axes, label=label, **options)
     bar.outline.set_visible(False)  # type: ignore[operator]
     return bar
 

@@ -153,8 +153,8 @@ def expected_result(name: str, asked: Measurement, stated: StatedMeasurement, vi
     task = asked.kind, asked.features, asked.unit, asked.nominal, asked.tolerance
     uncertainty = stated.bias, stated.bias_uncertainty, stated.standard_uncertainty
     counts = stated.trials, stated.without_value, stated.verdict
-    ends = *stated.interval, stated.errors_of, *(accepted or (None, None))
-    return ExpectedResult(name, *task, view, expected, *uncertainty, low, high, *counts, *ends)
+    errors, readings = (*stated.interval, stated.errors_of), accepted or (None, None)
+    return ExpectedResult(name, *task, view, expected, *uncertainty, low, high, *counts, *errors, *readings)
 
 
 def _part_value(asked: Measurement, errors_of: str) -> float | None:

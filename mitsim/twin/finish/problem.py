@@ -228,5 +228,6 @@ class Problem:
         """Return the residuals of each view."""
         pixels = self.pixels(values)
         of_blocks = (self.measured, self.means(pixels), np.sqrt(variance))
-        split = (np.split(numbers, self.starts[1:-1]) for numbers in of_blocks)
-        return tuple(map(Residual, self.views, *split, self._of_views(pixels)))
+        measured, predicted, sigma = (np.split(numbers, self.starts[1:-1]) for numbers in of_blocks)
+        by_view = zip(self.views, measured, predicted, sigma, self._of_views(pixels), strict=True)
+        return tuple(Residual(*row) for row in by_view)

@@ -187,7 +187,7 @@ def fit_captures(
     block = block_px or (KNOWN_BLOCK_PX if first.decoding.pattern == chosen.pattern else UNKNOWN_BLOCK_PX)
 
     views, dots, specimens = list[CouponView](), list[Dots](), list[Specimen]()
-    calibration, unknown, digests = None, False, dict[str, str]()
+    calibration, unknown, digests = dict[str, Any](), False, dict[str, str]()
     for index, folder in enumerate(track(list(captures), "captures", len(captures))):
         capture = read_capture(folder)
         if capture.sensor != first.sensor:
