@@ -106,9 +106,8 @@ def acceptance(
         beside = beside_simulated(input_clouds[0], targets, simulated, figures, seed)
     if as_json:
         whose = [(input_cloud.path, input_cloud.cloud.sensor, input_cloud.cloud.source) for input_cloud in input_clouds]
-        document = measured_document(whose, results, over) | {
-            "all_clouds": [result_values(result) for result in together]
-        }
+        document = measured_document(whose, results, over)
+        document |= {"all_clouds": [result_values(result) for result in together]}
         if beside is not None:
             document |= {"beside": beside_document(simulated or "", *beside)}
         print(json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False))

@@ -50,10 +50,7 @@ class Artefacts:
 
 
 def read_artefacts(planes: Sequence[str], spheres: Sequence[str], spacings: Sequence[str]) -> Artefacts:
-    """Read the texts of ``--plane``, ``--sphere`` and ``--spacing``.
-
-    Raises InputError if a text cannot be read. The error names the option and the allowed form.
-    """
+    """Read the texts of ``--plane``, ``--sphere`` and ``--spacing``; InputError with option and allowed form."""
     targets: dict[str, tuple[Roi | None, float | None]] = {}
     for text in planes:
         name, window, distance = parse_window("--plane", text, (0, 1, 4, 5), _PLANE, targets)
@@ -88,12 +85,7 @@ def cloud_figures(cloud: PointCloud, artefacts: Artefacts, baseline_mm: float | 
     - Sphere: form error PF and size error PS [mm].
     - Spacing: spacing error SD [mm].
 
-    Flatness and form errors have the standard uncertainty of a repeated capture, conditional on the form that was read
-    (:mod:`characterisation.acceptance.range_uncertainty`).
-
-    Definitions and sources: :mod:`characterisation.acceptance.vdi_2634` and
-    :mod:`characterisation.acceptance.depth_quality`. A figure that cannot be computed has no value, but a reason.
-    Raises InputError if a window does not lie in the grid.
+    A figure that cannot be computed has no value, but a reason. Raises InputError if a window does not lie in the grid.
     """
     out: list[Result] = []
     for name, (window, distance) in artefacts.planes.items():
@@ -108,15 +100,13 @@ def cloud_figures(cloud: PointCloud, artefacts: Artefacts, baseline_mm: float | 
             out += [failed(label, "mm", str(unfit), len(points), count) for label in labels]
             continue
         uncertainty = form_error_uncertainty(points, error.centre)
-        out.append(_result(labels[0], "mm", error.form, uncertainty, len(points), count))
+        out.append(figure_or_reason(labels[0], "mm", error.form, "", len(points), count, uncertainty))
         out.append(Result(labels[1], "mm", error.size, points=len(points), points_given=count))
     for first, second, distance in artefacts.spacings:
-        first_points, second_points = (
-            window_points(artefacts.spheres[name][0], cloud, name) for name in (first, second)
-        )
-        label, count = f"{first}-{second} spacing error SD", len(first_points) + len(second_points)
+        both = [window_points(artefacts.spheres[name][0], cloud, name) for name in (first, second)]
+        label, count = f"{first}-{second} spacing error SD", sum(map(len, both))
         try:
-            out.append(Result(label, "mm", sphere_spacing_error(first_points, second_points, distance), points=count))
+            out.append(Result(label, "mm", sphere_spacing_error(*both, distance), points=count))
         except InputError as unfit:
             out.append(failed(label, "mm", str(unfit), count))
     return out
@@ -125,26 +115,19 @@ def cloud_figures(cloud: PointCloud, artefacts: Artefacts, baseline_mm: float | 
 def joint_figures(clouds: Sequence[PointCloud], artefacts: Artefacts) -> list[Result]:
     """Return the figures of every plane that need two or more captures of one pose.
 
-    Temporal noise [mm] over the window; global planarity trueness [mm]; with a distance mean depth error [%].
-    Definitions and sources: :mod:`characterisation.acceptance.depth_quality`. Raises
+    Temporal noise [mm] over the window; global planarity trueness [mm]; with a distance mean depth error [%]. Raises
     InputError if there are fewer than two clouds, their grids differ in size, or a window does not lie in the grid.
     """
     out: list[Result] = []
     for name, (window, distance) in artefacts.planes.items():
         region = _mask(clouds[0], window_slices(window, clouds[0], name))
         noise, reason = typical_temporal_noise(clouds, region), "no pixel has a point in two of the clouds"
-        out += [
-            _figure_or_reason(f"{name} temporal noise", "mm", noise, reason),
-            _figure_or_reason(
-                f"{name} global planarity trueness",
-                "mm",
-                global_planarity_trueness(clouds, region),
-                "fewer than 4 pixels have a point in every cloud",
-            ),
-        ]
+        out.append(figure_or_reason(f"{name} temporal noise", "mm", noise, reason))
+        trueness, reason = global_planarity_trueness(clouds, region), "fewer than 4 pixels have a point in every cloud"
+        out.append(figure_or_reason(f"{name} global planarity trueness", "mm", trueness, reason))
         if distance is not None:
             error = mean_depth_error(clouds, _perpendicular_plane(clouds[0], distance), region)
-            out.append(_figure_or_reason(f"{name} mean depth error", "%", error, "a cloud has too few points"))
+            out.append(figure_or_reason(f"{name} mean depth error", "%", error, "a cloud has too few points"))
     return out
 
 
@@ -168,35 +151,25 @@ def _plane_figures(
         values["Z accuracy", "%"] = quality.z_accuracy if enough else np.nan
     if baseline_mm is not None:
         values["sub-pixel RMS", "px"] = quality.subpixel_rms if enough else np.nan
-    too_few = f"{len(points)} points in the window, at least {LEAST_POINTS} are needed"
-    holes = "no patch of 9 x 9 pixels has all points"
-    on_edge = "the least-squares plane of the points stands on edge: too many false matches for these figures"
+    reason = f"{len(points)} points in the window, at least {LEAST_POINTS} are needed"
+    reasons = {"local planarity precision": "no patch of 9 x 9 pixels has all points"} if enough else {}
+    if enough:
+        reason = "the least-squares plane of the points stands on edge: too many false matches for these figures"
     uncertainty = {"flatness error": flatness_uncertainty(points)} if enough else {}
-    return [
-        _figure_or_reason(
-            f"{name} {quantity}",
-            unit,
-            value,
-            too_few if not enough else holes if quantity == "local planarity precision" else on_edge,
-            len(points),
-            count,
-            uncertainty.get(quantity, math.nan),
-        )
-        for (quantity, unit), value in values.items()
-    ]
+    out = []
+    for (quantity, unit), value in values.items():
+        why, u = reasons.get(quantity, reason), uncertainty.get(quantity, math.nan)
+        out.append(figure_or_reason(f"{name} {quantity}", unit, value, why, len(points), count, u))
+    return out
 
 
-def _figure_or_reason(
+def figure_or_reason(
     name: str, unit: str, value: float, reason: str, points: int = 0, count: int = 0, uncertainty: float = math.nan
 ) -> Result:
     """Return the result of a figure, or the reason why it has no value."""
-    if np.isfinite(value):
-        return _result(name, unit, float(value), uncertainty, points, count)
-    return failed(name, unit, reason, points, count)
-
-
-def _result(name: str, unit: str, value: float, uncertainty: float, points: int, count: int) -> Result:
-    return Result(name, unit, value, uncertainty, "fit" if math.isfinite(uncertainty) else "none", points, count)
+    if not math.isfinite(value):
+        return failed(name, unit, reason, points, count)
+    return Result(name, unit, float(value), uncertainty, "fit" if math.isfinite(uncertainty) else "none", points, count)
 
 
 def _perpendicular_plane(cloud: PointCloud, distance: float) -> Coupon:

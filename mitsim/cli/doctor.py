@@ -22,20 +22,8 @@ from mitsim.scene import backend
 Verdict = Literal["ok", "missing", "absent"]
 
 _PACKAGES = (
-    "mitsuba",
-    "drjit",
-    "numpy",
-    "scipy",
-    "xarray",
-    "netCDF4",
-    "opencv-contrib-python-headless",
-    "trimesh",
-    "pydantic",
-    "typer",
-    "rich",
-    "jinja2",
-    "matplotlib",
-    "OpenEXR",
+    "mitsuba drjit numpy scipy xarray netCDF4 opencv-contrib-python-headless trimesh pydantic typer rich jinja2 "
+    "matplotlib OpenEXR"
 )
 _OPTIONAL = {
     "pyserial": "pan-tilt tables",
@@ -85,7 +73,7 @@ def doctor(json: options.Json = False) -> None:
 
     Example: mitsim doctor
     """
-    findings = examine()
+    findings = [*_software(), *_renderer(), *_optional()]
     if json:
         print(json_module.dumps([asdict(finding) for finding in findings], indent=2))
     else:
@@ -97,17 +85,12 @@ def doctor(json: options.Json = False) -> None:
         raise typer.Exit(3)
 
 
-def examine() -> list[MachineFinding]:
-    """Check everything that mitsim needs or can use."""
-    return [*_software(), *_renderer(), *_optional()]
-
-
 def _software() -> list[MachineFinding]:
     out = [
         MachineFinding("mitsim", "ok", __version__),
         MachineFinding("python", "ok", f"{platform.python_version()} on {platform.platform()}, {os.cpu_count()} cores"),
     ]
-    for name in _PACKAGES:
+    for name in _PACKAGES.split():
         missing = MachineFinding(name, "missing", "not installed", f"pip install {name}")
         out.append(MachineFinding(name, "ok", version) if (version := _version(name)) else missing)
     return out

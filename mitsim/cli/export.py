@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -12,9 +12,6 @@ from characterisation.files.errors import InputError
 from characterisation.words.numbers import how_many
 from characterisation.words.progress import say
 from mitsim.cli import options
-
-if TYPE_CHECKING:
-    from characterisation.point_cloud import PointCloud
 
 #: file name suffixes that each command accepts
 CLOUD_SUFFIXES = (".ply", ".pcd", ".e57", ".mcap")
@@ -43,6 +40,8 @@ def cloud(
 
     Example: mitsim export cloud runs/two_pillars/clouds/predicted_0012.ply -o cloud.pcd
     """
+    import numpy as np
+
     from characterisation.cloud_files import read_cloud
     from mitsim.report.export.cloud_points import cloud_points
     from mitsim.report.export.cloud_writers import write_cloud_pcd, write_cloud_ply
@@ -76,7 +75,8 @@ def cloud(
             write_cloud_ply(points, output)
         else:
             write_cloud_pcd(points, output, part_from_sensor)
-    say(f"cloud: {output}: {_counted(read)}")
+    with_sigma = 0 if read.sigma is None else int(np.isfinite(read.sigma[read.valid]).sum())
+    say(f"cloud: {output}: {int(read.valid.sum())} points, {with_sigma} of them with a covariance")
 
 
 def run(
@@ -102,9 +102,7 @@ def run(
     suffix = _suffix(output, RUN_SUFFIXES)
     folder = _run_in(folder)
     scene = read_run_scene(folder, views)
-    scans = [
-        (view, kind, cloud_points(point_cloud)) for view in scene.views for kind, point_cloud in view.clouds.items()
-    ]
+    scans = [(view, kind, cloud_points(cloud)) for view in scene.views for kind, cloud in view.clouds.items()]
     if suffix in (".mcap", ".e57") and not scans:
         raise InputError("--views", "", f"{views}: none of these views has a cloud", "views with clouds", "see clouds/")
     options.check_file(output)
@@ -115,11 +113,9 @@ def run(
     elif suffix == ".e57":
         write_e57([(f"{view.name}_{kind}", points, view.part_from_sensor) for view, kind, points in scans], output)
     elif suffix == ".mcap":
-        stamped = [
-            Stamped(f"/{view.name}/{kind}", f"{view.name}_optical", points, view.part_from_sensor)
-            for view, kind, points in scans
-        ]
-        write_mcap(stamped, output)
+        write_mcap(
+            [Stamped(f"/{v.name}/{kind}", f"{v.name}_optical", p, v.part_from_sensor) for v, kind, p in scans], output
+        )
     else:
         write_usd(scene, output)
     written = [how_many(len(scene.views), "view")]
@@ -272,13 +268,6 @@ def _suffix(output: Path, allowed: tuple[str, ...]) -> str:
     if output.suffix.lower() not in allowed:
         raise InputError("--output", "", output.name, f"a name that ends in {', '.join(allowed)}")
     return output.suffix.lower()
-
-
-def _counted(cloud: PointCloud) -> str:
-    import numpy as np
-
-    with_sigma = 0 if cloud.sigma is None else int(np.isfinite(cloud.sigma[cloud.valid]).sum())
-    return f"{int(cloud.valid.sum())} points, {with_sigma} of them with a covariance"
 
 
 def report(

@@ -66,15 +66,12 @@ def finish(
     for file in (output, figure):
         if file is not None:
             options.check_file(file)
-    coupon_fit = fit_captures(
-        captures, sensor, scene, options.definitions(define), block, Roi(*window) if window else None
-    )
+    roi = Roi(*window) if window else None
+    coupon_fit = fit_captures(captures, sensor, scene, options.definitions(define), block, roi)
     print(fit_table(coupon_fit), end="")
     if coupon_fit.posterior is not None:
-        print(
-            f"\n# for a study whose part has this finish and the Ra of this scene\n{coupon_fit.posterior.toml()}",
-            end="",
-        )
+        comment = "# for a study whose part has this finish and the Ra of this scene"
+        print(f"\n{comment}\n{coupon_fit.posterior.toml()}", end="")
     for remark in remarks(coupon_fit):
         say(remark)
     if output is not None:

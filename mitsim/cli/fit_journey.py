@@ -40,16 +40,8 @@ def read_journey(
 ) -> Journey:
     """Return the steps after a fit; everything that can be checked before the fit is checked.
 
-    Raises InputError if a file cannot be read, or no campaign is given.
-
-    Parameters
-    ----------
-    study, campaign
-        Study file, whose sensor and map are replaced; campaign of the map, by default the one that the study names.
-    output
-        The sensor file; map and report go to a folder of its name, beside it.
-    minutes, ask
-        Time of the run of the study [min], None until it ends by its rules; see :class:`Journey`.
+    The default campaign is the one that the study names. Map and report go to a folder beside the sensor file
+    ``output``, of its name. Raises InputError if a file cannot be read, or no campaign is given.
     """
     from mitsim.maps.campaign.campaign_file import CampaignFile
     from mitsim.study import StudyFile
@@ -66,10 +58,7 @@ def read_journey(
 
 
 def map_and_run(journey: Journey, sensor: Path) -> None:
-    """Make the map of a fitted sensor, run the study with both, and print where the report is.
-
-    Raises InputError if the campaign or the study cannot be done with this sensor.
-    """
+    """Make the map of a fitted sensor, run the study with both, and print where the report is."""
     from mitsim.report.figures import write_map_figures
     from mitsim.report.page import write_report
     from mitsim.study import StudyFile, open_study, report_doubts

@@ -20,24 +20,9 @@ if TYPE_CHECKING:
 
 #: settings of an imported capture that the user should check
 SETTINGS_TO_CHECK = (
-    "image_set",
-    "topic",
-    "stamp_s",
-    "frame_id",
-    "grid_from",
-    "unit_of_file",
-    "axes_of_file",
-    "fitted_camera_rms_px",
-    "off_the_rays_px",
-    "depth_scale_mm",
-    "measured_from",
-    "baseline_mm",
-    "spec_baseline_mm",
-    "subpixel_bits",
-    "subpixel_bits_from",
-    "bits_from",
-    "empty_bits",
-    "channel",
+    "image_set topic stamp_s frame_id grid_from unit_of_file axes_of_file fitted_camera_rms_px off_the_rays_px "
+    "depth_scale_mm measured_from baseline_mm spec_baseline_mm subpixel_bits subpixel_bits_from bits_from empty_bits "
+    "channel"
 )
 
 
@@ -156,13 +141,11 @@ def import_(
         capture = _posed(capture, coupon, str(path))
     folder = output or Path(plain_name(path.resolve().stem) + "_capture")
     say(f"{path}: {NAMES[imported.kind]}, of {capture.sensor}, {capture.technology}, {capture.source}")
-    for name in SETTINGS_TO_CHECK:
+    for name in SETTINGS_TO_CHECK.split():
         if name in capture.settings:
             say(f"  {name}: {capture.settings[name]}")
-    reference, *other_eyes = [
-        *capture.rig.cameras.values(),
-        *([capture.rig.projector] if capture.rig.projector else []),
-    ]
+    rig = capture.rig
+    reference, *other_eyes = [*rig.cameras.values(), *([rig.projector] if rig.projector else [])]
     if other_eyes and imported.kind in ("stereo-pair", "images"):
         baseline = math.dist(other_eyes[0].centre, reference.centre)
         say(f"  baseline: {baseline:.4g} mm")

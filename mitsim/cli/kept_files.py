@@ -28,13 +28,7 @@ def note_arguments(arguments: list[str]) -> None:
 
 
 def refuse_kept(file: Path) -> None:
-    """Refuse an existing file that the command reads, or that a capture or a run consists of.
-
-    Raises
-    ------
-    InputError
-        Naming the file, and whose it is.
-    """
+    """Raise InputError for an existing file that the command reads, or that a capture or a run consists of."""
     if not is_file(file):
         return
     owner = "the command reads" if any(is_file(path) and file.samefile(path) for path in _read()) else _owner(file)

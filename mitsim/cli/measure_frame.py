@@ -40,10 +40,8 @@ class MeasuringFrame:
         from mitsim.capture.workspace import written_frame
 
         if input_cloud.capture is None:
-            hint = "give the capture folder instead of its cloud"
-            raise InputError(
-                input_cloud.path, "--points-in", "a cloud, whose workspace is not known", "a capture", hint
-            )
+            found, hint = "a cloud, whose workspace is not known", "give the capture folder instead of its cloud"
+            raise InputError(input_cloud.path, "--points-in", found, "a capture", hint)
         frame = written_frame(input_cloud.capture, self.text, input_cloud.path)
         assert frame is not None  # the text is workspace
         return frame.from_sensor, f"places in the frame {frame.name}"
@@ -55,35 +53,28 @@ class MeasuringFrame:
         from mitsim.decoding.plate import image_on_grid
 
         if input_cloud.capture is None or not input_cloud.capture.images:
-            hint = "give the capture folder, which the command decodes"
-            raise InputError(
-                input_cloud.path, "--points-in", "a cloud without images", "images that show the board", hint
-            )
+            allowed, hint = "images that show the board", "give the capture folder, which the command decodes"
+            raise InputError(input_cloud.path, "--points-in", "a cloud without images", allowed, hint)
         image = image_on_grid(input_cloud.capture, input_cloud.cloud.grid)
         try:
             frame, scale, rms = board_frame(BoardCorners(columns, rows, pitch), input_cloud.cloud, image)
         except FitError as error:
-            raise InputError(
-                input_cloud.path, "--points-in", str(error), "a capture that shows the whole board"
-            ) from None
+            allowed = "a capture that shows the whole board"
+            raise InputError(input_cloud.path, "--points-in", str(error), allowed) from None
         return frame, f"places in the frame of the board: scale {scale:.5f}, corners {rms:.3g} mm from the print (rms)"
 
 
 def read_frame(text: str) -> MeasuringFrame:
-    """Read the text of ``--points-in``.
-
-    Raises InputError if it is none of the allowed.
-    """
+    """Read the text of ``--points-in``."""
     if text in ("sensor", "workspace"):
         return MeasuringFrame(text)
     if text.startswith("board="):
-        words = text.removeprefix("board=").split(",")
         try:
-            columns, rows, pitch = int(words[0]), int(words[1]), float(words[2])
-        except (ValueError, IndexError):
-            columns = rows = 0
-            pitch = 0.0
-        if len(words) != 3 or not (3 <= columns <= 100 and 3 <= rows <= 100 and 0 < pitch < 1e4):
+            first, second, last = text.removeprefix("board=").split(",")
+            columns, rows, pitch = int(first), int(second), float(last)
+        except ValueError:
+            columns, rows, pitch = 0, 0, 0.0
+        if not (3 <= columns <= 100 and 3 <= rows <= 100 and 0 < pitch < 1e4):
             allowed = "board=COLUMNS,ROWS,PITCH: 3 to 100 inner corners, and their pitch over 0 mm"
             raise InputError("--points-in", "", repr(text), allowed)
         return MeasuringFrame(text, (columns, rows, pitch))

@@ -5,6 +5,7 @@ Signal chain: texts of the options -> windows and plates, checked -> results and
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -67,13 +68,8 @@ class Request:
     ) -> tuple[list[Result], Callable[[], Figure]]:
         """Return the results of a cloud, and a function that draws its picture.
 
-        ``reference`` is the reference cloud of a difference, None without one; ``frame`` (4, 4), from the sensor frame,
-        that of positions and directions.
-
-        Raises
-        ------
-        InputError
-            If a window does not lie in the cloud's grid, or dots are requested of a cloud without images.
+        ``frame`` (4, 4), from the sensor frame, is that of positions and directions. Raises InputError if a window does
+        not lie in the cloud's grid, or dots are requested of a cloud without images.
         """
         cloud = input_cloud.cloud
         results = measure_windows(cloud, self.plan, frame)
@@ -97,10 +93,9 @@ class Request:
     def _difference(self, input_cloud: InputCloud, reference: InputCloud) -> NDArray[np.float64]:
         """Return the difference (H, W) [mm] of a cloud from the reference, NaN outside the window."""
         cloud, other = input_cloud.cloud, reference.cloud
-        rays = self.by == "rays" or (self.by == "auto" and cloud.grid.same_rays(other.grid))
         inside = window_slices(self.window, cloud, "difference")
         out = np.full(cloud.status.shape, np.nan)
-        if rays:
+        if self.by == "rays" or (self.by == "auto" and cloud.grid.same_rays(other.grid)):
             out[inside] = difference_along_rays(cloud, other, inside)
         else:
             progress = partial(track_if_long, label="difference, blocks of points")
@@ -129,20 +124,10 @@ def read_request(
     by: str,
     window: tuple[int, int, int, int] | None,
 ) -> Request:
-    """Read the texts of options into a request.
+    """Read the texts of options into a request; raise InputError with the option and the allowed form.
 
-    Raises InputError if a text cannot be read. The error names the option and the allowed form.
-
-    Parameters
-    ----------
-    features, between
-        Texts ``NAME=COLUMN,ROW,WIDTH,HEIGHT`` [px], or ``NAME``, by shape; ``NAME,NAME`` by kind of measurement.
-    plates, bright
-        Texts ``NAME=COLUMN,ROW,WIDTH,HEIGHT,PITCH`` [px, mm], or ``NAME=PITCH``; whether dots are brighter than the
-        plate.
-    against, by, window
-        Path of the reference cloud of a difference, None without one; its direction, one of :data:`DIRECTIONS`; its
-        window [px], None for the whole grid.
+    ``features`` are texts by shape, ``between`` by kind of measurement. ``bright``: whether dots are brighter than the
+    plate. ``against``, ``by`` and ``window`` [px] are of a difference: its reference cloud, direction and window.
     """
     named: dict[str, tuple[Shape, Roi | None]] = {}
     for shape, texts in features.items():
@@ -174,7 +159,7 @@ def read_request(
 
 def _difference_results(difference: Difference) -> list[Result]:
     """Return the results of a difference, without uncertainties, because its points are not independent."""
-    result = partial(Result, unit="mm", points=difference.count, points_given=difference.points_given)
+    counts = difference.count, difference.points_given
     values = {
         "mean": difference.mean,
         "median": difference.median,
@@ -185,10 +170,8 @@ def _difference_results(difference: Difference) -> list[Result]:
     }
     if difference.count < 2:
         reason = f"only {difference.count} of {difference.points_given} points have a counterpart in the reference"
-        return [
-            failed(f"difference {name}", "mm", reason, difference.count, difference.points_given) for name in values
-        ]
-    return [result(f"difference {name}", value=value) for name, value in values.items()]
+        return [failed(f"difference {name}", "mm", reason, *counts) for name in values]
+    return [Result(f"difference {name}", "mm", value, math.nan, "none", *counts) for name, value in values.items()]
 
 
 def parse_window(
@@ -196,20 +179,9 @@ def parse_window(
 ) -> tuple[str, Roi | None, float | None]:
     """Return name, window and length of a text such as ``name=200,150,300,200,600``.
 
-    Raises InputError if the text has another form, the name is in use, or the window is not one.
-
-    Parameters
-    ----------
-    option, text, allowed
-        The option, its text, and its form for the error.
-    counts
-        How many numbers are allowed: four are the window [px], one more or one alone is the length.
-    used_names
-        Names that are in use.
-
-    Returns
-    -------
-    The window is None for the whole grid, the length is None without one.
+    ``counts`` are the allowed numbers of numbers: four are the window [px], one more or one alone is the length. The
+    window is None for the whole grid, the length None without one. ``allowed`` is the form for the error. Raises
+    InputError if the text has another form, the name is in use, or the window is not one.
     """
     name, _, numbers_text = text.partition("=")
     try:

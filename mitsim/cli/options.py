@@ -149,9 +149,7 @@ class Group(TyperGroup):
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the list of the commands."""
         named = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
-        rows = [
-            (name, command.get_short_help_str(limit=1000)) for name, command in named if command and not command.hidden
-        ]
+        rows = [(name, one.get_short_help_str(limit=1000)) for name, one in named if one and not one.hidden]
         with formatter.section("Commands"):
             formatter.write_dl(rows)
 
@@ -177,9 +175,8 @@ class DefaultCommandGroup(Group):
 
 def command_group(words: str, *commands: Callable[..., None], default: bool = False) -> typer.Typer:
     """Return a group of commands with its help; with ``default``, the first one runs if none is named."""
-    group = typer.Typer(
-        cls=DefaultCommandGroup if default else Group, no_args_is_help=True, rich_markup_mode=None, help=words
-    )
+    kind = DefaultCommandGroup if default else Group
+    group = typer.Typer(cls=kind, no_args_is_help=True, rich_markup_mode=None, help=words)
     for command in commands:
         group.command(name=command.__name__.rstrip("_"), cls=Command)(command)
     return group
@@ -193,10 +190,9 @@ def start(variant: str | None) -> None:
 
 
 def refuse_unused(context: typer.Context, found: str, allowed: str, *names: str) -> None:
-    """Refuse options of the running command that the user gave although they have no effect.
+    """Raise InputError for the first of the parameters ``names`` that is on the command line but has no effect.
 
-    ``found`` and ``allowed`` say why the parameters ``names`` have no effect, such as ``no --task``, and what gives
-    them one. Raises InputError for the first of them that is on the command line, whatever its value.
+    ``found`` and ``allowed`` say why they have no effect, such as ``no --task``, and what gives them one.
     """
     for parameter in context.command.params:
         source = context.get_parameter_source(parameter.name or "")
@@ -207,9 +203,7 @@ def refuse_unused(context: typer.Context, found: str, allowed: str, *names: str)
 def requested_workers(scheduler: str | None, processes: int) -> Executor | None:
     """Return the workers of a scheduler, or processes on this machine; None if this process works alone.
 
-    ``processes`` of 0 means as many as cores and memory allow, or one on a CUDA device, which it uses completely. A
-    scheduler has workers of its own. Raises InputError if both are given, or the address of the scheduler is not valid.
-    Raises MissingEnvironmentError if no scheduler answers.
+    ``processes`` of 0 means as many as cores and memory allow, or one on a CUDA device, which it uses completely.
     """
     from mitsim.running import executor
     from mitsim.running.cluster import Cluster
@@ -225,15 +219,7 @@ def requested_workers(scheduler: str | None, processes: int) -> Executor | None:
 
 
 def pose_of(position: tuple[float, float, float], target: tuple[float, float, float], roll: float, sensor: Any) -> Any:
-    """Return ``world_from_sensor``.
-
-    Parameters
-    ----------
-    position, target
-        Position of the reference camera, and the point that it looks at [mm].
-    roll, sensor
-        Rotation about the view axis [deg], and the sensor.
-    """
+    """Return ``world_from_sensor`` of a sensor whose reference camera looks from a position at a target [mm]."""
     import numpy as np
 
     from mitsim.sensor.poses import look_at
@@ -293,8 +279,7 @@ def keep_finished(folder: Path, overwrite: bool, last: str) -> None:
     """Check that a folder holds no finished run; ``last`` is the file that a run writes at its end.
 
     A run that ended for lack of time says so in the file, and goes on. The command that writes the new run removes the
-    file (:func:`mitsim.study.run_files.claim_folder`), or moves it away with the other files of its run: an interrupted
-    run must not look finished. Raises InputError if the file exists and ``overwrite`` is false.
+    file (:func:`mitsim.study.run_files.claim_folder`): an interrupted run must not look finished.
     """
     if not overwrite and (folder / last).exists() and _is_finished(folder / last):
         hint = "to repeat the run, add --overwrite (it reuses finished trials); to rewrite its page, use mitsim report"

@@ -107,8 +107,7 @@ def check(
         from mitsim.report.author_page import author_page
 
         options.check_file(html)
-        text = author_page(checked)
-        write_text(html, text)
+        write_text(html, author_page(checked))
         say(f"page: {html}")
     if json:
         about = {"scene": checked.scene.where, "sensor": chosen.name, "world_from_sensor": placed.matrix().tolist()}
@@ -253,14 +252,12 @@ def _edit(scene: Path, sensor: str | None, port: int) -> None:
 
     authored()  # report errors in the scene before serving the page
     names = {"scene": scene.name, "task": task.name, "study": "study.toml"}
+
+    def page(token: str) -> str:
+        return author_page(authored(), token)
+
     try:
-        server = AuthorServer(
-            scene.parent,
-            names,
-            lambda token: author_page(authored(), token),
-            lambda: findings_data(authored().findings),
-            port,
-        )
+        server = AuthorServer(scene.parent, names, page, lambda: findings_data(authored().findings), port)
     except OSError as error:
         raise InputError("--port", "", f"{port} ({error})", "a free port, or 0") from None
     print(server.address, flush=True)

@@ -146,23 +146,9 @@ for name, group in {
 
 #: errors of the system for a path that does not exist or may not be read or written
 _OF_THE_USER = frozenset(
-    {
-        errno.ENAMETOOLONG,
-        errno.EACCES,
-        errno.EPERM,
-        errno.EROFS,
-        errno.EISDIR,
-        errno.ENOTDIR,
-        errno.ELOOP,
-        errno.ENOENT,
-        errno.EEXIST,
-        errno.ENOTEMPTY,
-        errno.ENXIO,
-        errno.ETXTBSY,
-        errno.EMFILE,
-    }
+    {errno.EACCES, errno.EPERM, errno.EROFS, errno.ETXTBSY, errno.EMFILE, errno.ENXIO, errno.ENAMETOOLONG, errno.ELOOP}
+    | {errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENOTEMPTY}
 )
-
 
 #: exit code of an interrupted command: 128 plus the number of SIGINT
 _STOPPED = 130
@@ -177,10 +163,7 @@ def main() -> None:
 
 
 def run_application(app: typer.Typer) -> None:
-    """Run commands; errors that users can correct end with a message and an exit code, not a traceback.
-
-    A bug ends with its traceback, and with an exit code that differs from that of a failed check.
-    """
+    """Run commands; errors that users can correct end with a message and an exit code, a bug with its traceback."""
     keep_blas_to_one_thread()
     _prepare_streams()
     _stop_as_by_hand()
@@ -211,8 +194,8 @@ def run_application(app: typer.Typer) -> None:
             code = _bug()
     except Exception:
         code = _bug()
-    if code:
-        _kill_workers()
+    for process in multiprocessing.active_children() if code else ():
+        process.kill()  # without a result: the interpreter would wait for their orders
     sys.exit(_flushed(code))
 
 
@@ -221,12 +204,6 @@ def _end(code: int, text: str) -> int:
     with suppress(OSError, ValueError):
         print(f"mitsim: {printable(text)}", file=sys.stderr, flush=True)
     return code
-
-
-def _kill_workers() -> None:
-    """End the worker processes of a command without a result: the interpreter would wait for their orders."""
-    for process in multiprocessing.active_children():
-        process.kill()
 
 
 def _bug() -> int:

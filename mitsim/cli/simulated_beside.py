@@ -19,6 +19,7 @@ from characterisation.region_of_interest import Roi
 from characterisation.tasks.result import Result, failed
 from characterisation.words.numbers import aligned
 from characterisation.words.progress import say
+from mitsim.cli.acceptance_request import figure_or_reason
 from mitsim.decoding.input_clouds import InputCloud
 from mitsim.decoding.measured_document import number_with_decimals, uncertainty_text
 from mitsim.sensor.fitted_to import shows_the_fit
@@ -47,13 +48,6 @@ def beside_simulated(
     """Return the figures of every target in the recorded and in the simulated cloud, in the same order.
 
     Raises InputError if the sensor is not known, or does not see a target.
-
-    Parameters
-    ----------
-    input_cloud, targets, sensor
-        The recorded cloud, planes and spheres by name, and preset or sensor file to simulate.
-    figures, seed
-        Function that states the figures of a target; seed of the noise.
     """
     from mitsim.sensor.preset import load_sensor
     from mitsim.twin.compare.target_twin import seen_target, simulated_target
@@ -65,14 +59,12 @@ def beside_simulated(
     preset.require("simulation")
     if input_cloud.capture is None and preset.fitted_to:
         names = ", ".join(fit.name for fit in preset.fitted_to[:3]) + ", ..." * (len(preset.fitted_to) > 3)
-        say(
-            f"warning: {preset.name} was fitted to {names}: if {input_cloud.path} is of one of these, this shows the "
-            "fit"
-        )
-    elif fitted := shows_the_fit(
-        preset.fitted_to, input_cloud.capture.images if input_cloud.capture else {}, preset.name
-    ):
-        say(f"warning: {fitted}")
+        doubt = f"{preset.name} was fitted to {names}: if {input_cloud.path} is of one of these, this shows the fit"
+    else:
+        images = input_cloud.capture.images if input_cloud.capture else {}
+        doubt = shows_the_fit(preset.fitted_to, images, preset.name)
+    if doubt:
+        say(f"warning: {doubt}")
     real: list[Result] = []
     twin: list[Result] = []
     for name, target in targets.items():
@@ -100,17 +92,12 @@ def _with_coupon(
         pooled = overall(measure_coupon(cloud, window=region))
     except InputError as error:
         return [failed(f"{name} F", "1", str(error)), failed(f"{name} sigma", "mm", str(error)), *results]
+    few = "too few points in every disc"
     return [
-        _pooled(f"{name} F", "1", pooled.fraction, pooled.fraction_error),
-        _pooled(f"{name} sigma", "mm", pooled.sigma, pooled.sigma_error),
+        figure_or_reason(f"{name} F", "1", pooled.fraction, few, uncertainty=pooled.fraction_error),
+        figure_or_reason(f"{name} sigma", "mm", pooled.sigma, few, uncertainty=pooled.sigma_error),
         *results,
     ]
-
-
-def _pooled(name: str, unit: str, value: float, error: float) -> Result:
-    if not math.isfinite(value):
-        return failed(name, unit, "too few points in every disc")
-    return Result(name, unit, value, error, "fit" if math.isfinite(error) else "none")
 
 
 def beside_table(recorded: Sequence[Result], simulated: Sequence[Result], sensor: str) -> str:
@@ -119,17 +106,12 @@ def beside_table(recorded: Sequence[Result], simulated: Sequence[Result], sensor
     for result, other in zip(recorded, simulated, strict=True):
         both = result.possible and other.possible and abs(result.value) > _ROUNDING * abs(other.value)
         ratio = other.value / result.value if both else math.nan
-        rows.append(
-            [
-                result.name,
-                number_with_decimals(result.value, result.uncertainty),
-                uncertainty_text(result.uncertainty),
-                number_with_decimals(other.value, other.uncertainty),
-                uncertainty_text(other.uncertainty),
-                result.unit,
-                f"{ratio:.3g}" if math.isfinite(ratio) else "-",
-            ]
-        )
+        numbers = [
+            text
+            for one in (result, other)
+            for text in (number_with_decimals(one.value, one.uncertainty), uncertainty_text(one.uncertainty))
+        ]
         reason = result.reason or other.reason
-        rows[-1] += [f"not possible: {reason}"] if reason else []
+        row = [result.name, *numbers, result.unit, f"{ratio:.3g}" if math.isfinite(ratio) else "-"]
+        rows.append([*row, *([f"not possible: {reason}"] if reason else [])])
     return "\n".join(aligned(rows))

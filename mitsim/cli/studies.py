@@ -131,9 +131,8 @@ def choose(
     done = read_choice(output)
     if done is not None and done.finished:
         options.keep_finished(output, overwrite, CHOICE)
-    candidates, excluded = read_candidates(
-        study, [sensors], options.asking(yes, " (and likewise for every other sensor)")
-    )
+    ask = options.asking(yes, " (and likewise for every other sensor)")
+    candidates, excluded = read_candidates(study, [sensors], ask)
     candidates = [replace(candidate, study=with_plan(candidate.study, plan)) for candidate in candidates]
     if done is not None and done.finished:
         (output / CHOICE).unlink()
@@ -149,9 +148,8 @@ def choose(
         write_json(output / CHOICE, choice.model_dump(mode="json"))
 
     with ending_in_order():
-        results = choose_sensor(
-            candidates, output, limit, report_results, options.requested_workers(scheduler, processes)
-        )
+        workers = options.requested_workers(scheduler, processes)
+        results = choose_sensor(candidates, output, limit, report_results, workers)
         stopped = stopped_by_user()
     best = results[0].candidate.study
     write_scene_geometry(output, best.scene, best.sensor)
