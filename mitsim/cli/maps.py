@@ -158,10 +158,8 @@ def predict(
     performance_map = read_map(map_file, chosen)
     loaded = load_scene(scene, chosen, options.definitions(define))
     pose = options.pose_of(position, target, roll, chosen)
-    correlated = noise == "correlated"
-    cloud = maps.predict(
-        loaded, chosen, performance_map, pose, seed=seed, correlated=correlated, ask=options.asking(yes)
-    )
+    correlated, ask = noise == "correlated", options.asking(yes)
+    cloud = maps.predict(loaded, chosen, performance_map, pose, seed=seed, correlated=correlated, ask=ask)
     options.check_cloud_file(output)
     write_cloud(cloud, output)
     options.print_reasons(cloud)
@@ -203,17 +201,11 @@ def validate(
     from characterisation.maps.shipped import map_path
     from characterisation.maps.validation import residual_table, within_limits
     from mitsim.capture.simulated.simulate import SimulatedSensor
+    from mitsim.maps.campaign import hold_out
     from mitsim.maps.campaign.acquire import CaptureSource, simulated_source
     from mitsim.maps.campaign.campaign_file import CampaignFile
-    from mitsim.maps.campaign.hold_out import (
-        compare,
-        held_out_campaign,
-        held_out_live,
-        held_out_orders,
-        held_out_shots,
-        hold_out_order,
-    )
     from mitsim.maps.campaign.live import live_source
+    from mitsim.maps.campaign.orders import PreparedSensor
     from mitsim.maps.campaign.run import write_netcdf
     from mitsim.report.style import write_png
     from mitsim.report.validation_figures import agreement_figure, validation_table
@@ -225,21 +217,24 @@ def validate(
     file, chosen = read_toml(campaign, CampaignFile), load_sensor(sensor)
     if file.device is not None:
         options.refuse_unused(context, *_ONE_AT_A_TIME, "scheduler", "processes")
-    live = None if file.device is None else held_out_live(campaign, file, chosen, performance_map)
-    plan = held_out_campaign(campaign, chosen, performance_map) if live is None else live.campaign
-    shots = held_out_shots(plan, poses, seed)
+    live = None if file.device is None else hold_out.held_out_live(campaign, file, chosen, performance_map)
+    plan = hold_out.held_out_campaign(campaign, chosen, performance_map) if live is None else live.campaign
+    shots = hold_out.held_out_shots(plan, poses, seed)
     options.check_folder(output)
     workers = options.requested_workers(scheduler, processes)
     if workers is not None:
-        pairs = results_of(held_out_orders(plan, shots, path, repeats), hold_out_order, workers, "hold out")
+        orders = hold_out.held_out_orders(plan, shots, path, repeats)
+        pairs = results_of(orders, hold_out.hold_out_order, workers, "hold out")
     else:
         source: AbstractContextManager[CaptureSource]
         if live is None:
             source = nullcontext(simulated_source(SimulatedSensor(plan.sensor), plan.file.samples_per_pixel))
         else:
             source = live_source(live, mount)
+        prepared = PreparedSensor(plan.sensor)
         with source as take:
-            pairs = list(track(compare(plan, performance_map, shots, take, repeats), "hold out", len(shots)))
+            compared = (hold_out.compared(shot, prepared, performance_map, take, repeats) for shot in shots)
+            pairs = list(track(compared, "hold out", len(shots)))
     table = residual_table(pairs)
     write_netcdf(table, output / "validation.nc")
     for sample in plan.samples:

@@ -214,13 +214,9 @@ class _SimulatedTargets:
         cloud, coupon = self._plate("matt white", distance, tilt_deg, Noise.none())
         points, view, _ = _on_plate(cloud, coupon)
         off = np.linalg.norm(points, axis=1) - _to_plane(coupon.centre - cloud.grid.origin, coupon.normal, view)
-        known = len(points) > _LEAST_POINTS
-        return PlaneFloor(
-            tilt_deg,
-            float(off.mean()) if known else math.nan,
-            float(_about_plane(points, view).std()),
-            _mean_fraction(measure_patches(cloud, coupon)),
-        )
+        offset = float(off.mean()) if len(points) > _LEAST_POINTS else math.nan
+        flatness = float(_about_plane(points, view).std())
+        return PlaneFloor(tilt_deg, offset, flatness, _mean_fraction(measure_patches(cloud, coupon)))
 
     def ball(self, distance: float, radius: float) -> float:
         """Return the error of the radius of a ball without noise [mm]."""
@@ -243,17 +239,12 @@ class _SimulatedTargets:
     def recovery(self, finish: str, distance: float, tilt_deg: float) -> Recovery:
         cloud, coupon = self._plate(finish, float(distance), tilt_deg, Noise())
         patches = measure_patches(cloud, coupon)
-        sigma = patches.ray_noise_inliers.values
-        finite = sigma[np.isfinite(sigma)]
+        sigmas = patches.ray_noise_inliers.values
+        finite = sigmas[np.isfinite(sigmas)]
+        sigma = float(np.median(finite)) if len(finite) else math.nan
         points, view, _ = _on_plate(cloud, coupon)
-        return Recovery(
-            finish,
-            float(distance),
-            tilt_deg,
-            _mean_fraction(patches),
-            float(np.median(finite)) if len(finite) else math.nan,
-            float(_about_plane(points, view).std()),
-        )
+        spread = float(_about_plane(points, view).std())
+        return Recovery(finish, float(distance), tilt_deg, _mean_fraction(patches), sigma, spread)
 
     def residuals(self, distance: float) -> Residuals:
         cloud, coupon = self._plate("matt white", distance, NOISE_TILT_DEG, Noise())
@@ -273,11 +264,8 @@ class _SimulatedTargets:
 
     def _plate(self, finish: str, distance: float, tilt_deg: float, noise: Noise) -> tuple[PointCloud, Coupon]:
         size = PLATE_SHARE * distance
-        tilt, azimuth = math.radians(tilt_deg), math.radians(AZIMUTH_DEG)
-        normal = np.array([math.sin(tilt) * math.cos(azimuth), math.sin(tilt) * math.sin(azimuth), math.cos(tilt)])
-        pose = coupon_pose(normal, distance, self.axis, self.eye)
-        axes = pose.rotation
-        coupon = Coupon(pose.translation, axes[:, 2], axes[:, 0], size, size)
+        pose = coupon_pose(tilted(tilt_deg), distance, self.axis, self.eye)
+        coupon = Coupon(pose.translation, pose.rotation[:, 2], pose.rotation[:, 0], size, size)
         scene = plate(size, finish, self.sensor.wavelength_nm)
         capture = self._capture(scene, pose, coupon.corners(), noise)
         return coupon_cloud(capture, coupon, self.geometry, self.sensor), coupon
@@ -290,6 +278,12 @@ class _SimulatedTargets:
 
     def decoded(self, capture: Capture) -> PointCloud:
         return capture_cloud(capture, self.sensor.settings, self.geometry, imager=capture.decoding.imager)
+
+
+def tilted(tilt_deg: float) -> Floats:
+    """Return the unit normal (3,) in the view frame at an incidence, halfway between baseline and across."""
+    tilt, azimuth = math.radians(tilt_deg), math.radians(AZIMUTH_DEG)
+    return np.array([math.sin(tilt) * math.cos(azimuth), math.sin(tilt) * math.sin(azimuth), math.cos(tilt)])
 
 
 def correlation_length(image: Floats) -> float:

@@ -166,9 +166,7 @@ def open_study(
         near, far = sensor.working_range_mm
         around = [max(math.floor(standoffs[0] - radius), near), min(math.ceil(standoffs[-1] + radius), far)]
         campaign = read_campaign(folder / file.characterisation.campaign, sensor, around)
-        samples = samples_of(
-            [(sample.finish, sample.roughness, sample.light) for sample in campaign.samples], "the campaign"
-        )
+        samples = samples_of(campaign.samples)
         distances = list(campaign.distances)
     else:
         map_name = file.characterisation.map or sensor.name

@@ -99,20 +99,14 @@ def one_ahead(
                 if before is not None:
                     yield before[0], before[1].result()
                 raise
-            ready, before = before, (item, _finish_in_thread(finish, taken, item))
+            thread = ThreadPoolExecutor(1)
+            ready, before = before, (item, thread.submit(finish, taken, item))
+            thread.shutdown(wait=False)
             del taken
             if ready is not None:
                 yield ready[0], ready[1].result()
         if before is not None:
             yield before[0], before[1].result()
-
-
-def _finish_in_thread(finish: Callable[[Taken, Item], Made], taken: Taken, item: Item) -> Future[Made]:
-    thread = ThreadPoolExecutor(1)
-    try:
-        return thread.submit(finish, taken, item)
-    finally:
-        thread.shutdown(wait=False)
 
 
 def measured(capture: Capture, shot: Shot, geometry: Geometry, sensor: Sensor, keep_images: bool) -> Finished:
@@ -123,12 +117,9 @@ def measured(capture: Capture, shot: Shot, geometry: Geometry, sensor: Sensor, k
 
     Parameters
     ----------
-    capture, shot
-        Capture of the coupon, and its shot.
-    sensor, geometry
-        Sensor of the campaign, and geometry of its rig; pose and calibration are those of the capture, if it has them.
-    keep_images
-        Whether the result contains the capture.
+    capture, shot, geometry, sensor, keep_images
+        Capture of the coupon, and its shot; geometry of the rig, and sensor of the campaign; whether the result
+        contains the capture.
     """
     sample, pose = shot.series.sample, coupon_place(capture, shot)
     coupon = sample.at(pose)
@@ -190,10 +181,9 @@ def coupon_cloud(capture: Capture, coupon: Coupon, geometry: Geometry, sensor: S
 
     Parameters
     ----------
-    capture, coupon, geometry
-        Capture of the coupon, the coupon at its pose in the sensor frame, and geometry of the capture.
-    sensor
-        Gives the decoder, and the imager if the capture does not state its own.
+    capture, coupon, geometry, sensor
+        Capture and its geometry; the coupon at its pose, sensor frame; gives the decoder, and the imager of a capture
+        that states none.
     """
     grid = geometry.grid
     seen = outline(grid, coupon)
@@ -212,14 +202,14 @@ def coupon_residuals(sensor: SimulatedSensor, campaign: Campaign) -> list[Render
     """
     camera = next(iter(sensor.sensor.rig.cameras))
     normals = campaign.file.normals()
-    samples, seed = campaign.file.samples_per_pixel, campaign.file.seed
+    rendering, seed = Rendering(campaign.file.samples_per_pixel), campaign.file.seed
     out = []
     for series in campaign.series:
         if series.variant is None and series.distance == campaign.distances[0]:
             pose = campaign.shot(series, normals[len(normals) // 2]).sensor_from_coupon
-            sample, corners = series.sample, series.sample.at(pose).corners()
+            sample, around = series.sample, series.sample.at(pose).corners()
             residual = render_residual(
-                sensor, sample.scene, pose.inverse(), camera, Rendering(samples), seed=seed, around=corners
+                sensor, sample.scene, pose.inverse(), camera, rendering, seed=seed, around=around
             )
             out.append(warn_above_limit(sample.label(), residual))
     return out
@@ -241,10 +231,8 @@ def found_shots(folder: str | Path, campaign: Campaign) -> dict[Path, Shot]:
     for capture_folder, shot in shots.items():
         other = folder_of.setdefault((shot.series.name, shot.name), capture_folder)
         if other != capture_folder:
-            hint = "the pose was not written anew, or keep one capture of each orientation"
-            raise InputError(
-                capture_folder / "pose.json", "", f"the orientation of {other}", "another for each capture", hint
-            )
+            found, hint = f"the orientation of {other}", "write the pose anew, or keep one capture of each orientation"
+            raise InputError(capture_folder / "pose.json", "", found, "another for each capture", hint)
     return shots
 
 
@@ -306,9 +294,8 @@ def _found_shot(folder: Path, campaign: Campaign) -> Shot:
         allowed = f"within 5 % of {', '.join(f'{planned:g}' for planned in campaign.distances)} mm"
         hint = "add this distance to distances_mm"
         raise InputError(folder / "pose.json", "distance", f"{distance:.1f} mm", allowed, hint)
-    series = next(
-        s for s in campaign.series if s.variant is None and s.distance == nominal and s.sample.label() == label
-    )
+    here = (series for series in campaign.series if series.variant is None and series.distance == nominal)
+    series = next(series for series in here if series.sample.label() == label)
     axis = campaign.sensor.rig.reference.sensor_from_camera.rotation[:, 2]
     index = read_bounded(folder / "capture.json", "a complete capture folder")  # it has the digest of every other file
     return Shot(series, view_axes(axis).T @ pose.rotation[:, 2], pose, hashlib.sha256(index).hexdigest())

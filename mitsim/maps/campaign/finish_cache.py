@@ -84,9 +84,8 @@ def made_finish(finish: OneFinish, simulated: SimulatedSensor, distance: float) 
                 shutil.rmtree(left, ignore_errors=True)
         work = Path(tempfile.mkdtemp(prefix="work-", dir=folder))
     except OSError as error:
-        raise InputError(
-            folder, "", f"a folder that cannot be created ({error.strerror})", "a writable folder", "set XDG_CACHE_HOME"
-        ) from None
+        found = f"a folder that cannot be created ({error.strerror})"
+        raise InputError(folder, "", found, "a writable folder", "set XDG_CACHE_HOME") from None
     began = time.monotonic()
     try:
         made = characterise_finish(finish, simulated, distance, work)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -74,12 +73,8 @@ def distances_between(performance_map: PerformanceMap) -> list[float]:
     if len(distances) == 1:
         return [float(distances[0])]
     # a tilted coupon extends nearer and farther than its middle, and the map ends at the middles of its coupons
-    ends = np.exp(
-        [
-            0.85 * math.log(distances[0]) + 0.15 * math.log(distances[1]),
-            0.15 * math.log(distances[-2]) + 0.85 * math.log(distances[-1]),
-        ]
-    )
+    log = np.log(distances)
+    ends = np.exp([0.85 * log[0] + 0.15 * log[1], 0.15 * log[-2] + 0.85 * log[-1]])
     middles = np.sqrt(distances[1:] * distances[:-1])
     return [float(f"{distance:.4g}") for distance in (ends[0], *sorted([*distances[1:-1], *middles]), ends[1])]
 
@@ -105,10 +100,8 @@ def held_out_live(
 
     Parameters
     ----------
-    path, file
-        The campaign file, and its content.
-    sensor
-        Preset or file, as in :func:`~mitsim.maps.campaign.live.plan_live`.
+    path, file, sensor
+        As in :func:`~mitsim.maps.campaign.live.plan_live`.
     performance_map
         To be compared; it may be that of a simulated sensor, which compares the simulation with the device.
     """
@@ -151,25 +144,6 @@ def held_out_shots(campaign: Campaign, count: int, seed: int) -> list[Shot]:
     return shots
 
 
-def compare(
-    campaign: Campaign, performance_map: PerformanceMap, shots: list[Shot], take: CaptureSource, repeats: int = 1
-) -> Iterator[Pair]:
-    """Take and predict each shot in this process.
-
-    Parameters
-    ----------
-    campaign, performance_map
-        The campaign of the map, and the map that predicts.
-    shots, take
-        Shots that the map was not made from, and the function that takes one.
-    repeats
-        Captures of each shot, as in :func:`compared`.
-    """
-    prepared = PreparedSensor(campaign.sensor)
-    for shot in shots:
-        yield compared(shot, prepared, performance_map, take, repeats)
-
-
 def compared(
     shot: Shot, prepared: PreparedSensor, performance_map: PerformanceMap, take: CaptureSource, repeats: int
 ) -> Pair:
@@ -181,10 +155,9 @@ def compared(
 
     Parameters
     ----------
-    shot, repeats
-        The shot to take and to predict, and the number of captures with fresh noise.
-    prepared, performance_map, take
-        The sensor, prepared once; the map that predicts; takes a shot.
+    shot, prepared, performance_map, take, repeats
+        The shot to take and to predict; the sensor, prepared once; the map that predicts; takes a shot; number of
+        captures with fresh noise.
     """
     sensor = prepared.sensor
     seeds = (shot.series.seed + 2**32 * number for number in range(MOST_REPEATS * repeats))
@@ -243,10 +216,8 @@ def held_out_orders(campaign: Campaign, shots: list[Shot], map_path: Path, repea
 
     Parameters
     ----------
-    campaign, shots, repeats
-        The campaign of the map, shots that the map was not made from, and captures of each.
-    map_path
-        Path of the map, the same on every machine.
+    campaign, shots, map_path, repeats
+        The campaign, its held-out shots, path of the map, the same on every machine, and captures of each shot.
     """
     path, digest = str(map_path.absolute()), _digest(map_path)
     return [HeldOutOrder(order_of(shot, campaign), path, digest, repeats) for shot in shots]

@@ -57,11 +57,9 @@ def plan_live(
 
     Parameters
     ----------
-    path, file
-        The campaign file, and its content.
-    sensor
-        Preset or file of the same kind, for name, decoder and imager. The calibration is that of the device in each
-        capture.
+    path, file, sensor
+        The campaign file, and its content; preset or file of the same kind, for name, decoder and imager. The
+        calibration is that of the device in each capture.
     range_mm
         Range of distances; stage positions outside it are ignored.
     """
@@ -95,11 +93,7 @@ def plan_live(
         allowed = ", ".join(f"{distance_mm:g}" for distance_mm in sorted(calibration_of))
         hint = "calibrate the stage at each distance, since it does not move the coupon"
         raise InputError(path, "distances_mm", f"{min(missing):g}", allowed, hint)
-    calibrations = {
-        distance: calibration_of[distance]
-        for distance in sorted(calibration_of)
-        if range_mm[0] <= distance <= range_mm[1]
-    }
+    calibrations = {d: calibration_of[d] for d in sorted(calibration_of) if range_mm[0] <= d <= range_mm[1]}
     if not calibrations:
         calibrated = ", ".join(f"{distance_mm:g} mm" for distance_mm in sorted(calibration_of))
         allowed = f"a place within {range_mm[0]:.4g} to {range_mm[1]:.4g} mm"

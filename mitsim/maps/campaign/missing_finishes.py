@@ -13,14 +13,13 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from characterisation.files.errors import InputError
 from characterisation.maps.joined import with_samples
-from characterisation.maps.light import Light
 from characterisation.maps.nearest import Nearest, nearest_sample, standing_for
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.samples import Samples
@@ -29,6 +28,7 @@ from characterisation.words.progress import say
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.maps.campaign.finish_cache import cache_folder, expected_seconds, keep_rate, kept_finish, made_finish
 from mitsim.maps.campaign.one_finish import OneFinish, largest_incidence_deg
+from mitsim.scene.coupons import Sample
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
 from mitsim.sensor.sensor import Sensor
@@ -190,7 +190,7 @@ def _in_words(finish: Finish) -> str:
     return str(finish) if light is None or light.as_made else f"{finish} ({light.in_words()})"
 
 
-def samples_of(labelled: Iterable[tuple[str, float, Light | None]], where: str) -> Samples:
-    """Return the samples that a campaign will make: finish, Ra [um] and optical numbers of each."""
-    rows = list(labelled)
-    return Samples([row[0] for row in rows], np.array([row[1] for row in rows], float), [row[2] for row in rows], where)
+def samples_of(coupons: Sequence[Sample]) -> Samples:
+    """Return the samples of the map that a campaign will make of its coupons."""
+    names, roughness = [coupon.finish for coupon in coupons], np.array([coupon.roughness for coupon in coupons], float)
+    return Samples(names, roughness, [coupon.light for coupon in coupons], "the campaign")

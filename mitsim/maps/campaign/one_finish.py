@@ -153,11 +153,7 @@ def plan_of(largest_deg: float, seed: int = 1) -> CampaignFile:
 
 
 def one_finish_campaign(finish: OneFinish, distance: float, file: CampaignFile, lay_deg: float = 0.0) -> Campaign:
-    """Return the campaign of a finish at a distance [mm], with its u at a lay angle if it has a lay.
-
-    ``finish``, ``distance``: the finish with the sensor that characterises it, and |V| [mm]. ``file``, ``lay_deg``: the
-    plan, from :func:`plan_of`; angle of u [deg], if the finish has a lay.
-    """
+    """Return the campaign of a finish at a distance [mm] by a plan of :func:`plan_of`; a lay has its u at an angle."""
     half = half_size(finish.sensor, distance, COUPON_PX if file.coupon_px is None else file.coupon_px)
     recipe = CouponRecipe(finish.finish.name, (), finish.sensor.wavelength_nm)
     scene = flat_coupon(finish.finish, half)

@@ -106,9 +106,7 @@ class Campaign:
     @property
     def samples(self) -> list[Sample]:
         """Return the samples at the nearest distance, without their variants."""
-        return [
-            series.sample for series in self.series if series.variant is None and series.distance == self.distances[0]
-        ]
+        return [one.sample for one in self.series if one.variant is None and one.distance == self.distances[0]]
 
     def shot(self, series: Series, normal: NDArray[np.float64]) -> Shot:
         """Return a shot of the coupon of a series with a given normal."""
@@ -183,10 +181,7 @@ def half_size(sensor: Sensor, distance: float, side_px: float) -> float:
 
 
 def check_exposure(sensor: Sensor) -> None:
-    """Reject a sensor whose exposure follows the scene.
-
-    Raises InputError with the sensor and its rule.
-    """
+    """Raise InputError for a sensor whose exposure follows the scene."""
     if sensor.exposure.base_s is None:
         hint = "a map holds for one exposure: with an automatic one, F depends on the rest of the view, "
         hint += "not only on distance, normal and finish"

@@ -56,8 +56,7 @@ class _SeenPlane:
 def pose_doubt(cloud: PointCloud, decode: Decode, sample: Sample, sensor_from_coupon: Transform) -> str:
     """Return a warning if the points of a capture contradict the pose of its coupon, or "".
 
-    ``cloud``, ``decode``: cloud of the coupon at its pose, sensor frame; gives that of the same capture about a coupon
-    at another place. ``sample``, ``sensor_from_coupon``: the coupon, and its pose [mm].
+    ``cloud`` is that of the coupon at its pose; ``decode`` gives that of the same capture about a coupon elsewhere.
     """
     coupon, grid = sample.at(sensor_from_coupon), cloud.grid
     plane = _seen_plane(cloud, coupon)

@@ -72,22 +72,19 @@ def measure_captures(campaign: Campaign, shots: Sequence[Shot], source: Source, 
 
     Parameters
     ----------
-    campaign, folder
-        The planned campaign, and the folder for the map and the measured shots.
-    shots, source
-        From :func:`~mitsim.maps.campaign.acquire.found_shots`; returns their results.
+    campaign, shots, source, folder
+        The planned campaign; shots from :func:`~mitsim.maps.campaign.acquire.found_shots`, and the source of their
+        results; folder for the map and the measured shots.
     """
     captures = Path(folder) / KEPT
     captures.mkdir(parents=True, exist_ok=True)
     remove_partial(captures)
     done: dict[tuple[str, str], Finished] = {}
     _take_missing(shots, done, source, captures, "measure")
-    shown: dict[Series, list[Shot]] = {}
+    shown: dict[Series, list[NDArray[np.float64]]] = {}
     for shot in sorted(shots, key=lambda shot: -shot.normal[2]):
-        shown.setdefault(shot.series, []).append(shot)
-    wanted = {
-        series: [np.array([shot.normal for shot in shown[series]])] for series in campaign.series if series in shown
-    }
+        shown.setdefault(shot.series, []).append(shot.normal)
+    wanted = {series: [np.array(shown[series])] for series in campaign.series if series in shown}
     return _finish(campaign, wanted, done, Path(folder), 0, 0)
 
 
@@ -133,16 +130,8 @@ def _refined(
         if series.variant is None:
             normals = np.concatenate(wanted[series])
             seen = [astuple(overall(done[series.name, campaign.shot(series, n).name].patches)) for n in normals]
-            fraction, fraction_error, sigma, sigma_error = np.array(seen, float).reshape(-1, 4).T
-            rough = refine(
-                normals,
-                fraction,
-                fraction_error,
-                sigma,
-                sigma_error,
-                campaign.file.refine,
-                math.radians(campaign.file.largest_deg),
-            )
+            columns = np.array(seen, float).reshape(-1, 4).T
+            rough = refine(normals, *columns, campaign.file.refine, math.radians(campaign.file.largest_deg))
             added = rough.normals[campaign.reachable(rough.normals)] if len(rough.normals) else rough.normals
             unresolved += rough.unresolved
         wanted[series].append(added)
@@ -157,9 +146,8 @@ def _report_reach(normals: NDArray[np.float64], reached: NDArray[np.bool_], fold
     if reached.all():
         return
     if not reached.any():
-        raise InputError(
-            "campaign", "stage.axes", "limits that exclude all orientations", "at least one possible orientation"
-        )
+        found = "limits that exclude all orientations"
+        raise InputError("campaign", "stage.axes", found, "at least one possible orientation")
     say(f"{(~reached).sum()} of {len(normals)} orientations are beyond the stage: {listed}")
     rows = [f"{n[0]:.6f},{n[1]:.6f},{math.degrees(math.acos(min(1.0, n[2]))):.3f}" for n in normals[~reached]]
     atomic_io.write_text(listed, "\n".join(["normal_x,normal_y,incidence_deg", *rows]) + "\n")
@@ -178,11 +166,8 @@ def _finish(
     for series, parts in wanted.items():
         shots = [campaign.shot(series, normal) for normal in np.concatenate(parts)]
         measured = [done[series.name, shot.name].patches for shot in shots]
-        sample = series.sample
-        patches = joined(measured)
-        tables.append(
-            SampleTable(sample.finish, sample.roughness, series.distance, patches, series.variant, sample.light)
-        )
+        one, patches = series.sample, joined(measured, orientation=np.arange(len(measured)))
+        tables.append(SampleTable(one.finish, one.roughness, series.distance, patches, series.variant, one.light))
     sources = sorted({finished.source for finished in done.values()})
     attributes = {
         "name": f"{campaign.sensor.name} map",
@@ -204,25 +189,19 @@ def _finish(
     return performance
 
 
-def joined(tables: Sequence[xr.Dataset]) -> xr.Dataset:
-    """Return the patches of all captures of a series, each with the number of its ``orientation``."""
-    names = [str(name) for name in tables[0].data_vars]
-    columns = {name: np.concatenate([table.variables[name].values for table in tables]) for name in names}
-    columns["orientation"] = np.repeat(np.arange(len(tables)), [table.sizes["patch"] for table in tables])
-    return patch_table(**columns)
+def joined(tables: Sequence[xr.Dataset], **number: NDArray[np.integer]) -> xr.Dataset:
+    """Return the patches of several tables in one, with a further column: the ``number`` of the table of each."""
+    columns = {str(name): np.concatenate([table[name].values for table in tables]) for name in tables[0].data_vars}
+    sizes = [table.sizes["patch"] for table in tables]
+    return patch_table(**columns, **{name: np.repeat(numbers, sizes) for name, numbers in number.items()})
 
 
 def _all_patches(tables: list[SampleTable]) -> xr.Dataset:
     """Join the tables; each patch keeps the number of its sample, whose finish and Ra are coordinates."""
-    samples = list(dict.fromkeys((table.finish, str(table.roughness)) for table in tables))
-    numbers = [samples.index((table.finish, str(table.roughness))) for table in tables]
-    sizes = [table.patches.sizes["patch"] for table in tables]
-    patches = [table.patches.variables for table in tables]
-    columns = {
-        str(name): np.concatenate([patch[name].values for patch in patches]) for name in tables[0].patches.data_vars
-    }
-    whole = patch_table(**columns, sample_number=np.repeat(np.array(numbers, np.int16), sizes))
-    return whole.assign_coords(
+    keys = [(table.finish, str(table.roughness)) for table in tables]
+    samples = list(dict.fromkeys(keys))
+    numbers = np.array([samples.index(key) for key in keys], np.int16)
+    return joined([table.patches for table in tables], sample_number=numbers).assign_coords(
         finish=("sample", [finish for finish, _ in samples]),
         roughness=("sample", [float(ra) for _, ra in samples], {"units": "um", "long_name": "roughness average Ra"}),
     )

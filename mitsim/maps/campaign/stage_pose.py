@@ -136,10 +136,8 @@ def write_stage_calibration(
 ) -> None:
     """Write a calibration for campaigns, with the coupon's pose at zero.
 
-    - ``path``, ``fit``, ``names``: file to write, the calibrated axes, and their names, as in the campaign's
-      ``[stage]``.
-    - ``board_from_coupon``: the coupon's middle and axes on the board, z out of the face toward the sensor. Default:
-      the coupon's frame is that of the board.
+    ``names`` of the axes are those in the campaign's ``[stage]``. ``board_from_coupon``: the coupon's middle and
+    axes on the board, z out of the face toward the sensor; by default the coupon's frame is that of the board.
     """
     coupon = Transform.from_matrix(fit.zero_pose) @ (board_from_coupon or Transform.identity())
     lines = zip(names, fit.axes.directions, fit.axes.points, strict=True)

@@ -113,10 +113,7 @@ def write_shot(captures: Path, shot: Shot, finished: Finished) -> None:
 
 
 def read_shot(captures: Path, shot: Shot) -> Finished | None:
-    """Return a kept shot; None if missing or of another capture.
-
-    InputError with the file that is damaged or changed.
-    """
+    """Return a kept shot; None if missing or of another capture; InputError with the file that is damaged."""
     folder = shot_folder(captures, shot)
     if not folder.exists():
         return None

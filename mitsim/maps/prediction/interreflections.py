@@ -35,7 +35,7 @@ from importlib.resources import files
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.files.arrays import Floats
+from characterisation.files.arrays import Floats, Singles
 from characterisation.files.documents import Document, read_toml
 from characterisation.region_of_interest import Roi
 from mitsim.capture.simulated.indirect_light import smoothed
@@ -191,10 +191,8 @@ class InterreflectionEffect:
             light_source = self.sensor.projector.optics.centre
             displaced = range_bias(interreflections.displaced, light_source, view.ideal)
         elif self.fringe is not None:
-            displaced, scattered = (
-                self.fringe.range_bias(phase, view.ideal)
-                for phase in (interreflections.displaced, interreflections.scattered)
-            )
+            phases = (interreflections.displaced, interreflections.scattered)
+            displaced, scattered = (self.fringe.range_bias(phase, view.ideal) for phase in phases)
         return Perturbation(kept, interreflections.noisier, displaced, np.abs(scattered), nothing.shared)
 
     def _rendered_with_next(self, scene: Scene, pose: Transform) -> InterreflectionImage:
@@ -240,47 +238,28 @@ class InterreflectionEffect:
         return Roi.between(*first, *last).overlap(whole) or Roi.whole(1, 1)
 
     def _image(
-        self,
-        region: Roi,
-        shape: NDArray[np.integer],
-        direct: NDArray[np.float32],
-        indirect: Sequence[NDArray[np.float32]],
+        self, region: Roi, shape: NDArray[np.integer], direct: Singles, indirect: Sequence[Singles]
     ) -> InterreflectionImage:
-        """Return the interreflections of one view from its direct light and one or two renders of the other light.
-
-        All are images (..., h, w) of the region.
-        """
+        """Return the interreflections of one view from its direct light, and one or two renders of the other light."""
         code = self.sensor.pattern
         # number of images whose mean is the total light
         white_count = code.steps if isinstance(code, AmplitudeModulation) else 1
-        white = np.stack(
-            [
-                direct[:white_count].mean(axis=0),
-                np.mean([images[:white_count].mean(axis=0) for images in indirect], axis=0),
-            ]
-        )
+        means = [images[:white_count].mean(axis=0) for images in (direct, *indirect)]
+        white = np.stack([means[0], np.mean(means[1:], axis=0)])
         first, other = smoothed(white, shape, SMOOTHED_PX / self.step).astype(float)
         with np.errstate(divide="ignore", invalid="ignore"):
             rho = np.where(first > 0, other / first, np.nan)
         displaced, scattered, rejected = np.zeros((3, *rho.shape))
         noisier = np.sqrt(1 + np.nan_to_num(rho))
         if isinstance(code, AmplitudeModulation):
-            assert isinstance(self.sensor.settings, TimeOfFlightSettings)
-            levels = self._levels(region)
-            displaced, rejected, noisier = path_bias(
-                path_amplitudes(direct, code) * levels,
-                path_amplitudes(indirect[0], code) * levels,
-                code,
-                self.sensor.settings,
-                self.sensor.imager,
-                shape,
-                self.step,
-            )
+            settings, levels = self.sensor.settings, self._levels(region)
+            assert isinstance(settings, TimeOfFlightSettings)
+            first_path, other_path = (path_amplitudes(images, code) * levels for images in (direct, indirect[0]))
+            biases = path_bias(first_path, other_path, code, settings, self.sensor.imager, shape, self.step)
+            displaced, rejected, noisier = biases
         elif self.fringe is not None:
-            direct_amplitude, *indirect_amplitudes = (amplitude(images[1:]) for images in (direct, *indirect))
-            displaced, scattered = phase_bias(
-                direct_amplitude, (indirect_amplitudes[0], indirect_amplitudes[1]), shape, self.step
-            )
+            first_phase, *others = (amplitude(images[1:]) for images in (direct, *indirect))
+            displaced, scattered = phase_bias(first_phase, (others[0], others[1]), shape, self.step)
         return InterreflectionImage(self.coarse, region, np.stack([rho, displaced, scattered, rejected, noisier]))
 
     def _levels(self, region: Roi) -> float | Floats:

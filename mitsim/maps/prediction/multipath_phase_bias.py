@@ -93,17 +93,13 @@ def finest_fringe(sensor: Sensor) -> Fringe | None:
 
 
 def fringes(sensor: Sensor) -> NDArray[np.float32]:
-    """Return that fringe with three phase shifts: (3, H, W), values 0..1 in projector pixels.
-
-    A sensor without a fringe gives (0, H, W).
-    """
+    """Return that fringe with three phase shifts: (3, H, W), 0..1 in projector pixels; (0, H, W) without a fringe."""
     optics, code = sensor.projector.optics, sensor.pattern
     if finest_fringe(sensor) is None:
         return np.empty((0, optics.height, optics.width), np.float32)
     assert isinstance(code, PhaseShift | GrayCodePhaseShift)
-    alone = PhaseShift(
-        periods_px=[_period(code)], steps=len(_PHASE_SHIFTS), axis=code.axis, mean=code.mean, contrast=code.contrast
-    )
+    period, steps = _period(code), len(_PHASE_SHIFTS)
+    alone = PhaseShift(periods_px=[period], steps=steps, axis=code.axis, mean=code.mean, contrast=code.contrast)
     return patterns(alone, optics.width, optics.height)
 
 
@@ -121,10 +117,8 @@ def phase_bias(
 ) -> tuple[Floats, Floats]:
     """Return the bias arg(1 + z) (H, W) [rad] of each pixel, and the standard deviation of its phase about the bias.
 
-    Both are 0 without direct light.
-
-    ``direct``, ``indirect``: A_1 (H, W), and two renders of A_2 (H, W). ``shape``, ``step``: (H, W) shape that each
-    pixel shows, -1 for none; number of sensor pixels per pixel along an axis.
+    Both are 0 without direct light. ``direct`` is A_1 (H, W), ``indirect`` two renders of A_2, ``shape`` that of each
+    pixel, -1 for none; ``step`` the number of sensor pixels per pixel along an axis.
     """
     size = np.abs(direct)
     # scale first: squares of radiances are too small for single precision

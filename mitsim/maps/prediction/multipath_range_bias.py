@@ -49,11 +49,8 @@ def path_bias(
 ) -> tuple[Floats, Floats, Floats]:
     """Return the bias of the path [mm], whether the decoder rejects the phases, 1 or 0, and a factor on sigma; (H, W).
 
-    Without direct light the bias is 0 and the factor 1.
-
-    ``direct``, ``other``: complex amplitudes A_1 and A_2 (F, H, W) [DN]. ``code``, ``settings``, ``imager``: of the
-    sensor. ``shape``, ``step``: (H, W) shape that a pixel shows, -1 for none; number of sensor pixels per pixel along
-    an axis.
+    Without direct light the bias is 0 and the factor 1. ``direct`` and ``other`` are A_1 and A_2 (F, H, W) [DN];
+    ``shape`` (H, W) that of a pixel, -1 for none; ``step`` the number of sensor pixels per pixel along an axis.
     """
     size, direct_phase = np.abs(direct), np.angle(direct)
     turned = other * np.exp(-1j * direct_phase)

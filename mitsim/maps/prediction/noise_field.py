@@ -71,11 +71,7 @@ _LOOK_UP_POINTS = 32768
 def correlated_noise(
     scene: Scene, performance_map: PerformanceMap, mapped: MappedView, rng: np.random.Generator
 ) -> Singles:
-    """Return the errors (h, w) of the points of a view in units of the map's sigma; 0 where the map has none.
-
-    ``scene``, ``performance_map``: scene with the finishes of the shapes; map with noise areas and persistent noise.
-    ``mapped``, ``rng``: the view, with normals, and the random generator.
-    """
+    """Return the errors (h, w) of the points of a view in units of the map's sigma; 0 where the map has none."""
     assert mapped.normal is not None
     predicted = np.isfinite(mapped.sigma)
     pixel, normal = np.argwhere(predicted), mapped.normal[:, predicted].T
@@ -92,10 +88,8 @@ def correlated_noise(
             structure = noise_structure(
                 performance_map, finish.name, finish.roughness, distance[at], normal[at].astype(float), finish.light
             )
-            area[at], share[at] = (
-                structure.area,
-                np.hypot(structure.persistent_share, np.nan_to_num(structure.bias_share)),
-            )
+            area[at] = structure.area
+            share[at] = np.hypot(structure.persistent_share, np.nan_to_num(structure.bias_share))
 
         _run_in_threads(ask, len(chosen), _LOOK_UP_POINTS)
     field_area, strength = own_field(area, fraction)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.arrays import Floats
 from characterisation.maps.noise_structure import noise_structure
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import Status
@@ -21,19 +22,12 @@ from mitsim.scene.materials import Finish
 from mitsim.sensor.transforms import Transform
 
 
-def performance(
-    ideal: Ideal, scene: Scene, performance_map: PerformanceMap, finish: Finish | None = None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def performance(ideal: Ideal, scene: Scene, performance_map: PerformanceMap) -> tuple[Floats, Floats]:
     """Return F and sigma (n,) of every ideal point; 0 and NaN if an eye does not see it, NaN if the map has no answer.
 
-    Parameters
-    ----------
-    ideal, scene, performance_map
-        Points of the view, scene with the finishes of the shapes, and map of the sensor.
-    finish
-        Replaces the finishes of the scene: matt white, to normalise the view score.
+    The scene has the finishes of the shapes.
     """
-    answers = map_answers(ideal, scene, performance_map, finish)
+    answers = map_answers(ideal, scene, performance_map)
     return answers.fraction, answers.sigma
 
 
@@ -41,9 +35,9 @@ def performance(
 class MapAnswers:
     """Answers of a map for the n ideal points of a view: F, sigma [mm] and the error of F, as :func:`performance`."""
 
-    fraction: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-    fraction_error: NDArray[np.float64]
+    fraction: Floats
+    sigma: Floats
+    fraction_error: Floats
 
 
 def map_answers(
@@ -57,14 +51,11 @@ def map_answers(
 
     Parameters
     ----------
-    ideal, scene, performance_map, finish
+    ideal, scene, performance_map
         As for :func:`performance`.
-    of_scene
-        Answers for the finishes of the scene, if they are known: a shape with the surface of ``finish`` keeps them.
-
-    See Also
-    --------
-    mitsim.maps.prediction.performance : F and sigma alone
+    finish, of_scene
+        Replaces the finishes of the scene: matt white, to normalise the view score; answers for the finishes of the
+        scene, if they are known: a shape with the surface of ``finish`` keeps them.
     """
     out = MapAnswers(*np.full((3, len(ideal.pixel)), np.nan))
     for index, scene_finish in enumerate(scene.finishes):
@@ -119,12 +110,10 @@ def expected_points(
 
     Parameters
     ----------
-    view, scene, shape
-        Ideal points of the view, the scene, and the index of the shape into its names.
-    performance_map, answers
-        Map with noise areas and persistent noise, and what it answers for all points of the view, if that is known.
-    perturbation
-        Effects that flat coupons cannot show (:mod:`mitsim.maps.prediction.perturbation`).
+    view, scene, shape, performance_map
+        Ideal points of the view, the scene, the index of the shape into its names, and the map.
+    perturbation, answers
+        Effects that flat coupons cannot show; what the map answers for all points of the view, if that is known.
     """
     ideal, labels, world_from_sensor = view.ideal, view.labels, view.world_from_sensor
     finish = scene.finishes[shape]
@@ -134,15 +123,13 @@ def expected_points(
     distance, normal = ideal.distance[mask], ideal.normal[mask]
     pixel = np.stack(np.divmod(ideal.pixel[mask], labels.shape[1]), axis=-1)
     unknown = np.full(len(distance), np.nan)
-    fraction, fraction_error, sigma, area, persistent = unknown, unknown, unknown, unknown, unknown
+    fraction = fraction_error = sigma = area = persistent = unknown
     displaced = np.zeros(len(distance))
     if finish is not None and mask.any():
         if answers is None:
             answers = map_answers(replace(ideal, shape=np.where(mask, ideal.shape, -1)), scene, performance_map)
         structure = noise_structure(performance_map, finish.name, finish.roughness, distance, normal, finish.light)
-        fraction, fraction_error, sigma = (
-            values[mask] for values in (answers.fraction, answers.fraction_error, answers.sigma)
-        )
+        fraction, sigma, fraction_error = (values[mask] for values in vars(answers).values())
         area, persistent = structure.area, structure.persistent_share * sigma
         displaced = np.nan_to_num(structure.bias_share * sigma)
         if perturbation is not None:
@@ -174,24 +161,18 @@ def expected_points(
 
 
 def feature_statistics(
-    ideal: Ideal,
-    labels: NDArray[np.int16],
-    fraction: NDArray[np.float64],
-    sigma: NDArray[np.float64],
-    shapes: list[int],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    ideal: Ideal, labels: NDArray[np.int16], fraction: Floats, sigma: Floats, shapes: list[int]
+) -> tuple[Floats, Floats]:
     """Return the expected number of points n and the mean sigma [mm] of each shape, (features,) each; NaN if n is 0.
 
     The mean of sigma is over the expected points, so each pixel is weighted by its F.
 
     Parameters
     ----------
-    ideal, labels
-        Points of the view, and the shapes (H, W) that its rays show.
+    ideal, labels, shapes
+        Points of the view, the shapes (H, W) that its rays show, and indices into the scene's names.
     fraction, sigma
         F and sigma [mm] (n,) of the points, from :func:`performance`.
-    shapes
-        Indices into the scene's names.
     """
     label = labels.reshape(-1)[ideal.pixel]
     weight = np.where(np.isfinite(sigma), np.nan_to_num(fraction), 0.0)

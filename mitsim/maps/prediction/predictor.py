@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from characterisation.coupon.view_frame import in_frame, view_frame
+from characterisation.files.arrays import Floats
 from characterisation.files.threads import in_threads
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.region_of_interest import Roi
@@ -84,10 +85,7 @@ class Predictor:
 
     @staticmethod
     def of_sensor(sensor: Sensor, geometry: Geometry) -> Predictor:
-        """Return the predictor of a sensor on the grid of its clouds.
-
-        The margin is half a matching block plus a pixel.
-        """
+        """Return the predictor of a sensor on the grid of its clouds; the margin is half a block and a pixel."""
         settings, margin = sensor.settings, EDGE_MARGIN_PX
         if isinstance(settings, MatcherSettings):
             margin = max(margin, settings.block_size // 2 + 1)
@@ -111,9 +109,8 @@ class Predictor:
         assert self.step == 1, "thinned already"
         roi = self.view.roi(bounds, world_from_sensor, self.margin)
         step = math.ceil(math.sqrt(roi.width * roi.height / rays))
-        return Predictor(
-            self.rig, self.grid.cropped(roi), self.seen[roi.slices], self.sensor, self.edge_margin_px, step
-        )
+        grid, seen = self.grid.cropped(roi), self.seen[roi.slices]
+        return Predictor(self.rig, grid, seen, self.sensor, self.edge_margin_px, step)
 
     def surfaces(self, scene: Scene, world_from_sensor: Transform) -> Surfaces:
         """Return the ray-cast surfaces of a view, in the sensor frame."""
@@ -209,26 +206,15 @@ class Predictor:
         Kinnell and Justham (2018; slide *Simulating the Point Cloud*) writes rho_e for F and sigma_e for sigma. The
         equations are in :meth:`_cloud`.
 
+        Raises InputError if the view shows a face whose finish was not characterised.
+
         Parameters
         ----------
-        characterised
-            The scene with F and sigma of its faces.
-        world_from_sensor
-            Pose of the sensor.
-        rng
-            Random generator.
+        characterised, world_from_sensor, rng
+            The scene with F and sigma of its faces; pose of the sensor; random generator.
         correlated
             Whether the deviates of neighbours are correlated as measured in the map; otherwise independent, as in the
             talk.
-
-        Raises
-        ------
-        InputError
-            If the view shows a face whose finish was not characterised.
-
-        See Also
-        --------
-        draw : from F and sigma that were looked up
         """
         predicted = self.look_up(characterised, world_from_sensor, correlated)
         seen, size = predicted.seen, predicted.seen.status.shape
@@ -242,20 +228,18 @@ class Predictor:
         scene: Scene,
         ideal: Ideal,
         labels: NDArray[np.int16],
-        fraction: NDArray[np.float64],
-        sigma: NDArray[np.float64],
+        fraction: Floats,
+        sigma: Floats,
         rng: np.random.Generator,
     ) -> PointCloud:
         """Draw a cloud from ideal points, F and sigma (n,), with the equations of :meth:`predict`.
 
         Parameters
         ----------
-        scene, ideal, labels
-            Scene with the shapes, points of the view, and the shapes (H, W) that the pixels show.
+        scene, ideal, labels, rng
+            Scene with the shapes, points of the view, the shapes (H, W) that the pixels show, and random generator.
         fraction, sigma
             F and sigma [mm] (n,); NaN where the map has no answer. Such points are lost.
-        rng
-            Random generator.
         """
         size = (self.grid.height, self.grid.width)
 

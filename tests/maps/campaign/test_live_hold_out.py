@@ -12,8 +12,9 @@ from characterisation.maps.shipped import map_path
 from mitsim.cli.devices import mount
 from mitsim.maps.campaign import live as live_module
 from mitsim.maps.campaign.campaign_file import CampaignFile
-from mitsim.maps.campaign.hold_out import compare, held_out_live, held_out_shots
+from mitsim.maps.campaign.hold_out import compared, held_out_live, held_out_shots
 from mitsim.maps.campaign.live import live_source
+from mitsim.maps.campaign.orders import PreparedSensor
 from mitsim.maps.campaign.stage_pose import write_stage_calibration
 from tests.capture.devices.emulated_port import emulated
 from tests.capture.devices.nxlib_standin import installed
@@ -42,8 +43,9 @@ def test_the_shipped_map_predicts_what_an_emulated_device_shows(file, tmp_path, 
     library = installed(monkeypatch, camera)
     live = held_out_live(tmp_path / "campaign.toml", file, n10, shipped)
     shots = held_out_shots(live.campaign, 3, seed=4)
+    prepared = PreparedSensor(live.campaign.sensor)
     with live_source(live, mount) as take:
-        pairs = list(compare(live.campaign, shipped, shots, take))
+        pairs = [compared(shot, prepared, shipped, take, 1) for shot in shots]
     assert not library.initialised and not port.open
     nxlib.api._nxlib.reset()
     assert len(pairs) == 3
