@@ -55,11 +55,12 @@ def coupons(talk: Talk, results: Results) -> list[Slide]:
     collection, processing = Slide("Data Collection"), Slide("Point Cloud Processing")
     maps = Slide(f"Results – {talk.sensor.name}")
     normal = blinding_normal(talk.sensor, talk.file.coupons.distance_mm)
-    blinding = tuple(float(component[0]) for component in figures.gradient(normal[:1], normal[1:2]))
+    x, y = figures.gradient(normal[:1], normal[1:2])
+    blinding = float(x[0]), float(y[0])
     datasets = collected(results, {name: name for name in ("characterised", "sub_clouds", "tilts")}, collection)
     if len(datasets) == 3:
         poses, tilts = datasets["characterised"], datasets["tilts"]
-        picture = figures.collection_figure(poses, datasets["sub_clouds"], tilts, (blinding[0], blinding[1]))
+        picture = figures.collection_figure(poses, datasets["sub_clouds"], tilts, blinding)
         words = "Poses in gradient space, a cloud cut into sub-clouds, and the projected area of these over the tilt"
         collection.pictures["collection"] = (picture, words)
         collection.claims.extend([_density(poses, normal), _area(tilts)])
@@ -71,11 +72,9 @@ def coupons(talk: Talk, results: Results) -> list[Slide]:
         processing.missing.append("tilts")
     if "characterised" in datasets:
         dataset = datasets["characterised"]
-        words = (
-            f"Samples, F and sigma of Ra {dataset.attrs['Ra_um']:g} at {dataset.attrs['distance_mm']:g} mm in gradient "
-            "space"
-        )
-        maps.pictures["results"] = (figures.results_figure(dataset, (blinding[0], blinding[1])), words)
+        of = f"Ra {dataset.attrs['Ra_um']:g} at {dataset.attrs['distance_mm']:g} mm"
+        words = f"Samples, F and sigma of {of} in gradient space"
+        maps.pictures["results"] = (figures.results_figure(dataset, blinding), words)
         maps.claims.append(_regions(dataset, normal))
     else:
         maps.missing.append("characterised")
@@ -125,9 +124,8 @@ def _processing(tilts: xr.Dataset) -> list[Claim]:
     valid = np.isfinite(along_ray)
     first, last = np.flatnonzero(valid)[[0, -1]]
     ray, normal = along_ray[last] / along_ray[first], along_normal[last] / along_normal[first]
-    pixels, density, reference = (
-        tilts[f"fraction_{name}"].values.astype(float) for name in ("pixels", "density", "reference")
-    )
+    definitions = ("pixels", "density", "reference")
+    pixels, density, reference = (tilts[f"fraction_{name}"].values.astype(float) for name in definitions)
     apart = largest_of(np.abs(density - pixels))
     other = largest_of(np.abs(reference - pixels))
     return [
@@ -185,9 +183,7 @@ def validation(talk: Talk, results: Results) -> Slide:
     """Return slide *Simulation Validation*."""
     slide, table = Slide("Simulation Validation"), talk.file.coupons
     campaign = read_toml(talk.folder / table.campaign, CampaignFile)
-    rough = sorted(
-        (roughness_of(sample) for sample in campaign.samples), key=lambda ra: -math.inf if ra is None else -ra
-    )
+    rough = sorted(map(roughness_of, campaign.samples), key=lambda ra: -math.inf if ra is None else -ra)
     cells = []
     for ra in rough:
         for distance in table.validated_distances_mm:
@@ -232,16 +228,13 @@ _RESIDUALS = ("fraction_residual", "sigma_residual")
 
 def _multiple_reflections(talk: Talk, results: Results, slide: Slide) -> None:
     """Add the comparison of direct light alone with all light, on the artefact."""
-    names = {
-        (sample.name, light): f"light_{light}_{sample.key}"
-        for sample in talk.file.samples
-        for light in ("direct", "all")
-    }
+    samples, lights = talk.file.samples, ("direct", "all")
+    names = {(sample.name, light): f"light_{light}_{sample.key}" for sample in samples for light in lights}
     datasets = collected(results, names, slide)
     pairs = {
         sample.name: (datasets[sample.name, "direct"], datasets[sample.name, "all"])
-        for sample in talk.file.samples
-        if (sample.name, "direct") in datasets and (sample.name, "all") in datasets
+        for sample in samples
+        if all((sample.name, light) in datasets for light in lights)
     }
     if not pairs:
         return

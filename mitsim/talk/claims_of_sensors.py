@@ -27,11 +27,9 @@ def surfaces(talk: Talk, results: Results) -> Slide:
     datasets = collected(results, {finish.name: f"finish_{finish.key}" for finish in talk.file.finishes}, slide)
     if not datasets:
         return slide
-    slide.pictures["surfaces"] = (
-        figures.surfaces_figure(datasets),
-        f"The artefact in {listed(list(datasets))} before {talk.sensor.name}: image, cloud, and why pixels lack a "
-        "point",
-    )
+    before = f"The artefact in {listed(list(datasets))} before {talk.sensor.name}"
+    words = f"{before}: image, cloud, and why pixels lack a point"
+    slide.pictures["surfaces"] = (figures.surfaces_figure(datasets), words)
     shares = {name: figures.share(dataset) for name, dataset in datasets.items()}
     by_feature = {
         name: (dataset["points"] / dataset["possible"].where(dataset["possible"] >= 100)).values
@@ -57,10 +55,8 @@ def surfaces(talk: Talk, results: Results) -> Slide:
 
 def _noise_at(performance_map: PerformanceMap, distance: float) -> float:
     """Return the mean sigma [mm] of the roughest metal of a map at 25 deg, over all azimuths."""
-    turn = np.linspace(0, 2 * math.pi, 73)[:-1]
-    normals = np.stack(
-        [math.sin(0.436) * np.cos(turn), math.sin(0.436) * np.sin(turn), np.full(72, math.cos(0.436))], 1
-    )
+    turn, flat = np.linspace(0, 2 * math.pi, 73)[:-1], math.sin(0.436)
+    normals = np.stack([flat * np.cos(turn), flat * np.sin(turn), np.full(72, math.cos(0.436))], 1)
     finish, rough = max(((f, r) for f, r in performance_map.samples if not math.isnan(r)), key=lambda sample: sample[1])
     return mean_of(performance_map.query(finish, rough, distance, normals).sigma)
 
@@ -75,9 +71,7 @@ def noise(talk: Talk, results: Results) -> Slide:
     slide.pictures["noise"] = (figures.noise_figure(datasets), words)
     apart = {name: dataset.attrs["distance_one"] for name, dataset in datasets.items()}
     two = [name for name, dataset in datasets.items() if dataset.attrs["two"]]
-    kurtosis = ", ".join(
-        f"{name} {dataset.attrs['kurtosis']:+.2f}".replace("-0", "−0") for name, dataset in datasets.items()
-    )
+    kurtosis = ", ".join(f"{name} {one.attrs['kurtosis']:+.2f}".replace("-0", "−0") for name, one in datasets.items())
     worst = max(apart.values())
     slide.claims.extend(
         [

@@ -36,14 +36,9 @@ _END = 3
 
 
 def judged_of(talk: Talk, results: Results, measured: dict[str, xr.Dataset], slide: Slide) -> JudgedViews:
-    """Return scores and errors of all samples that have them.
+    """Return scores and errors of all samples that have them; ``slide`` takes the names of missing results.
 
-    Parameters
-    ----------
-    talk, results, slide
-        The talk, and the results that there are; takes the names of missing ones.
-    measured
-        Errors of real captures by the key of their sample, in place of virtual ones.
+    ``measured`` are errors of real captures by the key of their sample, in place of virtual ones.
     """
     names = {sample.name: sample.key for sample in talk.file.samples}
     scores = collected(results, {name: f"scores_{key}" for name, key in names.items()}, slide)
@@ -68,9 +63,8 @@ def scoring(talk: Talk, judged: JudgedViews) -> Slide:
     points = scores["n"].sel(feature=feature).values
     reached, outside = scores.sizes["view"], scores.sizes["outside"]
     reasons = Counter(_reason(str(words)) for words in scores["reason"].values)
-    left_out = (
-        f" Of the others {listed([f'{count} {why}' for why, count in reasons.most_common()])}." if reasons else ""
-    )
+    others = listed([f"{count} {why}" for why, count in reasons.most_common()])
+    left_out = f" Of the others {others}." if reasons else ""
     moved = scores.attrs["moved_out"] or "No"
     slide.claims.append(
         Claim(
@@ -115,11 +109,10 @@ def view_score(talk: Talk, judged: JudgedViews) -> Slide:
         valid = np.isfinite(error)
         alone = spearman(sums[valid], error[valid])
         together = spearman(np.where(here["possible"].values > 0, here["V_m"].values, 0)[valid], error[valid])
-        findings += (
-            f" Rank correlation with the true error of views: S_m alone {_signed(alone)}, V_m {_signed(together)}."
-        )
+        both = f"S_m alone {_signed(alone)}, V_m {_signed(together)}"
+        findings += f" Rank correlation with the true error of views: {both}."
         better = better and together < alone
-        figure = f"rank correlation with error: S_m alone {_signed(alone)}, V_m {_signed(together)}"
+        figure = f"rank correlation with error: {both}"
     slide.claims.append(
         Claim(
             "[S_m] is susceptible to bias. Doesn't take into account if all features are actually visible.",

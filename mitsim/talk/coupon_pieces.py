@@ -26,14 +26,12 @@ from mitsim.maps.campaign.acquire import coupon_cloud, in_turn, simulated_source
 from mitsim.maps.campaign.campaign_file import Band, CampaignFile, SampleEntry
 from mitsim.maps.campaign.hold_out import compared, random_normals
 from mitsim.maps.campaign.orders import PreparedSensor, prepared_sensor
-from mitsim.maps.campaign.plan import Campaign, Series, Shot, plan_campaign
+from mitsim.maps.campaign.plan import Campaign, Shot, plan_campaign
 from mitsim.maps.campaign.run import run_campaign
 from mitsim.maps.campaign.store import Finished
+from mitsim.maps.data_sheet import tilted
 from mitsim.maps.prediction import CharacterisedScene
 from mitsim.talk.talk_file import map_in, sensor_in
-
-#: azimuth of the tilts from the baseline: between it and the direction across
-_AZIMUTH_DEG = 45.0
 
 #: columns of patches that are drawn
 _DRAWN = ("row", "column", "semi_major", "semi_minor", "recovered_fraction", "incidence", "distance", "included_angle")
@@ -81,12 +79,6 @@ def roughness_of(entry: SampleEntry) -> float | None:
     return None if "Ra" not in entry.parameters else float(entry.parameters["Ra"])
 
 
-def tilted(angle_deg: float) -> Floats:
-    """Return the unit normal (3,) in the view frame at an incidence, halfway between baseline and across."""
-    tilt, azimuth = math.radians(angle_deg), math.radians(_AZIMUTH_DEG)
-    return np.array([math.sin(tilt) * math.cos(azimuth), math.sin(tilt) * math.sin(azimuth), math.cos(tilt)])
-
-
 def characterised(folder: str, coupon_place: CouponPlace, subdivisions: int, refined: int, seed: int) -> xr.Dataset:
     """Return the samples of a coupon at one distance and their map: orientations refined where F or sigma changes.
 
@@ -96,10 +88,9 @@ def characterised(folder: str, coupon_place: CouponPlace, subdivisions: int, ref
 
     Parameters
     ----------
-    folder, coupon_place, seed
-        Folder of the talk, the coupon and its distance, and seed of the choice of patches.
-    subdivisions, refined
-        Density of the planned orientations, and the largest one of those added.
+    folder, coupon_place, subdivisions, refined, seed
+        Folder of the talk, the coupon and its distance, density of the planned orientations, the largest one of those
+        added, and seed of the choice of patches.
     """
     bands = [Band(up_to_deg=20, subdivisions=subdivisions), Band(up_to_deg=80, subdivisions=max(subdivisions - 1, 0))]
     plan = campaign_of(folder, coupon_place, orientations=bands)
@@ -125,13 +116,9 @@ def characterised(folder: str, coupon_place: CouponPlace, subdivisions: int, ref
     data = xr.Dataset(attrs={"distance_mm": coupon_place.distance, "Ra_um": coupon_place.roughness, "patches": count})
     data["shot_x"], data["shot_y"] = ("shot", normals[:, 0]), ("shot", normals[:, 1])
     data["level"] = ("shot", (np.arange(len(shots)) >= planned).astype(np.int8))
-    for name, column in (
-        ("patch_x", "normal_x"),
-        ("patch_y", "normal_y"),
-        ("patch_fraction", "recovered_fraction"),
-        ("patch_sigma", "ray_noise_inliers"),
-    ):
-        data[name] = ("patch", here[column].values.astype(np.float32))
+    columns = {"x": "normal_x", "y": "normal_y", "fraction": "recovered_fraction", "sigma": "ray_noise_inliers"}
+    for name, column in columns.items():
+        data[f"patch_{name}"] = ("patch", here[column].values.astype(np.float32))
     whole = performance_map.data.isel(sample=0, distance=0)
     for name in ("recovered_fraction", "ray_noise_std"):
         data[name] = (("b", "a"), whole[name].transpose("b", "a").values.astype(np.float32))
@@ -146,17 +133,12 @@ def tilts(folder: str, coupon_place: CouponPlace, angles: tuple[float, ...]) -> 
     looks the same at every tilt, and ``metal_along_ray`` is of the coupon.
     """
     prepared = prepared_sensor(sensor_in(folder, coupon_place.sensor))
-    plans = {
-        "metal": campaign_of(folder, coupon_place),
-        "white": campaign_of(folder, replace(coupon_place, roughness=None)),
-    }
+    plans = [campaign_of(folder, place) for place in (coupon_place, replace(coupon_place, roughness=None))]
     rows: list[dict[str, float]] = []
     for angle in angles:
-        clouds = {name: _taken(prepared, plan, tilted(angle)) for name, plan in plans.items()}
-        (metal, coupon), (white, _) = clouds["metal"], clouds["white"]
-        pitch = metal.grid.angular_pitch
+        (metal, coupon), (white, _) = (_taken(prepared, plan, tilted(angle)) for plan in plans)
         by_pixels = measure_patches(metal, coupon)
-        by_density = measure_patches(metal, coupon, angular_pitch=pitch)
+        by_density = measure_patches(metal, coupon, angular_pitch=metal.grid.angular_pitch)
         by_reference = measure_patches(metal, coupon, reference=white)
         of_white = measure_patches(white, coupon)
         sigma, cosine = overall(of_white).sigma, np.cos(of_white["incidence"].values)
@@ -194,18 +176,11 @@ def sub_clouds(folder: str, coupon_place: CouponPlace, angle: float) -> xr.Datas
     return data.assign_attrs(tilt_deg=angle, distance_mm=coupon_place.distance)
 
 
-def hold_out(folder: str, coupon_place: CouponPlace, map_name: str, count: int, seed: int) -> xr.Dataset:
+def validation_of(folder: str, coupon_place: CouponPlace, map_name: str, count: int, seed: int) -> xr.Dataset:
     """Return F and sigma of one sample at one distance, captured and predicted, over poses no map was made from.
 
     Over ``pose``: ``incidence`` [rad], and ``fraction`` and ``sigma`` [mm] as ``..._measured`` and ``..._predicted``.
     The other variables are those of :func:`characterisation.maps.validation.residual_table`, of this one row.
-
-    Parameters
-    ----------
-    folder, coupon_place, map_name
-        Folder of the talk, the coupon and its distance, and the map that predicts.
-    count, seed
-        Number of poses; seed of poses and noise.
     """
     prepared, plan = prepared_sensor(sensor_in(folder, coupon_place.sensor)), campaign_of(folder, coupon_place)
     series = replace(plan.series[0], seed=plan.series[0].seed ^ (seed + 1))
@@ -227,22 +202,13 @@ def clouds_of_coupon(folder: str, coupon_place: CouponPlace, map_name: str, angl
     """Return the captured cloud of a large coupon and one drawn from the map, as residuals along V from the true plane.
 
     ``captured`` and ``drawn`` (row, column), thinned, are in steps of :data:`STEP_MM`; :data:`NO_POINT` is no point.
-
-    Parameters
-    ----------
-    folder, coupon_place, angle
-        Folder of the talk, the coupon and its distance, and tilt [deg].
-    map_name, seed
-        Map from which the second cloud is drawn, and its seed.
     """
     prepared = prepared_sensor(sensor_in(folder, coupon_place.sensor))
     plan = campaign_of(folder, coupon_place, coupon_px=5000.0)  # as large as the field of view
     cloud, coupon = _taken(prepared, plan, tilted(angle))
     scene, pose = plan.series[0].sample.scene, plan.shot(plan.series[0], tilted(angle)).sensor_from_coupon
-    characterised_scene = CharacterisedScene(scene, map_in(folder, map_name))
-    drawn = prepared.predictor.predict(
-        characterised_scene, pose.inverse(), np.random.default_rng(seed), correlated=True
-    )
+    in_map, rng = CharacterisedScene(scene, map_in(folder, map_name)), np.random.default_rng(seed)
+    drawn = prepared.predictor.predict(in_map, pose.inverse(), rng, correlated=True)
     window, _ = _window(cloud, coupon)
     data = xr.Dataset(attrs={"distance_mm": coupon_place.distance, "Ra_um": coupon_place.roughness, "tilt_deg": angle})
     for name, point_cloud in (("captured", cloud), ("drawn", drawn)):
@@ -258,9 +224,8 @@ def clouds_of_coupon(folder: str, coupon_place: CouponPlace, map_name: str, angl
 
 
 def _taken(prepared: PreparedSensor, plan: Campaign, normal: Floats) -> tuple[PointCloud, Coupon]:
-    series: Series = plan.series[0]
-    shot: Shot = plan.shot(series, normal)
-    coupon = series.sample.at(shot.sensor_from_coupon)
+    shot = plan.shot(plan.series[0], normal)
+    coupon = shot.series.sample.at(shot.sensor_from_coupon)
     capture = simulated_source(prepared.simulated, plan.file.samples_per_pixel)(shot)
     return coupon_cloud(capture, coupon, prepared.geometry, plan.sensor), coupon
 

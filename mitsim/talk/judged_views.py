@@ -35,8 +35,16 @@ class JudgedViews:
     errors: Mapping[str, xr.Dataset]
 
     def score(self, sample: str, measurement: str, kind: str) -> Floats:
-        """Return one score (view,), larger is better, NaN for a view that it rates as impossible."""
-        return score_of(self.scores[sample].sel(measurement=measurement), self.task, measurement, kind)
+        """Return one score (view,), a key of :data:`SCORES`; larger is better, NaN for an impossible view."""
+        scores = self.scores[sample].sel(measurement=measurement)
+        if kind == "V_m":
+            return np.where(scores["possible"].values > 0, scores["V_m"].values, np.nan)
+        if kind == "risk":
+            u, chance = scores["predicted_uncertainty"].values.astype(float), scores["chance"].values.astype(float)
+            able = np.isfinite(u) & (u > 0) & (chance > 0)
+            return np.where(able, 0.5 * np.log(np.where(able, chance, 1)) - np.log(np.where(able, u, 1)), np.nan)
+        points = scores["n"].sel(feature=list(self.task.shapes_for(measurement))).values
+        return np.where((points >= _LEAST_POINTS).all(axis=1), points.sum(axis=1), np.nan)
 
     def cell(self, sample: str, measurement: str, kind: str) -> xr.Dataset:
         """Return the deciles of one measurement of one sample."""
@@ -49,26 +57,6 @@ class JudgedViews:
         """Return the mean ranks of the bins over all measurements and samples with errors, by :data:`QUANTITIES`."""
         cells = [self.cell(sample, name, kind) for sample in self.errors for name in self.task.measurements]
         return {quantity: mean_ranks(cells, quantity) for quantity in QUANTITIES}
-
-
-def score_of(scores: xr.Dataset, task: Task, measurement: str, kind: str) -> Floats:
-    """Return one score (view,), larger is better, NaN for an impossible view.
-
-    Parameters
-    ----------
-    scores, task, measurement
-        Scores of the views for the measurement, the task, and the measurement in it.
-    kind
-        A key of :data:`SCORES`.
-    """
-    if kind == "V_m":
-        return np.where(scores["possible"].values > 0, scores["V_m"].values, np.nan)
-    if kind == "risk":
-        u, chance = scores["predicted_uncertainty"].values.astype(float), scores["chance"].values.astype(float)
-        able = np.isfinite(u) & (u > 0) & (chance > 0)
-        return np.where(able, 0.5 * np.log(np.where(able, chance, 1)) - np.log(np.where(able, u, 1)), np.nan)
-    points = scores["n"].sel(feature=list(task.shapes_for(measurement))).values
-    return np.where((points >= _LEAST_POINTS).all(axis=1), points.sum(axis=1), np.nan)
 
 
 def true_error(errors: xr.Dataset, measurement: str) -> Floats:

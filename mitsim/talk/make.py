@@ -7,7 +7,6 @@ Virtual measurements are kept one by one, as in every run (:mod:`mitsim.study.vi
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -96,7 +95,7 @@ def make(
     samples = [_unfinished(talk, results, sample, folder) for sample in wanted]
     unfinished = [entry for entry in samples if entry is not None]
     talk_folder = str(talk.folder)
-    of_trials = [trial_order for entry in unfinished for trial_order in _trial_orders(talk, entry)]
+    of_trials = [order for entry in unfinished for order in _trial_orders(talk, entry)]
     orders: list[_Order] = [*((talk_folder, piece) for piece in missing), *of_trials]
     if orders:
         trials = sum(len(of_trial.jobs) for of_trial in of_trials)
@@ -137,12 +136,10 @@ def _unfinished(talk: Talk, results: Results, sample: ArtefactEntry, folder: Pat
     return _Unfinished(sample, session, missing)
 
 
-def _trial_orders(talk: Talk, unfinished: _Unfinished) -> Iterator[TrialOrder]:
-    session = unfinished.session
-    for jobs in unfinished.missing.values():
-        path = str(talk.path.absolute())
-        rendering = rendering_of(session.study)
-        yield TrialOrder(path, session.study.file, session.unknowns, False, session.digest, jobs, rendering)
+def _trial_orders(talk: Talk, unfinished: _Unfinished) -> list[TrialOrder]:
+    session, rendering = unfinished.session, rendering_of(unfinished.session.study)
+    common = str(talk.path.absolute()), session.study.file, session.unknowns, False, session.digest
+    return [TrialOrder(*common, jobs, rendering) for jobs in unfinished.missing.values()]
 
 
 def _finish(talk: Talk, results: Results, unfinished: _Unfinished) -> None:

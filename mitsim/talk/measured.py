@@ -56,19 +56,16 @@ def _shown(talk: Talk, capture_folder: Path, folder: Path) -> tuple[ArtefactEntr
     if sensor != talk.sensor.name:
         raise InputError(capture_folder / "capture.json", "sensor", sensor, talk.sensor.name, "the sensor of the talk")
     if pose is None:
-        raise InputError(
-            capture_folder / "pose.json", "world_from_sensor", "null", "the pose, in the frame of the part"
-        )
+        allowed = "the pose, in the frame of the part"
+        raise InputError(capture_folder / "pose.json", "world_from_sensor", "null", allowed)
     coupon = settings.get("coupon")
     named = coupon.get("sample") if isinstance(coupon, dict) else None
     above = {part.name for part in (capture_folder, *capture_folder.parents) if part.is_relative_to(folder)}
     for sample in talk.file.samples:
         if named == sample.name or (named is None and above & {sample.name, sample.key}):
             return sample, _nearest(talk, pose, capture_folder)
-    names = ", ".join(sample.name for sample in talk.file.samples)
-    raise InputError(
-        capture_folder / "settings.json", "coupon.sample", repr(named), names, "or a folder of this name above it"
-    )
+    names, hint = ", ".join(sample.name for sample in talk.file.samples), "or a folder of this name above it"
+    raise InputError(capture_folder / "settings.json", "coupon.sample", repr(named), names, hint)
 
 
 def _nearest(talk: Talk, pose: Transform, capture_folder: Path) -> View:
@@ -93,9 +90,8 @@ def _nearest(talk: Talk, pose: Transform, capture_folder: Path) -> View:
         apart = float(np.linalg.norm(moved(view)))
         offset = f"{turned(view):.1f} deg and {apart:.0f} mm from the nearest view, number {view.number}"
         allowed = f"a pose within {NEAR_DEG:g} deg of a candidate view, at its standoff within {100 * NEAR_SHARE:g} %"
-        raise InputError(
-            capture_folder / "pose.json", "world_from_sensor", offset, allowed, "poses.json of mitsim study score"
-        )
+        hint = "poses.json of mitsim study score"
+        raise InputError(capture_folder / "pose.json", "world_from_sensor", offset, allowed, hint)
     return view
 
 

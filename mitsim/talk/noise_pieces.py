@@ -9,6 +9,7 @@ there are independent points, and if it also halves the distance of the distribu
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,17 +47,14 @@ class TwoNormals:
 
     def density(self, values: Floats) -> Floats:
         """Return the density [1/mm] at values [mm]."""
-        return np.asarray(
-            (1 - self.share) * stats.norm.pdf(values, 0, self.narrow)
-            + self.share * stats.norm.pdf(values, 0, self.wide)
-        )
+        return self._sum(stats.norm.pdf, values)
 
     def distribution(self, values: Floats) -> Floats:
         """Return the distribution function at values [mm]."""
-        return np.asarray(
-            (1 - self.share) * stats.norm.cdf(values, 0, self.narrow)
-            + self.share * stats.norm.cdf(values, 0, self.wide)
-        )
+        return self._sum(stats.norm.cdf, values)
+
+    def _sum(self, of: Callable[..., Floats], values: Floats) -> Floats:
+        return (1 - self.share) * of(values, 0, self.narrow) + self.share * of(values, 0, self.wide)
 
 
 def two_normals(values: Floats) -> TwoNormals:
@@ -64,14 +62,12 @@ def two_normals(values: Floats) -> TwoNormals:
 
     (Dempster, Laird and Rubin, J. R. Stat. Soc. B 39 (1977) 1-38.)
     """
-    square = np.asarray(values, float) ** 2
+    square = values**2
     spread = math.sqrt(float(square.mean()))
     mixture = TwoNormals(0.7 * spread, 1.6 * spread, 0.3)
     for _ in range(_STEPS):
-        wide = mixture.share * stats.norm.pdf(np.sqrt(square), 0, mixture.wide)
-        odds = wide / np.maximum(
-            wide + (1 - mixture.share) * stats.norm.pdf(np.sqrt(square), 0, mixture.narrow), 1e-300
-        )
+        wide = mixture.share * stats.norm.pdf(values, 0, mixture.wide)
+        odds = wide / np.maximum(mixture.density(values), 1e-300)
         share = float(odds.mean())
         if not 1e-6 < share < 1 - 1e-6:
             break
@@ -91,26 +87,17 @@ def noise_of(folder: str, sensor: str, seed: int) -> xr.Dataset:
     chosen = sensor_in(folder, sensor)
     near, far = chosen.working_range_mm
     residuals: Residuals = measure_piece(SheetPiece(chosen, seed, "residuals", (math.sqrt(near * far),)))
-    return described(residuals)
-
-
-def described(residuals: Residuals) -> xr.Dataset:
-    """Return the description of residuals that :func:`noise_of` returns."""
     values = residuals.values - residuals.values.mean()
     sigma = float(values.std())
     edges = np.linspace(-_REACH * sigma, _REACH * sigma, _BINS + 1)
-    density, _ = np.histogram(values, edges)
+    counts, _ = np.histogram(values, edges)
     two = two_normals(values[:: max(1, len(values) // _MOST_POINTS)])
     ordered = np.sort(values)
     measured = (np.arange(len(ordered)) + 0.5) / len(ordered)
-    apart = [
-        float(np.abs(measured - model).max())
-        for model in (stats.norm.cdf(ordered, 0, sigma), two.distribution(ordered))
-    ]
-    likelihoods = [
-        float(np.log(np.maximum(densities, 1e-300)).mean())
-        for densities in (stats.norm.pdf(values, 0, sigma), two.density(values))
-    ]
+    models = (stats.norm.cdf(ordered, 0, sigma), two.distribution(ordered))
+    apart = [float(np.abs(measured - model).max()) for model in models]
+    densities = (stats.norm.pdf(values, 0, sigma), two.density(values))
+    likelihoods = [float(np.log(np.maximum(density, 1e-300)).mean()) for density in densities]
     gain = 2 * residuals.independent * (likelihoods[1] - likelihoods[0]) - 2 * math.log(max(residuals.independent, 1))
     region = Roi.around(np.isfinite(residuals.image))
     assert region is not None
@@ -120,7 +107,7 @@ def described(residuals: Residuals) -> xr.Dataset:
     return xr.Dataset(
         {
             "image": (("row", "column"), cut[::step, ::step].astype(np.float32), {"units": "mm"}),
-            "histogram": ("interval", density / (len(values) * width), {"units": "1/mm"}),
+            "histogram": ("interval", counts / (len(values) * width), {"units": "1/mm"}),
             "middle": ("interval", (edges[1:] + edges[:-1]) / 2, {"units": "mm"}),
         },
         attrs={

@@ -40,13 +40,6 @@ def projected_frames(folder: str, scene: str, parameters: tuple[tuple[str, str],
 
     All frames share one scale. Of many frames some are chosen evenly, of those that are not dark. A sensor that
     projects one image has one frame.
-
-    Parameters
-    ----------
-    folder, sensor
-        Folder of the talk, and preset, or path of a sensor file.
-    scene, parameters
-        Path of the artefact's scene, and values of its parameters.
     """
     chosen = sensor_in(folder, sensor)
     loaded = load_scene(Path(folder) / scene, chosen.wavelength_nm, dict(parameters))

@@ -104,9 +104,7 @@ def write_talk(
     shown_frames = {name: frame for name, frame in frames.items() if frame is not None}
     words = f"What {listed(list(shown_frames))} see of the artefact: rendered images of the projected light"
     opening = _drawn(images, "opening", opening_figure(shown_frames), words) if shown_frames else None
-    pictures = [
-        [_drawn(images, name, figure, alt) for name, (figure, alt) in slide.pictures.items()] for slide in slides
-    ]
+    pictures = [[_drawn(images, name, *shown) for name, shown in slide.pictures.items()] for slide in slides]
     intro = _intro(talk, measured)
     content = {
         "title": TITLE,

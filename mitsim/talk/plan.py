@@ -39,7 +39,7 @@ FUNCTIONS: dict[str, Callable[..., xr.Dataset]] = {
     "tilts": coupon_pieces.tilts,
     "sub_clouds": coupon_pieces.sub_clouds,
     "clouds": coupon_pieces.clouds_of_coupon,
-    "validation": coupon_pieces.hold_out,
+    "validation": coupon_pieces.validation_of,
     "noise": noise_pieces.noise_of,
     "scores": view_pieces.scores_of,
 }
@@ -98,32 +98,16 @@ def pieces_of(talk: Talk) -> list[Piece]:
     number = pictured_view(talk)
     sensor, map_name = (file.sensor,), talk.map_name
     pieces = [
-        Piece(
-            f"opening_{sensor_key(name)}",
-            "opening",
-            (artefact_entry.scene, _plain(artefact_entry), name),
-            (name,),
-            (_scene(artefact_entry),),
-        )
+        Piece(f"opening_{sensor_key(name)}", "opening", (*_scene(entry), name), (name,), (_scene(entry),))
         for name in file.opening_sensors
-        for artefact_entry in (file.finishes or file.samples)[:1]
+        for entry in (file.finishes or file.samples)[:1]
     ]
-    pieces += [
-        Piece(
-            f"finish_{finish.key}",
-            "finish",
-            (talk.study_file(finish), number),
-            sensor,
-            (_scene(finish),),
-            files=(file.task,),
-        )
-        for finish in file.finishes
-    ]
+    for finish in file.finishes:
+        arguments, scenes = (talk.study_file(finish), number), (_scene(finish),)
+        pieces.append(Piece(f"finish_{finish.key}", "finish", arguments, sensor, scenes, files=(file.task,)))
     coupon_place = CouponPlace(coupons.campaign, file.sensor, coupons.distance_mm, coupons.roughness_um)
     campaign = read_toml(talk.folder / coupons.campaign, CampaignFile)
-    of_coupons = tuple(
-        (str(Path(coupons.campaign).parent / sample_entry.scene), ()) for sample_entry in campaign.samples
-    )
+    of_coupons = tuple((str(Path(coupons.campaign).parent / sample.scene), ()) for sample in campaign.samples)
     captured = (sensor, of_coupons, "", (coupons.campaign,))
     refined = (coupons.subdivisions, coupons.refined, file.seed)
     pieces.append(Piece("characterised", "characterised", (coupon_place, *refined), *captured))
@@ -140,25 +124,16 @@ def pieces_of(talk: Talk) -> list[Piece]:
             poses = coupons.poses * (_SHOWN_POSES if rough == coupons.shown_roughness_um else 1)
             arguments = (there, map_name, poses, file.seed)
             pieces.append(Piece(validation_name(rough, distance), "validation", arguments, *predicted))
-    for artefact_entry in file.samples:
-        study = (talk.study_file(artefact_entry),)
-        pieces.append(
-            Piece(
-                f"scores_{artefact_entry.key}",
-                "scores",
-                study,
-                sensor,
-                (_scene(artefact_entry),),
-                map_name,
-                (file.task,),
-            )
-        )
+    for entry in file.samples:
+        of_study = (sensor, (_scene(entry),), map_name, (file.task,))
+        pieces.append(Piece(f"scores_{entry.key}", "scores", (talk.study_file(entry),), *of_study))
     numbers = compared_views(talk)
-    for artefact_entry in file.samples:
+    for entry in file.samples:
+        of_study = (sensor, (_scene(entry),), map_name, (file.task,))
         for name, depth in (("direct", 1), ("all", file.light_path_depth)):
-            seen = (talk.study_file(artefact_entry, depth), numbers)
-            of_study = (sensor, (_scene(artefact_entry),), map_name, (file.task,))
-            pieces.append(Piece(f"light_{name}_{artefact_entry.key}", "light", seen, *of_study))
+            pieces.append(
+                Piece(f"light_{name}_{entry.key}", "light", (talk.study_file(entry, depth), numbers), *of_study)
+            )
     return pieces
 
 
@@ -186,12 +161,8 @@ def _as_plain(argument: Any) -> Any:
     return asdict(argument) if is_dataclass(argument) and not isinstance(argument, type) else argument
 
 
-def _scene(artefact_entry: ArtefactEntry) -> tuple[str, tuple[tuple[str, str], ...]]:
-    return artefact_entry.scene, _plain(artefact_entry)
-
-
-def _plain(artefact_entry: ArtefactEntry) -> tuple[tuple[str, str], ...]:
-    return tuple((name, str(value)) for name, value in sorted(artefact_entry.parameters.items()))
+def _scene(entry: ArtefactEntry) -> tuple[str, tuple[tuple[str, str], ...]]:
+    return entry.scene, tuple((name, str(value)) for name, value in sorted(entry.parameters.items()))
 
 
 @lru_cache(maxsize=64)

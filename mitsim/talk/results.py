@@ -36,12 +36,9 @@ class Results:
 
         Raises InputError if its file is damaged.
         """
-        if name not in self._known:
-            result = self._read(name)
-            if result is None:
-                return None
+        if name not in self._known and (result := self._read(name)) is not None:
             self._known[name] = result
-        return self._known[name]
+        return self._known.get(name)
 
     def add(self, name: str, data: xr.Dataset) -> None:
         """Keep the result of a piece in the output folder."""
@@ -56,14 +53,10 @@ class Results:
         self._known[name] = marked
 
     def _read(self, name: str) -> xr.Dataset | None:
-        for folder in (self.folder, *self.fallbacks):
-            path = folder / f"{name}.nc"
-            if not path.exists():
-                continue
-            data = read_dataset(path, _ANY)
-            if data.attrs.get("version") != VERSION:
-                continue
-            if self.any_version or data.attrs.get("digest") == self.digests.get(name):
+        for path in (folder / f"{name}.nc" for folder in (self.folder, *self.fallbacks)):
+            data = read_dataset(path, _ANY) if path.exists() else xr.Dataset()
+            same = self.any_version or data.attrs.get("digest") == self.digests.get(name)
+            if same and data.attrs.get("version") == VERSION:
                 return data
         return None
 

@@ -198,13 +198,8 @@ def results_figure(characterised: xr.Dataset, blinding: tuple[float, float]) -> 
             (panels[1], characterised["recovered_fraction"].values, norms[0], SEQUENTIAL, "F [1]"),
             (panels[2], sigma, norms[1], NOISE, "σ [mm]"),
         ):
-            shown = axes.imshow(
-                np.ma.masked_invalid(values[inside]),
-                origin="lower",
-                extent=(-_GRADIENT, _GRADIENT) * 2,
-                norm=norm,
-                cmap=colours,
-            )
+            image, extent = np.ma.masked_invalid(values[inside]), (-_GRADIENT, _GRADIENT) * 2
+            shown = axes.imshow(image, origin="lower", extent=extent, norm=norm, cmap=colours)
             bar = colour_scale(figure, shown, axes, label, extend="neither", shrink=0.8)
             if isinstance(norm, LogNorm):
                 plain_log_ticks(bar, float(norm.vmin or 0), float(norm.vmax or 1))
@@ -282,19 +277,14 @@ def validation_figure(clouds: xr.Dataset, cells: Sequence[tuple[str, float, xr.D
             axes[name].set_title(f"{shown} at {clouds.attrs['distance_mm']:g} mm: {name}", fontsize=8.5)
             _bare(axes[name])
         colour_scale(figure, picture, [axes["captured"], axes["drawn"]], "off the plane [mm]", location="bottom")
-        here = [
-            dataset for name, distance, dataset in cells if name == shown and distance == clouds.attrs["distance_mm"]
-        ]
-        for dataset in here:
+        residuals_of = {(name, distance): dataset for name, distance, dataset in cells}
+        if (dataset := residuals_of.get((shown, clouds.attrs["distance_mm"]))) is not None:
             order = np.argsort(dataset["incidence"].values)
             incidence = np.degrees(dataset["incidence"].values[order])
             for key, name, label in (("F", "fraction", "F [1]"), ("sigma", "sigma", "σ [mm]")):
-                axes[key].plot(
-                    incidence, dataset[f"{name}_measured"].values[order], "o-", ms=4, color=BLUE, label="captured"
-                )
-                axes[key].plot(
-                    incidence, dataset[f"{name}_predicted"].values[order], "x--", color=VERMILION, label="from the map"
-                )
+                captured, drawn = (dataset[f"{name}_{side}"].values[order] for side in ("measured", "predicted"))
+                axes[key].plot(incidence, captured, "o-", ms=4, color=BLUE, label="captured")
+                axes[key].plot(incidence, drawn, "x--", color=VERMILION, label="from the map")
                 axes[key].set(xlabel="incidence [deg]", ylabel=label, ylim=(0, None))
         axes["F"].legend(loc="best")
         names = list(dict.fromkeys(name for name, _, _ in cells))
@@ -305,13 +295,8 @@ def validation_figure(clouds: xr.Dataset, cells: Sequence[tuple[str, float, xr.D
             ("rs", "sigma_residual", "mean |residual| of σ [%]"),
         ):
             for number, distance in enumerate(distances):
-                values = [
-                    next(
-                        (100 * float(dataset[name]) for n, d, dataset in cells if (n, d) == (sample, distance)),
-                        math.nan,
-                    )
-                    for sample in names
-                ]
+                found = [residuals_of.get((sample, distance)) for sample in names]
+                values = [math.nan if dataset is None else 100 * float(dataset[name]) for dataset in found]
                 positions = np.arange(len(names)) + (number - (len(distances) - 1) / 2) * width
                 axes[key].bar(positions, values, 0.92 * width, label=f"{distance:g} mm", color=f"C{number}")
             axes[key].axhline(10, color=VERMILION, lw=1)
@@ -327,11 +312,8 @@ def light_figure(pairs: Mapping[str, tuple[xr.Dataset, xr.Dataset]]) -> Figure:
         figure = Figure((2.1 * len(pairs) + 0.5, 2.9), layout="constrained")
         row = np.asarray(figure.subplots(1, len(pairs), squeeze=False, sharey=True))[0]
         for axes, (name, pair) in zip(row, pairs.items(), strict=True):
-            for dataset, mark, colour, words in zip(
-                pair, "ox", (MUTED, VERMILION), ("direct light", "all light"), strict=True
-            ):
-                expected, captured = fractions(dataset)
-                axes.plot(expected, captured, mark, ms=4.5, color=colour, label=words)
+            for dataset, mark, colour, words in zip(pair, "ox", (MUTED, VERMILION), ("direct", "all"), strict=True):
+                axes.plot(*fractions(dataset), mark, ms=4.5, color=colour, label=f"{words} light")
             axes.plot([0, 1], [0, 1], color=INK, lw=0.6)
             axes.set(xlim=(-0.04, 1.04), ylim=(-0.04, 1.04), aspect="equal", xlabel="F from the map")
             axes.set_title(name)

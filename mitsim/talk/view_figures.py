@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -25,10 +26,9 @@ def sphere(axes: Axes, scores: xr.Dataset, values: Floats, title: str, label: st
 
     Parameters
     ----------
-    axes, values, error
-        Where to draw, and values (view,), of an ``error`` the small ones bright, on a logarithmic scale.
-    scores
-        Scores of the views, with their directions and those left out.
+    axes, scores, values, error
+        Where to draw; scores with the directions of the views and those left out; values (view,), of an ``error`` the
+        small ones bright, on a logarithmic scale.
     title, label
         Title of the picture, and label of the colour bar with the unit.
     """
@@ -51,13 +51,10 @@ def sphere(axes: Axes, scores: xr.Dataset, values: Floats, title: str, label: st
         norm: Normalize = Normalize(0 if low >= 0 else low, max(high, 1e-9))
         if error and low > 0:
             norm = LogNorm(low, max(high, 1.05 * low))
-        colours = f"{SEQUENTIAL}_r" if error else SEQUENTIAL
-        shown = axes.scatter(
-            x[valid], y[valid], c=values[valid], s=size, norm=norm, cmap=colours, lw=0.3, ec=MUTED, zorder=4
-        )
-        bar = colour_scale(
-            figure_of(axes), shown, axes, label, extend="max" if error else "neither", location="bottom", shrink=0.8
-        )
+        colours, extend = (f"{SEQUENTIAL}_r", "max") if error else (SEQUENTIAL, "neither")
+        dots: dict[str, Any] = {"s": size, "norm": norm, "cmap": colours, "lw": 0.3, "ec": MUTED, "zorder": 4}
+        shown = axes.scatter(x[valid], y[valid], c=values[valid], **dots)
+        bar = colour_scale(figure_of(axes), shown, axes, label, extend=extend, location="bottom", shrink=0.8)
         if isinstance(norm, LogNorm):
             plain_log(bar.ax.xaxis)
     axes.set_title(title, pad=11, fontsize=9)
@@ -154,10 +151,8 @@ def ranks_figure(ranks: Mapping[str, Mapping[str, xr.Dataset]]) -> Figure:
                 correlation = mean_ranks.attrs["correlation"]
                 ends = f"({mean_ranks.attrs['correlation_low']:+.2f} to {mean_ranks.attrs['correlation_high']:+.2f})"
                 label = name if math.isnan(correlation) else f"{name}: {correlation:+.2f} {ends}".replace("-", "−")
-                colour = (BLUE, VERMILION, "#009e73")[number]
-                axes.errorbar(
-                    position, rank, spread, fmt="osD"[number] + "-", ms=4, lw=0.9, capsize=2, color=colour, label=label
-                )
+                colour, line = (BLUE, VERMILION, "#009e73")[number], ("o-", "s-", "D-")[number]
+                axes.errorbar(position, rank, spread, fmt=line, ms=4, lw=0.9, capsize=2, color=colour, label=label)
             axes.set(xlabel="decile of the score, 10 is best", title=f"by {words}", xticks=range(1, 11))
             axes.set(yticks=range(2, 11, 2), ylim=(0.5, 12.5))  # the legend is above
             axes.legend(fontsize=6.5, title="mean rank correlation, 95 % interval", title_fontsize=6.5)

@@ -11,37 +11,23 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from mitsim.study import Study, StudyFile, open_study
+from mitsim.study import StudyFile, open_study
 from mitsim.study.session import Session
 from mitsim.study.virtual.trials import TrialFolder
 from mitsim.study.virtual.world import Trial
 
 #: variables of scores that the page shows
-SHOWN = (
-    "n",
-    "S_f",
-    "R_f",
-    "S_m",
-    "R_m",
-    "V_m",
-    "possible",
-    "predicted_uncertainty",
-    "chance",
-    "azimuth_deg",
-    "elevation_deg",
-)
+SHOWN = "n S_f R_f S_m R_m V_m possible predicted_uncertainty chance azimuth_deg elevation_deg"
 
 
 def scores_of(folder: str, file: StudyFile) -> xr.Dataset:
-    """Return the scores of all candidate views of the artefact in one finish, by the map; nothing is rendered."""
+    """Return the scores that are shown of all candidate views of the artefact in one finish; nothing is rendered.
+
+    ``left_out`` are the directions of impossible views, with their reasons.
+    """
     study = open_study(Path(folder) / "talk.toml", file)
     scores, _ = Session(study).screen()
-    return trimmed(scores, study)
-
-
-def trimmed(scores: xr.Dataset, study: Study) -> xr.Dataset:
-    """Return the variables of scores that are shown, with the ``left_out`` directions and the reasons."""
-    kept = scores[list(SHOWN)].assign_attrs({})
+    kept = scores[SHOWN.split()].assign_attrs({})
     kept["unit"] = ("measurement", scores["unit"].values.astype(str))
     for name in kept.data_vars:
         if kept[name].dtype == np.float64:
