@@ -22,8 +22,8 @@ COVERAGE_FACTOR = 2.0
 NORMAL_COVERAGE = math.erf(COVERAGE_FACTOR / math.sqrt(2))
 
 
-def coverage_interval(z: Floats, confidence: float = 0.95) -> tuple[float, float, float]:
-    """Return the share of |z| up to 2, and the ends of its Clopper-Pearson interval; NaN without any z.
+def coverage_interval(z: Floats) -> tuple[float, float, float]:
+    """Return the share of |z| up to 2, and the ends of its 95 % Clopper-Pearson interval; NaN without any z.
 
     ``z`` (views, repeats) is NaN for missing values. Repeats of one view have systematic errors in common, so they
     count as fewer trials. The effective number is p (1 - p) over the variance of p between views (Korn and Graubard,
@@ -40,5 +40,5 @@ def coverage_interval(z: Floats, confidence: float = 0.95) -> tuple[float, float
     if 0 < p < 1 and views > 1:
         variance = views / (views - 1) * float(((inside - p * trials) ** 2).sum()) / total**2
         effective = float(np.clip(p * (1 - p) / variance, views, total)) if variance > 0 else float(total)
-    _, low, high = recovered_fraction(p * effective, effective, confidence)
+    _, low, high = recovered_fraction(p * effective, effective)
     return p, float(low), float(high)

@@ -110,7 +110,7 @@ def joint_information(view: JoinedView, rigid: Sequence[Floats], motion_covarian
     """Return the information (P, P) of one view on the parameters of all features together; 0 for unseen features.
 
     ``rigid`` is J (p, 6) of each feature; ``motion_covariance`` is K (6, 6). Errors that views have in common are not
-    included. With them, no joining of the views is better than the sum of these.
+    included.
     """
     sizes = [len(jacobian) for jacobian in rigid]
     ends = np.cumsum(sizes)
@@ -131,9 +131,8 @@ def joined_covariance(
 ) -> Floats:
     """Return the covariance (P, P) of all features fitted to the joined points of views; very large for unseen ones.
 
-    ``views``, ``rigid``: what each view contributes to the features; J (p, 6) of each feature. ``motion_covariance``: K
-    (6, 6) of each pose, before the fit if there is one; then not singular. ``best_fit``: whether the poses are
-    estimated together with the features; otherwise the points are merged as they are.
+    ``rigid`` is J (p, 6) of each feature; ``motion_covariance`` K (6, 6) of each pose, before the fit if there is one.
+    ``best_fit``: whether the poses are estimated together with the features; otherwise the points are merged.
     """
     ends = np.cumsum([len(jacobian) for jacobian in rigid])
     out = np.eye(ends[-1]) / NOTHING

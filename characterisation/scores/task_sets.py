@@ -57,14 +57,12 @@ def choose_set(
 
     Parameters
     ----------
-    task, inputs
-        Features and measurements; for every view, the expected input quantities of the measurements.
-    limits
-        By measurement, in its unit; the other measurements are ignored.
-    least_chance
-        A view sees a feature if there are enough points with at least this probability.
-    seconds
-        Time limit of the proof [s]; after it, the greedy set is returned, marked as not exact.
+    task, inputs, limits
+        Features and measurements; for every view, the expected input quantities of the measurements; limits by
+        measurement, in its unit. The other measurements are ignored.
+    least_chance, seconds
+        A view sees a feature if there are enough points with at least this probability. Time limit of the proof [s];
+        after it, the greedy set is returned, marked as not exact.
     joining
         Uncertainty of the poses of the views; exact by default.
     """
@@ -110,27 +108,19 @@ class _JoinedSet:
         best: dict[InputQuantity, ExpectedInput],
         joining: SetJoining,
     ) -> None:
-        self.quantities = list(
-            dict.fromkeys(quantity for quantities in needed_inputs.values() for quantity in quantities)
-        )
-        sizes = [len(best[quantity].fit.covariance) for quantity in self.quantities]
-        ends = dict(zip(self.quantities, np.cumsum(sizes), strict=True))
+        self.quantities = list(dict.fromkeys(quantity for needed in needed_inputs.values() for quantity in needed))
+        variances = [np.diag(best[quantity].fit.covariance) for quantity in self.quantities]
+        rows = np.split(np.arange(sum(map(len, variances))), np.cumsum([len(part) for part in variances])[:-1])
         self.rigid = [
-            np.zeros((size, 6))
-            if quantity.kind == "pose"
-            else rigid_derivatives(best[quantity].estimate, joining.about)
-            for quantity, size in zip(self.quantities, sizes, strict=True)
+            np.zeros((len(part), 6)) if of.kind == "pose" else rigid_derivatives(best[of].estimate, joining.about)
+            for of, part in zip(self.quantities, variances, strict=True)
         ]
-        self.quadratic = np.zeros((len(needed_inputs), sum(sizes), sum(sizes)))
+        self.quadratic = np.zeros((len(needed_inputs), *[sum(map(len, variances))] * 2))
         for m, (name, quantities) in enumerate(needed_inputs.items()):
-            indices = [
-                np.arange(ends[quantity] - len(best[quantity].fit.covariance), ends[quantity])
-                for quantity in quantities
-            ]
-            motion = np.concatenate([self.rigid[self.quantities.index(quantity)] for quantity in quantities])
-            variances = np.concatenate([np.diag(best[quantity].fit.covariance) for quantity in quantities])
-            form = invariant(joint_quadratic_form(task, name, best), motion, variances)
-            self.quadratic[m][np.ix_(np.concatenate(indices), np.concatenate(indices))] = form
+            numbers = [self.quantities.index(quantity) for quantity in quantities]
+            at, motion, variance = (np.concatenate([of[k] for k in numbers]) for of in (rows, self.rigid, variances))
+            form = invariant(joint_quadratic_form(task, name, best), motion, variance)
+            self.quadratic[m][np.ix_(at, at)] = form
 
     def view(self, inputs: dict[InputQuantity, Any], least_chance: float) -> JoinedView:
         """Return the expected fits of these quantities in one view."""
@@ -141,13 +131,9 @@ class _JoinedSet:
             for quantity in self.quantities
         ]
         causes = max((fit.shared.shape[1] for fit in fits if fit is not None), default=1)
-        return JoinedView(
-            tuple(None if fit is None else fit.noise_covariance for fit in fits),
-            tuple(
-                np.zeros((len(motion), causes)) if fit is None else fit.shared
-                for fit, motion in zip(fits, self.rigid, strict=True)
-            ),
-        )
+        nothing = [np.zeros((len(motion), causes)) for motion in self.rigid]
+        shared = tuple(none if fit is None else fit.shared for fit, none in zip(fits, nothing, strict=True))
+        return JoinedView(tuple(None if fit is None else fit.noise_covariance for fit in fits), shared)
 
 
 def _best_known(inputs: Sequence[dict[InputQuantity, Any]]) -> dict[InputQuantity, ExpectedInput]:
@@ -155,8 +141,6 @@ def _best_known(inputs: Sequence[dict[InputQuantity, Any]]) -> dict[InputQuantit
     best: dict[InputQuantity, ExpectedInput] = {}
     for view_inputs in inputs:
         for quantity, expected in view_inputs.items():
-            if isinstance(expected, ExpectedInput) and (
-                quantity not in best or expected.fit.count > best[quantity].fit.count
-            ):
-                best[quantity] = expected
+            if isinstance(expected, ExpectedInput):
+                best[quantity] = max(best.get(quantity, expected), expected, key=lambda one: one.fit.count)
     return best

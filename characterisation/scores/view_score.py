@@ -47,12 +47,10 @@ def view_statistics(
 
     Parameters
     ----------
-    features
-        Names.
-    n, n_white, n_only_white
-        Expected numbers of points, arrays (views, features); they may be fractional.
+    features, n, n_white, n_only_white
+        Names; expected numbers of points, which may be fractional.
     mean_sigma, mean_sigma_white
-        (views, features) [mm]; NaN where a view has no point on a feature.
+        [mm], NaN where a view has no point on a feature.
     """
     arrays = [np.asarray(values, float) for values in (n, mean_sigma, n_white, mean_sigma_white, n_only_white)]
     shape = (len(arrays[0]), len(features))
@@ -166,10 +164,8 @@ def write_scores(
 
     Parameters
     ----------
-    path
-        The file.
-    scores, extra, order
-        As in :func:`score_table`.
+    path, scores, extra, order
+        The file, and as in :func:`score_table`.
     """
     rows = score_table(scores, extra, order)
     with atomic_write(path) as whole, whole.open("w", encoding="utf-8", newline="") as file:

@@ -127,9 +127,8 @@ def fewest_views(
 ) -> ViewSet:
     """Return the fewest views that keep all limits.
 
-    ``features``, ``limits``: information about each feature from every view; l_m (measurements,) in their units.
-    ``seconds``: time limit of the proof; after it, the greedy set is returned, marked as not exact. ``joined``: returns
-    the actual uncertainty of a set; by default :func:`set_uncertainty`.
+    ``limits`` and ``joined`` are those of :func:`greedy_views`. After ``seconds``, the time limit of the proof, the
+    greedy set is returned, marked as not exact.
     """
     began = time.monotonic()
     uncertainty_of = joined or (lambda chosen: set_uncertainty(features, chosen))
@@ -144,13 +143,8 @@ def fewest_views(
     _cut(features, np.zeros(count), limits, greedy.feasible, rows, bounds)
     while (left := seconds - (time.monotonic() - began)) > 0:
         planes = LinearConstraint(np.array(rows), ub=np.array(bounds))
-        solution = milp(
-            np.ones(count),
-            integrality=np.ones(count),
-            bounds=Bounds(0, 1),
-            constraints=planes,
-            options={"time_limit": left},
-        )
+        ones, time_limit = np.ones(count), {"time_limit": left}
+        solution = milp(ones, integrality=ones, bounds=Bounds(0, 1), constraints=planes, options=time_limit)
         if solution.x is None or solution.status != 0:
             break
         chosen = np.round(solution.x)

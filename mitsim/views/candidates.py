@@ -121,13 +121,10 @@ def candidate_views(
 
     Parameters
     ----------
-    table, where
-        Table ``[views]``, and its file, for error messages.
-    sensor
-        Sensor with its working range and its body.
+    table, where, sensor
+        Table ``[views]``, and its file, for error messages; sensor with its working range and its body.
     standoffs
-        [mm], ascending: distance of the target from the reference camera along its axis. On a stage it is the distance
-        of the stage's origin.
+        [mm], ascending: distance of the target, on a stage of its origin, from the reference camera along its axis.
     centre, triangles
         (3,) [mm] target if the table has none; (n, 3, 3) [mm], part frame: surfaces that the sensor's body must not
         touch (:func:`mitsim.scene.ray_casting.triangles.triangles`).
@@ -250,10 +247,8 @@ def _depth(sensor: Sensor, target: Floats, distance: float, range_mm: tuple[floa
         return distance, ""
     if range_mm[0] <= depth <= range_mm[1] and bool(in_image(camera, target)):
         return depth, ""
-    return (
-        depth,
-        f"stage: the target is {depth:.0f} mm deep and {beside:.0f} mm off the axis, outside the image or the range",
-    )
+    position = f"{depth:.0f} mm deep and {beside:.0f} mm off the axis"
+    return depth, f"stage: the target is {position}, outside the image or the range"
 
 
 def _first_free(

@@ -144,15 +144,7 @@ def _solids(triangles: Floats) -> Solids:
 
 
 def is_near(part: Obstacle, box: BodyBox, part_from_sensor: Transform, clearance: float) -> bool:
-    """Return whether any triangle of a part is nearer to a box than ``clearance`` [mm], or meets it.
-
-    Parameters
-    ----------
-    part, part_from_sensor
-        From :func:`obstacle`; pose of the sensor.
-    box, clearance
-        In the sensor frame; [mm].
-    """
+    """Return whether any triangle of a part is nearer to a box than ``clearance`` [mm], or meets it."""
     centre = part_from_sensor.points(box.centre)
     reach = float(np.linalg.norm(box.half)) + clearance
     indices = [members[tree.query_ball_point(centre, reach + radius)] for tree, members, radius in part.trees]
@@ -184,10 +176,7 @@ def is_inside(part: Obstacle, point: Floats) -> bool:
 
 
 def box_distance(triangles: Floats, half: Floats) -> Floats:
-    """Return the distance (n,) [mm] of triangles (n, 3, 3) from a box about the origin; 0 if they meet.
-
-    ``half`` (3,) [mm] are half its side lengths.
-    """
+    """Return the distance (n,) [mm] of triangles (n, 3, 3) from a box about the origin; 0 if they meet."""
     corners, edges = _CORNERS * half, (_CORNERS * half)[_EDGES]
     nearest = np.linalg.norm(_beyond(triangles, half), axis=2).min(axis=1, initial=np.inf)
     sides = np.roll(triangles, -1, axis=1) - triangles
@@ -209,9 +198,8 @@ def _face_distance(triangles: Floats, corners: Floats) -> Floats:
     normal = np.cross(first, second)
     area = (normal**2).sum(axis=1)
     there = area > 0
-    unit = normal / np.sqrt(np.where(there, area, 1.0))[:, None]
-    offset = corners - triangles[:, :1]
     share = np.where(there, area, 1.0)[:, None]
+    unit, offset = normal / np.sqrt(share), corners - triangles[:, :1]
     u = np.einsum("nk,nmk->nm", np.cross(second, normal), offset) / share
     v = np.einsum("nk,nmk->nm", np.cross(normal, first), offset) / share
     over = there[:, None] & (u >= 0) & (v >= 0) & (u + v <= 1)

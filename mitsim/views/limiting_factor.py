@@ -32,18 +32,8 @@ def limiting_factors(
 ) -> tuple[NDArray[np.str_], NDArray[np.str_]]:
     """Return the limiting factor of each measurement in each view, and its feature, (measurement, view) each.
 
-    Parameters
-    ----------
-    task, measured, inputs
-        Features and measurements; of each view, the expected measurements in the order of the task, and their expected
-        input quantities.
-    share, possible
-        R_f (view, feature), share of a feature's points that the rest of the part leaves; whether the measurement is
-        possible (measurement, view).
-
-    See Also
-    --------
-    mitsim.views.view_scores.score_candidates
+    ``measured`` and ``inputs`` are the expected measurements of each view, in the order of the task, and their input
+    quantities; ``share`` is R_f (view, feature), ``possible`` (measurement, view) says whether a measurement is.
     """
     shape = (len(task.measurements), len(measured))
     limit, feature = np.full(shape, "", object), np.full(shape, "", object)
@@ -68,13 +58,10 @@ def limiting_factors(
         among = np.broadcast_to(able[:, None], noise.shape)
         with np.errstate(invalid="ignore", divide="ignore"):
             geometry = parts * np.sqrt(count) / noise
-            excess = np.stack(
-                [
-                    noise / np.min(noise, axis=0, where=among & np.isfinite(noise), initial=np.inf),
-                    np.sqrt(np.max(count, axis=0, where=among & np.isfinite(count), initial=0.0) / count),
-                    geometry / np.min(geometry, axis=0, where=among & (geometry > 0), initial=np.inf),
-                ]
-            )
+            noisier = noise / np.min(noise, axis=0, where=among & np.isfinite(noise), initial=np.inf)
+            fewer = np.sqrt(np.max(count, axis=0, where=among & np.isfinite(count), initial=0.0) / count)
+            flatter = geometry / np.min(geometry, axis=0, where=among & (geometry > 0), initial=np.inf)
+            excess = np.stack([noisier, fewer, flatter])
         for v in range(len(measured)):
             if not np.isfinite(parts[v]).all() or not parts[v].any():
                 limit[m, v] = "few points"

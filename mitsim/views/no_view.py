@@ -37,12 +37,11 @@ def why_no_view(scores: xr.Dataset, measurement: str, shapes: Sequence[str]) -> 
     points = scores["n"].sel(feature=shapes).transpose("view", "feature").values
     most = points.max(axis=0)
     if (most < needed).any():
-        short = [
-            f"{name} has at most {most[k]:.0f} points of {needed:.0f} from any view"
-            + _cause(scores, name, points[:, k], needed)
-            for k, name in enumerate(shapes)
-            if most[k] < needed
-        ]
+        short = []
+        for name, at_most, from_views in zip(shapes, most, points.T, strict=True):
+            if at_most < needed:
+                cause = _cause(scores, name, from_views, needed)
+                short.append(f"{name} has at most {at_most:.0f} points of {needed:.0f} from any view{cause}")
         return "; ".join(short)
     best = int(points.min(axis=1).argmax())
     if points[best].min() < needed:

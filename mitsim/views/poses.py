@@ -45,10 +45,9 @@ def write_views(folder: str | Path, candidates: Candidates, table: ViewsTable, s
 
     Parameters
     ----------
-    folder, candidates
-        Folder to write; the views, and those that were excluded.
-    table, sensor
-        Names the axes of the stage and defines the robot's flange; name of the sensor.
+    folder, candidates, table, sensor
+        Folder to write; the views, and those that were excluded; names the axes of the stage and defines the robot's
+        flange; name of the sensor.
     """
     views, left_out = candidates.views, candidates.left_out
     files = {"poses.csv": _poses_csv(views, table), "poses.json": _poses_json(candidates, table, sensor)}

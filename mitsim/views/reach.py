@@ -96,11 +96,8 @@ def reach_rotations(stage: PartStage, rotations: Floats) -> Reach:
     third = np.broadcast_to(units[2], (len(wanted), 3))
 
     def error(angles: Floats) -> Floats:
-        shown = (
-            rotation_about(units[0], angles[:, 0])
-            @ rotation_about(units[1], angles[:, 1])
-            @ rotation_about(units[2], angles[:, 2])
-        )
+        first, second, third = (rotation_about(unit, angle) for unit, angle in zip(units, angles.T, strict=True))
+        shown = first @ second @ third
         return np.asarray(np.abs(shown - wanted).max(axis=(1, 2)))
 
     def finished(first: Floats, second: Floats) -> Floats:

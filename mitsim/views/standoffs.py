@@ -19,10 +19,8 @@ def chosen_standoffs(where: str | Path, table: ViewsTable, sensor: Sensor, radiu
 
     Parameters
     ----------
-    where, table
-        Table ``[views]``, and its file, for the error.
-    sensor, radius_mm
-        Sensor with its working range; radius of a ball around the part.
+    where, table, sensor, radius_mm
+        File of the table ``[views]``, for the error, and the table; sensor; radius of a ball around the part.
     """
     near, far = sensor.working_range_mm
     for standoff in table.standoffs:
@@ -41,10 +39,8 @@ def characterised_range(
 
     Parameters
     ----------
-    where, table
-        Table ``[views]``, and its file, for the error.
-    sensor, standoffs, distances
-        Sensor with its working range; |V| of the views, and characterised ones [mm].
+    where, table, sensor, standoffs, distances
+        As in :func:`chosen_standoffs`; |V| of the views, and characterised ones [mm].
     """
     for standoff in standoffs:
         if not min(distances) <= standoff <= max(distances):

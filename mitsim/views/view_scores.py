@@ -110,10 +110,8 @@ def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above 
     ----------
     scene, task, views
         Scene with the part; features and measurements; candidate views.
-    predictor, performance_map
-        Casts the rays of the sensor's full grid; map of the sensor.
-    minimum_points
-        Least number of points of a shape.
+    predictor, performance_map, minimum_points
+        Casts the rays of the sensor's full grid; map of the sensor; least number of points of a shape.
     effects
         Effects beyond the map that the predicted uncertainty includes. V_m includes none.
     limit
@@ -196,15 +194,8 @@ def score_candidates(  # noqa: PLR0913 - the parts of a study, which lies above 
     scores.attrs["views_scored"] = len(by_index)
     for name in ("mean_sigma", "n_white", "mean_sigma_white", "n_only_white"):
         scores[name] = statistics[name]
-    uncertainty, chance = (
-        np.array(
-            [
-                [getattr(view_score.measurements[m], name) for view_score in scored]
-                for m in range(len(task.measurements))
-            ]
-        )
-        for name in ("uncertainty", "chance")
-    )
+    rows = [[(one.uncertainty, one.chance) for one in view_score.measurements] for view_score in scored]
+    uncertainty, chance = np.array(rows, float).T
     possible = np.isfinite(uncertainty) & (chance >= LEAST_CHANCE)
 
     def add(name: str, dims: tuple[str, ...], values: Any, long_name: str, units: str = "1") -> None:
@@ -238,14 +229,8 @@ def _not_scored(like: _ViewScore) -> _ViewScore:
     none, unknown = np.zeros_like(like.n), np.full_like(like.sigma, np.nan)
     missing = FitError("not scored, for lack of time")
     measurements = [
-        replace(
-            measurement,
-            uncertainty=math.nan,
-            chance=0.0,
-            reason=str(missing),
-            contributions=(math.nan,) * len(measurement.inputs),
-        )
-        for measurement in like.measurements
+        replace(one, uncertainty=math.nan, chance=0.0, reason=str(missing), contributions=(math.nan,) * len(one.inputs))
+        for one in like.measurements
     ]
     return _ViewScore(none, unknown, none, unknown, none, dict.fromkeys(like.inputs, missing), measurements)
 
@@ -298,11 +283,7 @@ def with_poses(scores: xr.Dataset, views: Sequence[View]) -> xr.Dataset:
     poses = np.stack([view.world_from_sensor.matrix() for view in views])
     scores["world_from_sensor"] = (("view", "i", "j"), poses, {"units": "mm", "long_name": "pose of the sensor"})
     scores["direction"] = (("view", "xyz"), np.stack([view.direction for view in views]), {"units": "1"})
-    for name, values, units in (
-        ("roll_deg", [view.roll_deg for view in views], "deg"),
-        ("elevation_deg", [view.elevation_deg for view in views], "deg"),
-        ("azimuth_deg", [view.azimuth_deg for view in views], "deg"),
-        ("standoff_mm", [view.standoff for view in views], "mm"),
-    ):
-        scores[name] = (("view",), values, {"units": units})
+    for name in ("roll_deg", "elevation_deg", "azimuth_deg"):
+        scores[name] = (("view",), [getattr(view, name) for view in views], {"units": "deg"})
+    scores["standoff_mm"] = (("view",), [view.standoff for view in views], {"units": "mm"})
     return scores

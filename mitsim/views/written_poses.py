@@ -71,10 +71,6 @@ def _check_same(path: Path, number: int, key: str, poses: Mapping[str, Transform
     difference = np.abs(poses[key].matrix() - expected.matrix())
     if difference.max() > _SAME:
         off = f"{difference[:3, 3].max():.3g} mm and {difference[:3, :3].max():.3g} in its rotation"
-        raise InputError(
-            path,
-            f"views.{key} of view {number}",
-            f"a pose that is off by {off} from the one that follows from part_from_sensor",
-            "poses as mitsim wrote them",
-            "run the command again that wrote them; for a pose of your own, give a pose.json",
-        )
+        found = f"a pose that is off by {off} from the one that follows from part_from_sensor"
+        hint = "run the command again that wrote them; for a pose of your own, give a pose.json"
+        raise InputError(path, f"views.{key} of view {number}", found, "poses as mitsim wrote them", hint)
