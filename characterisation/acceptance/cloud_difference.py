@@ -90,10 +90,8 @@ def difference_along_rays(cloud: PointCloud, reference: PointCloud, window: Wind
         allowed = f"the grid of the reference: {_described(reference.grid)}"
         hint = "or use the difference to the surface"
         raise InputError("difference along rays", "grid", _described(cloud.grid), allowed, hint)
-    distance, reference_distance = (
-        np.linalg.norm(compared.points[window].astype(np.float64) - compared.grid.origin, axis=-1)
-        for compared in (cloud, reference)
-    )
+    away = (compared.points[window].astype(np.float64) - compared.grid.origin for compared in (cloud, reference))
+    distance, reference_distance = (np.linalg.norm(vectors, axis=-1) for vectors in away)
     return np.asarray(distance - reference_distance)
 
 
@@ -105,16 +103,14 @@ def difference_to_surface(
 ) -> Floats:
     """Return the difference (h, w) [mm] of a cloud's points in a window from the surface of a reference.
 
-    The difference is NaN where the cloud has no point, or the reference has none within 1 % of the point's distance. It
-    is also NaN beyond the edge of the reference. Raises InputError if the reference has fewer than :data:`NEIGHBOURS`
-    points.
+    It is NaN where the cloud has no point, or the reference has none within 1 % of the point's distance, and beyond the
+    edge of the reference. Raises InputError if the reference has fewer than :data:`NEIGHBOURS` points.
 
     Parameters
     ----------
-    cloud, reference
-        The cloud to judge, and that of the surface in the same frame; they need no common grid.
-    window, progress
-        Rows and columns (h, w), by default all; iterates over the starts of the blocks of points, and may report them.
+    cloud, reference, window, progress
+        The cloud to judge, and that of the surface in the same frame; they need no common grid. Rows and columns (h,
+        w); iterates over the starts of the blocks of points, and may report them.
     """
     surface = reference.points[reference.valid].astype(np.float64)
     if len(surface) < NEIGHBOURS:
@@ -152,16 +148,8 @@ def distribution(difference: Floats, points_given: int) -> Difference:
     if robust == 0 and LEAST_STEP_MM < step < np.inf:  # of rounded depths, of which most are the same
         near = finite[off <= 2 * step]
         median, robust = float(near.mean()), float(near.std(ddof=1))
-    return Difference(
-        len(finite),
-        points_given,
-        float(finite.mean()),
-        median,
-        float(finite.std(ddof=1)),
-        robust,
-        float(low),
-        float(high),
-    )
+    mean, deviation = float(finite.mean()), float(finite.std(ddof=1))
+    return Difference(len(finite), points_given, mean, median, deviation, robust, float(low), float(high))
 
 
 class _Searched:
@@ -180,10 +168,7 @@ class _Searched:
         self.whole: cKDTree | None = self.tree if len(self.near) == len(surface) else None
 
     def neighbours(self, points: Floats, farthest: Floats) -> tuple[NDArray[np.bool_], Floats]:
-        """Return which points (n, 3) have a counterpart within ``farthest`` (n,) [mm], and the neighbours of those.
-
-        The neighbours are the nearest points (m, NEIGHBOURS, 3) of the reference.
-        """
+        """Return which points have a counterpart within ``farthest`` [mm], and the nearest NEIGHBOURS of those."""
         if self.tree is None or not len(points):
             return np.zeros(len(points), bool), np.empty((0, NEIGHBOURS, 3))
         limit = float(farthest.max()) * (1 + 1e-9)
@@ -208,8 +193,7 @@ class _Beside:
     def heights(self, points: Floats, farthest: Floats) -> Floats:
         """Return distances (n,) of points (n, 3) from the surface by the points nearest in direction.
 
-        They are NaN where the noise of these is small, one lies deeper or higher by more than ``farthest`` (n,) [mm],
-        or none is as near.
+        NaN where their noise is small, one lies deeper or higher by more than ``farthest`` (n,) [mm], or none is near.
         """
         out = np.full(len(points), np.nan)
         if self.tree is None or not len(points):
@@ -230,10 +214,7 @@ def _directions(away: Floats) -> Floats:
 
 
 def _to_surface(points: Floats, farthest: Floats, searched: _Searched, viewpoint: Floats) -> Floats:
-    """Return signed distances (n,) of points (n, 3) from a surface, NaN without a counterpart within ``farthest`` (n,).
-
-    The surface at a point is that of second order through its nearest points, over the plane through them.
-    """
+    """Return signed distances (n,) of points (n, 3) from a surface, NaN without a counterpart within ``farthest``."""
     out = np.full(len(points), np.nan)
     met, patch = searched.neighbours(points, farthest)
     points = points[met]
@@ -270,9 +251,8 @@ def _along_ray(points: Floats, beside: Floats, eye: Floats) -> Floats:
 def _over_surface(local: Floats, spread: Floats, axes: Floats, apart: Floats) -> Floats:
     """Return the heights (n,) of points over the surface of second order through their neighbours, NaN beyond its edge.
 
-    ``local`` (n, 3) and ``spread`` (n, k, 3) are points and neighbours about the middle of the neighbours [mm]. The
-    columns of ``axes`` (n, 3, 3) are the direction of the heights, and two across it; ``apart`` (n,) [mm] is about the
-    distance of the neighbours.
+    ``local`` (n, 3) and ``spread`` (n, k, 3) are points and neighbours about the middle of these [mm]. Columns of
+    ``axes`` are the direction of the heights, and two across; ``apart`` [mm] is about the distance of the neighbours.
     """
     height, *foot = np.einsum("nij,ni->jn", axes, local)
     heights, *feet = np.moveaxis(spread @ axes, -1, 0)

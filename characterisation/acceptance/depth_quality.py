@@ -102,12 +102,10 @@ def plane_quality(
     Parameters
     ----------
     cloud, region
-        Points relative to the grid's origin, and a (H, W) mask all of which must show the target; the whole grid if
-        None.
-    ground_truth, baseline_mm
-        True pose of the target; without it, Z accuracy is NaN. b of a stereo sensor.
-    trimmed_share
-        Share of the points excluded at either end of the depths.
+        The cloud, and a (H, W) mask all of which must show the target; the whole grid if None.
+    ground_truth, baseline_mm, trimmed_share
+        True pose of the target; without it, Z accuracy is NaN. b of a stereo sensor. Share of the points excluded at
+        either end of the depths.
     """
     where = "plane_quality"
     region = _region(where, cloud, region)
@@ -216,14 +214,10 @@ def local_planarity_precision(cloud: PointCloud, region: NDArray[np.bool_] | Non
     """
     region = _region("local_planarity_precision", cloud, region)
     rows, columns = (side // PATCH_PX for side in region.shape)
-    cut = cloud.points[: rows * PATCH_PX, : columns * PATCH_PX].astype(float)
-    used = (region & cloud.valid)[: rows * PATCH_PX, : columns * PATCH_PX]
-
-    def tiles(array: NDArray[np.generic], *tail: int) -> NDArray[np.generic]:
-        split = array.reshape(rows, PATCH_PX, columns, PATCH_PX, *tail).swapaxes(1, 2)
-        return split.reshape(rows * columns, PATCH_PX**2, *tail)
-
-    patches = np.asarray(tiles(cut, 3), float)[np.asarray(tiles(used), bool).all(axis=1)]
+    used = np.where((region & cloud.valid)[..., None], cloud.points, np.nan).astype(float)
+    tiles = used[: rows * PATCH_PX, : columns * PATCH_PX].reshape(rows, PATCH_PX, columns, PATCH_PX, 3).swapaxes(1, 2)
+    patches = tiles.reshape(rows * columns, PATCH_PX**2, 3)
+    patches = patches[np.isfinite(patches).all(axis=(1, 2))]
     if not len(patches):
         return float("nan")
     centred = patches - patches.mean(axis=1, keepdims=True)
@@ -246,9 +240,9 @@ def global_planarity_trueness(clouds: Sequence[PointCloud], region: NDArray[np.b
     region = _region(where, clouds[0], region)
     points = sum((cloud.points[region].astype(float) for cloud in clouds), np.zeros(3)) / len(clouds)
     points = points[np.isfinite(points).all(axis=-1)]
-    return (
-        float(np.percentile(np.abs(plane_distances(points)), TRUENESS_PERCENTILE)) if len(points) >= 4 else float("nan")
-    )
+    if len(points) < 4:
+        return float("nan")
+    return float(np.percentile(np.abs(plane_distances(points)), TRUENESS_PERCENTILE))
 
 
 def _check_clouds(where: str, clouds: Sequence[PointCloud], least: int, hint: str, alike: bool = True) -> None:

@@ -33,17 +33,17 @@ LEAST_REJECTED = 3
 _SEED = 26342
 
 
-def flatness_uncertainty(points: ArrayLike, rejected_share: float = REJECTED_SHARE) -> float:
+def flatness_uncertainty(points: ArrayLike) -> float:
     """Return the standard uncertainty [mm] of the flatness error of points (n, 3), conditional on the form read.
 
     It is NaN if fewer than :data:`LEAST_REJECTED` points are rejected.
     """
     finite = _finite(points)
-    if _rejected(finite, rejected_share) < LEAST_REJECTED:
+    if _rejected(finite) < LEAST_REJECTED:
         return math.nan
     centred = finite - finite.mean(axis=0)
     axes = np.linalg.svd(centred, full_matrices=False)[2]
-    return _range_uncertainty(centred @ axes[:2].T, plane_distances(finite), rejected_share)
+    return _range_uncertainty(centred @ axes[:2].T, plane_distances(finite))
 
 
 def form_error_uncertainty(points: ArrayLike, centre: ArrayLike) -> float:
@@ -52,12 +52,12 @@ def form_error_uncertainty(points: ArrayLike, centre: ArrayLike) -> float:
     It is conditional on the form that was read, and NaN if fewer than :data:`LEAST_REJECTED` points are rejected.
     """
     away = _finite(points) - np.asarray(centre, float)
-    if _rejected(away, REJECTED_SHARE) < LEAST_REJECTED:
+    if _rejected(away) < LEAST_REJECTED:
         return math.nan
     radii = np.linalg.norm(away, axis=1)
     directions = away / radii[:, None]
     axes = np.linalg.svd(directions - directions.mean(axis=0), full_matrices=False)[2]
-    return _range_uncertainty(directions @ axes[:2].T, radii - radii.mean(), REJECTED_SHARE)
+    return _range_uncertainty(directions @ axes[:2].T, radii - radii.mean())
 
 
 def _finite(points: ArrayLike) -> Floats:
@@ -65,13 +65,13 @@ def _finite(points: ArrayLike) -> Floats:
     return np.asarray(array[np.isfinite(array).all(axis=1)])
 
 
-def _rejected(points: Floats, share: float) -> int:
-    return int(share * len(points))
+def _rejected(points: Floats) -> int:
+    return int(REJECTED_SHARE * len(points))
 
 
-def _range_uncertainty(positions: Floats, deviations: Floats, rejected_share: float) -> float:
+def _range_uncertainty(positions: Floats, deviations: Floats) -> float:
     """Return the standard deviation of the range of deviations (n,) at positions (n, 2) whose noise is drawn again."""
-    stay = len(deviations) - _rejected(deviations, rejected_share)
+    stay = len(deviations) - _rejected(deviations)
     low, high = positions.min(axis=0), positions.max(axis=0)
     u, v = (2 * (positions - low) / np.maximum(high - low, 1e-12) - 1).T
     pairs = [(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
@@ -79,9 +79,6 @@ def _range_uncertainty(positions: Floats, deviations: Floats, rejected_share: fl
     modes = np.column_stack([along[:, i] * across[:, j] for i, j in pairs])
     form = modes @ np.linalg.lstsq(modes, deviations, rcond=None)[0]
     noise, rng = deviations - form, np.random.default_rng(_SEED)
-    ranges = []
-    for _ in range(DRAWS):
-        drawn = form + rng.choice(noise, len(noise))
-        kept = drawn[np.argpartition(np.abs(drawn), stay - 1)[:stay]]
-        ranges.append(np.ptp(kept))
+    drawn = (form + rng.choice(noise, len(noise)) for _ in range(DRAWS))
+    ranges = [np.ptp(one[np.argpartition(np.abs(one), stay - 1)[:stay]]) for one in drawn]
     return float(np.std(ranges, ddof=1))

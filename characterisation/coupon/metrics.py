@@ -103,11 +103,7 @@ def ray_noise_std(points: NDArray[np.floating]) -> RayNoise:
 def _fit_and_spread(
     coordinates: Floats, distance: Floats, present: NDArray[np.bool_], mean_ray: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Fit planes along the rays; return them with the residuals and their standard deviations.
-
-    - The planes a = n/c with 1/t = a.d, (p, 3).
-    - The residuals along the rays, (p, n).
-    - Their standard deviations with n - 3 degrees of freedom, (p,).
+    """Fit planes a = n/c (p, 3) along the rays; return them, the residuals (p, n), and their standard deviations (p,).
 
     All are NaN where the points span no plane. ``coordinates`` (p, 3, n) and ``distance`` (p, n) are 0 where
     ``present`` is false.
@@ -176,8 +172,7 @@ def recovered_fraction(
 
     F is that of the talk's slide *Point Cloud Processing*: density of recovered points over maximum possible density.
     ``possible`` need not be whole. All three are in 0..1, NaN where no point was possible. The interval assumes
-    independent pixels. Neighbouring pixels of SGBM are not independent, so the width of the interval is a lower bound
-    of the spread.
+    independent pixels; those of SGBM are not, so its width is a lower bound of the spread.
     """
     n, m = np.asarray(count, float), np.asarray(possible, float)
     if np.any(n > m) or np.any(n < 0):
@@ -193,8 +188,8 @@ def recovered_fraction(
 def clipped(fraction: ArrayLike) -> tuple[Floats, Floats]:
     """Return F limited to at most 1, and the excess over 1.
 
-    A density can exceed 1 by about 1 / sqrt(n) because whole pixels are counted on a given area. Otherwise lambda, the
-    pose or the reference is wrong. This is always the cause of a large excess.
+    A density can exceed 1 by about 1 / sqrt(n) because whole pixels are counted on a given area. A larger excess means
+    that lambda, the pose or the reference is wrong.
     """
     fraction = np.asarray(fraction, float)
     return np.minimum(fraction, 1.0), np.maximum(fraction - 1.0, 0.0)
@@ -210,14 +205,9 @@ def density_fraction(
 ) -> Floats:
     """Return F from point density and calibrated lambda, the talk's rho: lambda^2 n |V|^2 / (A N.V), times cos^3(phi).
 
-    It can exceed 1: see :func:`clipped`.
-
-    - ``count``, ``area``, ``distance``, ``cos_incidence``: n [1], patch area A [mm^2], |V| [mm], and N.V [1]: the
-      cosine of incidence, positive.
-    - ``angular_pitch``: lambda [rad], the angle between neighbouring pixels on the axis; lambda^2 is the solid angle of
-      a pixel.
-    - ``cos_off_axis``: cos(phi) of the patch. A pixel of a flat imager covers lambda^2 cos^3(phi): without this factor
-      an ideal sensor would reach 1.21 at 20 deg off its axis.
+    It can exceed 1: see :func:`clipped`. n is ``count``, A ``area`` [mm^2], |V| ``distance`` [mm], N.V
+    ``cos_incidence``; lambda [rad] is ``angular_pitch``, between neighbouring pixels on the axis. A pixel of a flat
+    imager covers lambda^2 cos^3(phi): without this factor an ideal sensor would reach 1.21 at 20 deg off its axis.
     """
     count, area, distance = np.asarray(count, float), np.asarray(area, float), np.asarray(distance, float)
     solid_angle = angular_pitch**2 * np.asarray(cos_off_axis, float) ** 3

@@ -53,9 +53,7 @@ LEAST_SHARE = 0.3
 def known_offset(points: Floats, inlier: NDArray[np.bool_], normal: Floats, reach: float) -> Floats:
     """Return the mean distance o [mm] (p,) of patches from the known plane, along the rays; NaN with too few inliers.
 
-    - ``points``, ``inlier``: (p, n, 3) [mm] relative to the optical centre of the sensor, and (p, n) mask of those
-      used.
-    - ``normal``, ``reach``: the plane q . normal = reach, normal (3,) and reach [mm].
+    ``points`` (p, n, 3) [mm] are relative to the optical centre of the sensor. The plane is q . normal = reach [mm].
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         beyond = np.linalg.norm(points, axis=-1) * (1.0 - reach / (points @ normal))
@@ -68,8 +66,8 @@ def known_offset(points: Floats, inlier: NDArray[np.bool_], normal: Floats, reac
 def neighbour_products(offset: Floats, centres: NDArray[np.integer], radius_px: float) -> tuple[Floats, Floats]:
     """Return the mean product [mm^2] of each patch's offset with the offsets of its neighbours.
 
-    There are two arrays (p,): for neighbours that touch (:data:`TOUCHING`), and for those apart (:data:`APART`).
-    ``centres`` is (p, 2) [px]. The product is NaN where a patch or all of its neighbours have no offset.
+    Arrays (p,) for neighbours that touch (:data:`TOUCHING`), and for those apart (:data:`APART`); NaN where a patch or
+    all of its neighbours have no offset.
     """
     out = np.full((2, len(offset)), np.nan)
     finite = np.flatnonzero(np.isfinite(offset))
@@ -94,10 +92,8 @@ def noise_area(k_0: Floats, k_1: Floats, k_2: Floats, radius_px: float) -> tuple
 
     Parameters
     ----------
-    k_0, k_1, k_2
-        K_0, K_1 and K_2 in units of sigma^2.
-    radius_px
-        Radius of the discs.
+    k_0, k_1, k_2, radius_px
+        K_0, K_1 and K_2 in units of sigma^2; radius of the discs.
     """
     persistent = np.maximum(k_2, 0.0)
     cell = np.sqrt(3) / 2 * (2 * radius_px) ** 2
@@ -118,11 +114,7 @@ def _areas(radius_px: float) -> tuple[Floats, Floats]:
     plane = np.linalg.qr(np.column_stack([np.ones(len(offsets)), offsets]))[0]
     square = ((offsets[:, None] - offsets) ** 2).sum(-1)
     a = np.geomspace(1.0, 400.0, 60)
-    kept = []
-    for area in a:
-        correlation = np.exp(-np.pi * square / area)
-        trace = len(offsets) - np.einsum("ik,ij,jk->", plane, correlation, plane)
-        kept.append(trace / (len(offsets) - 3))
-    areas = a / np.array(kept)
+    removed = [np.einsum("ik,ij,jk->", plane, np.exp(-np.pi * square / area), plane) for area in a]
+    areas = a / ((len(offsets) - np.array(removed)) / (len(offsets) - 3))
     areas[0] = min(areas[0], 1.0)
     return a, areas

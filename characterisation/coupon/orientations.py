@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial import cKDTree
 
+from characterisation.files.arrays import Floats
 from characterisation.files.documents import Document
 
 # an icosahedron on the unit sphere has 10 * 4^k + 2 vertices after k subdivisions:
@@ -59,12 +60,12 @@ class Refinement(Document):
 class RefinedNormals:
     """Result of :func:`refine`: ``normals`` (m, 3) to add; number of ``unresolved`` edges that may not be halved."""
 
-    normals: NDArray[np.float64]
+    normals: Floats
     unresolved: int
 
 
 @lru_cache(maxsize=8)
-def _sphere(subdivisions: int) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+def _sphere(subdivisions: int) -> tuple[Floats, NDArray[np.int64], NDArray[np.int64]]:
     """Return vertices (n, 3), edges (e, 2) and edges of each face (f, 3) of a subdivided icosahedron, poles on z."""
     sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
     vertices = np.asarray(sphere.vertices, np.float64)
@@ -74,12 +75,12 @@ def _sphere(subdivisions: int) -> tuple[NDArray[np.float64], NDArray[np.int64], 
     return np.asarray(vertices @ turn.T), edges, of_faces
 
 
-def sphere_directions(subdivisions: int) -> NDArray[np.float64]:
+def sphere_directions(subdivisions: int) -> Floats:
     """Return the vertices (10 * 4^k + 2, 3) of an icosahedron subdivided k times, on the unit sphere, poles on z."""
     return _sphere(subdivisions)[0].copy()
 
 
-def cap_directions(subdivisions: int, largest_angle: float) -> NDArray[np.float64]:
+def cap_directions(subdivisions: int, largest_angle: float) -> Floats:
     """Return the directions (n, 3) of the sphere within ``largest_angle`` [rad] of +z, nearest first.
 
     They are the normals of the coupon in the view frame, whose z axis points toward the sensor (talk of Kinnell and
@@ -92,11 +93,11 @@ def cap_directions(subdivisions: int, largest_angle: float) -> NDArray[np.float6
 
 
 def refine(
-    normals: NDArray[np.float64],
-    fraction: NDArray[np.float64],
-    fraction_error: NDArray[np.float64],
-    sigma: NDArray[np.float64],
-    sigma_error: NDArray[np.float64],
+    normals: Floats,
+    fraction: Floats,
+    fraction_error: Floats,
+    sigma: Floats,
+    sigma_error: Floats,
     refinement: Refinement,
     largest_angle: float,
 ) -> RefinedNormals:
@@ -108,10 +109,8 @@ def refine(
         (n, 3) measured so far: vertices of icosahedra of various subdivisions.
     fraction, fraction_error, sigma, sigma_error
         (n,) F and sigma [mm] there with their standard errors. Sigma is NaN, and ignored, where no point was recovered.
-    refinement
-        Where to add normals.
-    largest_angle
-        Largest incidence [rad] of an added normal.
+    refinement, largest_angle
+        Where to add normals; largest incidence [rad] of an added one.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         measures = [
@@ -124,7 +123,7 @@ def refine(
     tree = cKDTree(normals)
     half_way = np.zeros(len(normals), bool)
     bent = np.zeros((2, len(normals)), bool)
-    added: list[NDArray[np.float64]] = []
+    added: list[Floats] = []
     unresolved = 0
     for level in range(refinement.subdivisions + 1):
         vertices, edges, of_faces = _sphere(level)
@@ -157,9 +156,7 @@ def refine(
     return RefinedNormals(new[order], unresolved)
 
 
-def _differ(
-    values: NDArray[np.float64], errors: NDArray[np.float64], ends: NDArray[np.int64], tolerance: float
-) -> NDArray[np.bool_]:
+def _differ(values: Floats, errors: Floats, ends: NDArray[np.int64], tolerance: float) -> NDArray[np.bool_]:
     """Return along which edges (e, 2) the values differ by more than a tolerance, and by more than chance."""
     difference = np.abs(values[ends[:, 0]] - values[ends[:, 1]])
     chance = 2 * np.hypot(errors[ends[:, 0]], errors[ends[:, 1]])
@@ -168,11 +165,7 @@ def _differ(
 
 
 def _bent(
-    values: NDArray[np.float64],
-    errors: NDArray[np.float64],
-    ends: NDArray[np.int64],
-    middle: NDArray[np.int64],
-    tolerance: float,
+    values: Floats, errors: Floats, ends: NDArray[np.int64], middle: NDArray[np.int64], tolerance: float
 ) -> NDArray[np.bool_]:
     """Return which edges (e, 2) differ in the middle (e,) from the mean of their ends, by more than both limits."""
     off = np.abs(values[middle] - values[ends].mean(axis=1))

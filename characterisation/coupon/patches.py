@@ -23,14 +23,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from characterisation.coupon import metrics
 from characterisation.coupon.discs import disc_offsets, independent_share
-from characterisation.coupon.metrics import (
-    clipped,
-    density_fraction,
-    ray_noise_std,
-    recovered_fraction,
-    reference_fraction,
-)
+from characterisation.coupon.metrics import ray_noise_std
 from characterisation.coupon.offsets import known_offset, neighbour_products
 from characterisation.coupon.patch_table import patch_table
 from characterisation.coupon.view_frame import in_view_frame
@@ -89,10 +84,6 @@ def patch_centres(
     """Return pixels (p, 2) as (row, column) about which a disc lies on the coupon, ``margin_px`` from its edge.
 
     The centres form a hexagonal lattice with ``step_px`` between neighbours, anchored at the centre of the coupon.
-
-    ``grid``, ``coupon``: pixels of the cloud; pose and size of the coupon, sensor frame. ``radius_px``, ``margin_px``,
-    ``step_px``: radius of the discs, their least distance from the edge of the coupon, and distance of neighbouring
-    centres.
     """
     corners, middle = outline(grid, coupon), grid.project(coupon.centre)
     if not len(corners) or not (np.isfinite(corners).all() and np.isfinite(middle).all()):
@@ -135,11 +126,10 @@ def measure_patches(
     ----------
     cloud, coupon
         Organised cloud of the coupon; its pose and size, sensor frame.
-    radius_px, margin_px
+    radius_px, margin_px, step_px
         Radius of the disc; 6 px hold 113 possible points. Distance from the disc to the edge of the coupon: about one
-        matching block, within which the background affects the result.
-    step_px
-        Distance between neighbouring centres [px]. The default, 2 x radius, keeps patches apart and so independent.
+        matching block, within which the background affects the result. Distance between neighbouring centres; the
+        default, 2 x radius, keeps patches apart and so independent.
     angular_pitch
         Lambda [rad] of the sensor, from its calibration. With it, the number of possible points follows from the area
         of the patch on the surface. Without it, that is the number of pixels of the disc, which is the same if the grid
@@ -188,16 +178,16 @@ def measure_patches(
     ellipse = _ellipses(grid, coupon, rows, columns, radius_px)
     if reference is not None:
         possible = _points_of(reference, coupon, pixels)[1].sum(-1).astype(float)
-        fraction, low, high, excess = reference_fraction(noise.count, possible, len(offsets))
+        fraction, low, high, excess = metrics.reference_fraction(noise.count, possible, len(offsets))
     elif angular_pitch is not None:
         area = ellipse["area_per_pixel"] * len(offsets)
-        full = density_fraction(len(offsets), area, distance, normal[:, 2], angular_pitch, cos_off_axis)
+        full = metrics.density_fraction(len(offsets), area, distance, normal[:, 2], angular_pitch, cos_off_axis)
         possible = len(offsets) / full
-        fraction, excess = clipped(noise.count / possible)
-        _, low, high = recovered_fraction(np.minimum(noise.count, possible), possible)
+        fraction, excess = metrics.clipped(noise.count / possible)
+        _, low, high = metrics.recovered_fraction(np.minimum(noise.count, possible), possible)
     else:
         possible = np.full(len(centres), len(offsets))
-        fraction, low, high = recovered_fraction(noise.count, possible)
+        fraction, low, high = metrics.recovered_fraction(noise.count, possible)
         excess = np.zeros(len(centres))
     return patch_table(
         recovered_fraction=fraction,
@@ -284,11 +274,7 @@ def _pixels(cloud: PointCloud, centres: NDArray[np.int64], radius_px: float) -> 
 
 
 def _points_of(cloud: PointCloud, coupon: Coupon, pixels: NDArray[np.int64]) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return points (p, n, 3) relative to the grid's origin at flat pixel numbers, and which lie near the coupon.
-
-    A point lies near the coupon if its distance along the ray is within :data:`FALSE_SHARE_OF_DISTANCE` of the expected
-    one.
-    """
+    """Return points (p, n, 3) relative to the grid's origin at flat pixel numbers, and which lie near the coupon."""
     points = cloud.points.reshape(-1, 3)[pixels] - cloud.grid.origin
     reach = (coupon.centre - cloud.grid.origin) @ coupon.normal
     with np.errstate(invalid="ignore", divide="ignore"):

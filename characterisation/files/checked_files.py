@@ -32,20 +32,10 @@ def read_bounded(
 
     Parameters
     ----------
-    file
-        Path of the file.
-    absent
-        Description of the expected file, for the error about a missing file.
-    hint
-        Advice that the errors add.
-    largest
-        Largest size [bytes].
-    first
-        Number of bytes to read from the beginning; by default all.
-
-    See Also
-    --------
-    read_text_bounded : text
+    file, absent, hint
+        The file; a description of the expected file, for the error about a missing one; advice that the errors add.
+    largest, first
+        Largest size [bytes]; number of bytes to read from the beginning, by default all.
     """
     try:
         about = file.stat()
@@ -58,9 +48,9 @@ def read_bounded(
         if len(data) > largest:
             raise InputError(file, "size", f"over {largest} bytes", f"up to {largest} bytes", hint)
         return data
+    except InputError:
+        raise
     except ValueError as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(file, "", f"a path that cannot be ({error})", "the path of a file", hint) from None
     except OSError as error:
         if absent is not None and isinstance(error, FileNotFoundError):
@@ -77,17 +67,12 @@ def read_text_bounded(file: Path, absent: str | None = None, hint: str = "", lar
     ----------
     file, absent, hint, largest
         As in :func:`read_bounded`.
-
-    See Also
-    --------
-    read_bounded : bytes
     """
     try:
         return read_bounded(file, absent, hint, largest).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(
-            file, "", f"text that is not UTF-8 ({error.reason} at byte {error.start})", "UTF-8", hint
-        ) from None
+        found = f"text that is not UTF-8 ({error.reason} at byte {error.start})"
+        raise InputError(file, "", found, "UTF-8", hint) from None
 
 
 def read_json_object(file: Path, absent: str | None = None, hint: str = "") -> dict[str, Any]:

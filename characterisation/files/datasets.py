@@ -117,10 +117,7 @@ def read_dataset(path: str | Path, schema: Schema) -> xr.Dataset:
 
 
 def check_dataset(path: str | Path, data: xr.Dataset, schema: Schema) -> None:
-    """Check a dataset that was converted from another kind of file.
-
-    Raises InputError if a variable violates the schema. The error names the file and the variable.
-    """
+    """Check a dataset that was converted from another kind of file; InputError with the file and the variable."""
     _check_form(Path(path), data, schema)
     _check_content(Path(path), data, schema)
 
@@ -138,8 +135,7 @@ def _check_content(path: Path, data: xr.Dataset, schema: Schema) -> None:
 def _check_bytes(path: Path, schema: Schema) -> None:
     """Reject a damaged file before this process parses it: HDF5 may hang or crash on such a file.
 
-    A valid seal (:func:`characterisation.files.atomic_io.write_netcdf`) proves that the file is as it was written. A
-    file without a seal is first read in a separate process.
+    A valid seal (:func:`characterisation.files.atomic_io.write_netcdf`) proves that it is as it was written.
     """
     data = read_bounded(path, schema.made_by, schema.hint, LARGEST_DATASET)
     body, seal = data[: -len(SEAL) - 64], data[-len(SEAL) - 64 :]
@@ -147,10 +143,9 @@ def _check_bytes(path: Path, schema: Schema) -> None:
         if hashlib.sha256(body).hexdigest().encode() != seal[len(SEAL) :]:
             raise _unreadable(path, schema, ": damaged since it was written")
         return
+    command = [sys.executable, "-c", _PROBE, str(path.resolve())]
     try:
-        done = subprocess.run(
-            [sys.executable, "-c", _PROBE, str(path.resolve())], capture_output=True, timeout=PATIENCE_S, check=False
-        )
+        done = subprocess.run(command, capture_output=True, timeout=PATIENCE_S, check=False)
         failure = "" if done.returncode == 0 else done.stderr.decode("utf-8", "replace").strip()[-200:] or "it crashes"
     except subprocess.TimeoutExpired:
         failure = f"its reader did not finish within {PATIENCE_S:g} s"

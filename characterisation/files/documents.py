@@ -45,9 +45,7 @@ def checked_name(name: str) -> str:
     Raises ValueError if the name is not allowed; pydantic turns it into an :class:`InputError`.
     """
     # marks belong to the letter before them, as in Thai and Hindi; none is a letter of its own
-    letters = name[:1] + "".join(
-        character for character in name[1:] if not unicodedata.category(character).startswith("M")
-    )
+    letters = name[:1] + "".join(letter for letter in name[1:] if not unicodedata.category(letter).startswith("M"))
     if len(name.encode("utf-8", "replace")) > LONGEST_NAME or not re.fullmatch(_NAME, letters):
         raise ValueError(
             f"a name of at most {LONGEST_NAME} bytes that begins with a letter, digit or underscore, of these, spaces "
@@ -72,18 +70,8 @@ def validate(where: str | Path, table: dict[str, Any], model: type[Model], conte
 
     Parameters
     ----------
-    where
-        File or object that messages name.
-    table
-        Parsed content of the file.
-    model
-        Type of the document.
-    context
-        Passed to the validators of the model.
-
-    See Also
-    --------
-    read_toml : a TOML file
+    where, table, model, context
+        File or object that messages name; parsed content of the file; type of the document; passed to its validators.
     """
     try:
         return model.model_validate(table, context=context)
@@ -105,13 +93,10 @@ def missing_keys(table: dict[str, Any], model: type[Document], context: Any = No
     otherwise the key is a value.
     """
     filled = copy.deepcopy(table)
-    lacking: dict[tuple[Any, ...], None] = {}
-    while True:
-        new = [loc for loc in _missing_in(filled, model, context) if loc not in lacking]
-        if not new:
-            break
+    lacking: list[tuple[Any, ...]] = []
+    while new := [loc for loc in dict.fromkeys(_missing_in(filled, model, context)) if loc not in lacking]:
+        lacking += new
         for loc in new:
-            lacking[loc] = None
             _fill(filled, loc)
     tables = {loc[:depth] for loc in lacking for depth in range(1, len(loc))}
     return [".".join(map(str, loc)) for loc in lacking if loc not in tables]
@@ -176,28 +161,22 @@ def _explain(
             also = f"Also missing: {', '.join(other_keys)}" if other_keys else ""
             above = "" if meant and key not in fields_of(model) else _header_above(where, field)
             meant = "" if above else meant
-            return InputError(
-                where, field, "an unknown key", ", ".join(names) or "no keys", _joined(meant, above, also)
-            )
+            hint = _joined(meant, above, also)
+            return InputError(where, field, "an unknown key", ", ".join(names) or "no keys", hint)
         case "missing" | "union_tag_not_found":
             return missing_error(where, missing or [field])
         case "union_tag_invalid":
             key = f"{field}.{context['discriminator'].strip(chr(39))}".strip(".")
-            names = [tag.strip("' ") for tag in context["expected_tags"].split(",")]
-            return InputError(
-                where,
-                key,
-                shown(context["tag"], where),
-                ", ".join(map(repr, names)),
-                _joined(nearest(str(context["tag"]), names), also),
-            )
+            tag, names = context["tag"], [tag.strip("' ") for tag in context["expected_tags"].split(",")]
+            hint = _joined(nearest(str(tag), names), also)
+            return InputError(where, key, shown(tag, where), ", ".join(map(repr, names)), hint)
         case "value_error":
             allowed = str(context.get("error", fault["msg"]))
             key = allowed.partition(" ")[0]  # a rule of several keys names the first
-            if isinstance(fault["input"], dict) and key in fault["input"]:
-                field = f"{field}.{key}".removeprefix(".")
-                return InputError(where, field, shown(fault["input"][key], where), allowed, also)
-            return InputError(where, field, shown(fault["input"], where), allowed, also)
+            found = fault["input"]
+            if isinstance(found, dict) and key in found:
+                field, found = f"{field}.{key}".removeprefix("."), found[key]
+            return InputError(where, field, shown(found, where), allowed, also)
         case "model_type" | "model_attributes_type" | "dict_type" | "dataclass_type":
             keys = ", ".join(_keys_at(model, fault["loc"]))
             return InputError(where, field, shown(fault["input"], where), "a table" + f": {keys}" * bool(keys), also)
@@ -242,12 +221,8 @@ def _keys_at(model: type[Document], location: tuple[Any, ...]) -> list[str]:
         variants = [table for table in models if part in _tags(table)]
         inside = [fields_of(table)[part].annotation for table in models if part in fields_of(table)]
         values = [get_args(annotation)[-1] for annotation in here if get_origin(annotation) is dict]
-        items = [
-            part_of
-            for annotation in here
-            if get_origin(annotation) in (list, tuple, set)
-            for part_of in get_args(annotation)
-        ]
+        lists = [annotation for annotation in here if get_origin(annotation) in (list, tuple, set)]
+        items = [member for annotation in lists for member in get_args(annotation)]
         if isinstance(part, int):
             here = items
         elif part != "[key]" and not str(part).startswith("function-"):

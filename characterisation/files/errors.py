@@ -20,16 +20,10 @@ class InputError(ValueError):
 
     Parameters
     ----------
-    where
-        The file or command argument that holds the fault.
-    field
-        The field inside it (``campaign.distances_mm``), or "" for the whole file.
-    found
-        The value found there.
-    allowed
-        The values that are allowed.
-    hint
-        What to do, unless it is only to give an allowed value.
+    where, field
+        The file or command argument that holds the fault; the field inside it (``campaign.distances_mm``), or "".
+    found, allowed, hint
+        The value found there; the values that are allowed; what to do, unless it is only to give one of these.
     """
 
     def __init__(self, where: str | Path, field: str, found: Any, allowed: str, hint: str = "") -> None:

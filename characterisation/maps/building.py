@@ -34,8 +34,6 @@ Variant = tuple[str, Literal["low", "high"]]
 #: nodes of the grid along each axis: 1.2 deg apart for 60 deg of incidence, about as wide as a patch
 NODES = 97
 
-_SPREADS = {"recovered_fraction": "recovered_fraction_spread", "ray_noise_std": "ray_noise_std_spread"}
-
 _DESCRIBED = {
     "recovered_fraction": ("1", "fraction of points recovered, F"),
     "ray_noise_std": ("mm", "standard deviation along the view ray, sigma, without outliers"),
@@ -73,16 +71,15 @@ def build_map(
 
     Parameters
     ----------
-    tables
-        Patches of each sample.
-    attributes
-        Written into the map: ``sensor``, ``source``, ``exposure_rule`` and everything else that makes it reproducible.
-        The exposure policy is part of a map's identity.
+    tables, attributes
+        Patches of each sample; written into the map: ``sensor``, ``source``, ``exposure_rule`` and everything else that
+        makes it reproducible.
     largest_incidence, nodes
         Largest incidence [rad] of the campaign, beyond which nodes are NaN, as outside the hull of the patches; number
         of nodes along each axis of the equal-area grid.
     """
-    samples = sorted({(t.finish, t.roughness if not math.isnan(t.roughness) else -1.0) for t in tables})
+    keys = [(t.finish, t.roughness if not math.isnan(t.roughness) else -1.0) for t in tables]
+    samples = sorted(set(keys))
     distances = sorted({t.distance for t in tables})
     reach = 2 * math.sin(largest_incidence / 2)
     axis = np.linspace(-reach, reach, nodes)
@@ -90,8 +87,7 @@ def build_map(
     fields = {name: np.full(shape, np.nan) for name in _DESCRIBED}
     lights: list[Light | None] = [None] * len(samples)
     ends: dict[tuple[int, int], dict[Variant, dict[str, Floats]]] = {}
-    for table in tables:
-        key = (table.finish, table.roughness if not math.isnan(table.roughness) else -1.0)
+    for table, key in zip(tables, keys, strict=True):
         i, j = samples.index(key), distances.index(table.distance)
         pooled = _at_nodes(table, axis, reach)
         if table.variant is not None:
@@ -101,24 +97,22 @@ def build_map(
         for name, values in pooled.items():
             fields[name][i, j] = values
     for index, variants in ends.items():
-        for name, spread in _SPREADS.items():
-            fields[spread][index] = _spread({variant: pooled[name] for variant, pooled in variants.items()})
+        for name in ("recovered_fraction", "ray_noise_std"):
+            fields[f"{name}_spread"][index] = _spread({variant: pooled[name] for variant, pooled in variants.items()})
+
+    def variable(over: str | tuple[str, ...], values: Any, units: str, long_name: str) -> tuple[Any, ...]:
+        return over, values, {"units": units, "long_name": long_name}
+
     dims = ("sample", "distance", "b", "a")
+    roughness = [ra if ra >= 0 else np.nan for _, ra in samples]
     data = xr.Dataset(
-        {
-            n: (dims, v.astype(np.float32), dict(zip(("units", "long_name"), _DESCRIBED[n], strict=True)))
-            for n, v in fields.items()
-        },
+        {name: variable(dims, values.astype(np.float32), *_DESCRIBED[name]) for name, values in fields.items()},
         coords={
-            "finish": ("sample", np.array([s[0] for s in samples], dtype=str)),
-            "roughness": (
-                "sample",
-                [s[1] if s[1] >= 0 else np.nan for s in samples],
-                {"units": "um", "long_name": "roughness average Ra"},
-            ),
-            "distance": ("distance", distances, {"units": "mm", "long_name": "|V|"}),
-            "a": ("a", axis, {"units": "1", "long_name": "equal-area place along the baseline"}),
-            "b": ("b", axis, {"units": "1", "long_name": "equal-area place across the baseline"}),
+            "finish": ("sample", np.array([finish for finish, _ in samples], dtype=str)),
+            "roughness": variable("sample", roughness, "um", "roughness average Ra"),
+            "distance": variable("distance", distances, "mm", "|V|"),
+            "a": variable("a", axis, "1", "equal-area place along the baseline"),
+            "b": variable("b", axis, "1", "equal-area place across the baseline"),
         },
         attrs={"title": "performance map", "schema_version": SCHEMA_VERSION, **attributes},
     )

@@ -32,9 +32,7 @@ def with_samples(performance_map: PerformanceMap, other_maps: Sequence[Performan
     data = performance_map.data
     distances, axis = data["distance"].values.astype(float), data["a"].values.astype(float)
     kinds = {str(name): values for name, values in data.data_vars.items() if values.dims == _NODES}
-    with_lay = next(
-        (candidate.data for candidate in (performance_map, *other_maps) if "lay" in candidate.data.dims), None
-    )
+    with_lay = next((one.data for one in (performance_map, *other_maps) if "lay" in one.data.dims), None)
     if with_lay is not None:
         kinds |= {name: with_lay[name] for name in LAY_FIELDS.values()}
     samples, lights = list(performance_map.samples), list(performance_map.lights)
@@ -106,20 +104,15 @@ def mean_over(maps: Sequence[PerformanceMap]) -> PerformanceMap:
             continue
         values = np.stack([performance_map.data[name].values.astype(float) for performance_map in maps])
         finite = np.isfinite(values)
-        with np.errstate(invalid="ignore"):
-            fields[name] = np.where(finite, values, 0.0).sum(axis=0) / np.where(
-                finite.any(axis=0), finite.sum(axis=0), np.nan
-            )
+        total, number = np.where(finite, values, 0.0).sum(axis=0), finite.sum(axis=0)
+        fields[name] = total / np.where(number > 0, number, np.nan)
     for name, values in fields.items():
         data[name] = (_NODES, values.astype(np.float32), data[name].attrs)
     return PerformanceMap(data)
 
 
 def _persistent_and_bias(maps: Sequence[PerformanceMap], share: np.ndarray, mean: np.ndarray) -> dict[str, np.ndarray]:
-    """Return p / sigma and beta / sigma of the mean over maps, NaN where no map has them.
-
-    ``share`` (maps, nodes) of the recovered points [1]; ``mean`` (nodes): sigma [mm] of the mean.
-    """
+    """Return p / sigma and beta / sigma of the mean, by the ``share`` of the points and its sigma, ``mean`` [mm]."""
     persistent, bias = (
         np.stack([(one.data[name] * one.data["ray_noise_std"]).values.astype(float) for one in maps])
         for name in ("persistent_share", "bias_share")
@@ -129,10 +122,8 @@ def _persistent_and_bias(maps: Sequence[PerformanceMap], share: np.ndarray, mean
         weight = weight / weight.sum(axis=0)
         common = (weight * np.nan_to_num(bias)).sum(axis=0)
         second_moment = (weight * np.nan_to_num(bias**2 + persistent**2)).sum(axis=0)
-        return {
-            "persistent_share": np.sqrt(np.maximum(second_moment - common**2, 0.0)) / mean,
-            "bias_share": common / mean,
-        }
+        rest = np.sqrt(np.maximum(second_moment - common**2, 0.0))
+        return {"persistent_share": rest / mean, "bias_share": common / mean}
 
 
 def with_directions(
@@ -145,31 +136,21 @@ def with_directions(
     """
     angles = np.arange(len(maps)) * 180.0 / len(maps)
     fields = {
-        stored: (
-            LAY_NODES,
-            np.stack([performance_map.data[name].values for performance_map in maps], axis=1),
-            maps[0].data[name].attrs,
-        )
+        stored: (LAY_NODES, np.stack([one.data[name].values for one in maps], axis=1), maps[0].data[name].attrs)
         for name, stored in LAY_FIELDS.items()
     }
     described = {"units": "deg", "long_name": "direction of u of a surface with a lay, about the mirror direction"}
     middle = {"units": "mm", "long_name": "place half-way between camera and light"}
-    return PerformanceMap(
-        mean.data.assign(fields).assign_coords(
-            lay=("lay", angles, described),
-            lay_mirror_x=((), mirror_mm[0], middle),
-            lay_mirror_y=((), mirror_mm[1], middle),
-        )
-    )
+    x, y = (((), place, middle) for place in mirror_mm)
+    data = mean.data.assign(fields)
+    return PerformanceMap(data.assign_coords(lay=("lay", angles, described), lay_mirror_x=x, lay_mirror_y=y))
 
 
 def _number_of(distances: np.ndarray, distance: float) -> int:
     number = int(np.abs(np.log(distances / distance)).argmin())
     if abs(distances[number] / distance - 1) > _SAME_DISTANCE:
-        allowed = ", ".join(f"{value:g}" for value in distances)
-        raise InputError(
-            "maps to be joined", "distance", f"{distance:g} mm", f"a distance of the first map: {allowed} mm"
-        )
+        allowed = f"a distance of the first map: {', '.join(f'{value:g}' for value in distances)} mm"
+        raise InputError("maps to be joined", "distance", f"{distance:g} mm", allowed)
     return number
 
 
@@ -178,6 +159,5 @@ def _on_axis(data: xr.Dataset, axis: np.ndarray) -> xr.Dataset:
     map_axis = data["a"].values.astype(float)
     if len(map_axis) == len(axis) and np.allclose(map_axis, axis, atol=1e-9):
         return data
-    return data[[name for name, values in data.data_vars.items() if values.dims in (_NODES, LAY_NODES)]].interp(
-        a=axis, b=axis
-    )
+    names = [name for name, values in data.data_vars.items() if values.dims in (_NODES, LAY_NODES)]
+    return data[names].interp(a=axis, b=axis)

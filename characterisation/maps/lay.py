@@ -74,9 +74,8 @@ def turned(vectors: NDArray[np.floating], angle_deg: Floats, mirror: Floats) -> 
 def _rotated_with(vectors: NDArray[np.floating], start: NDArray[np.floating], end: NDArray[np.floating]) -> Floats:
     """Return vectors (..., 3), rotated by the smallest rotation that takes one unit vector to another."""
     both = start + end
-    return np.asarray(
-        vectors - both * _dot(both, vectors) / (1 + _dot(start, end)) + 2 * end * _dot(start, vectors), float
-    )
+    less = both * _dot(both, vectors) / (1 + _dot(start, end))
+    return np.asarray(vectors - less + 2 * end * _dot(start, vectors), float)
 
 
 def _dot(first: NDArray[np.floating], second: NDArray[np.floating]) -> Floats:
@@ -99,10 +98,8 @@ def between_directions(
     """Return F, sigma [mm], their errors and spreads, (n,) each, of a surface whose u lies along tangents (n, 3).
 
     Where the tangent is NaN, or the map has no F in one of the neighbouring directions, the answer is the mean over
-    directions. Elsewhere nothing is unknown of the direction, and the spreads are NaN.
-
-    ``surface``, ``distance``: fields of the surface in each direction, and |V| (n,) [mm]. ``normals``, ``tangents``:
-    (n, 3) in the view frame; tangents lie along u.
+    directions. Elsewhere nothing is unknown of the direction, and the spreads are NaN. ``distance`` is |V| (n,) [mm];
+    ``normals`` and ``tangents`` (n, 3) are in the view frame.
     """
     mean = surface.look_up(distance, normals)
     count, mirror = len(surface.directions), mirror_direction(distance, surface.mirror_mm)

@@ -13,12 +13,11 @@ sample, or it is unknown to the map.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from characterisation.files.datasets import Variable
 
@@ -45,16 +44,12 @@ class Light:
     kind
         ``metal``, ``gloss_paint``, ``powder_coat`` or ``matt``: the kind of lobe, and whether light enters the
         material.
-    reflectance
-        At normal incidence, of a metal; of the body under a coat.
-    wide_angle
-        Share of the reflected light that leaves at wide angles.
+    reflectance, wide_angle
+        At normal incidence, of a metal, or of the body under a coat; share of it that leaves at wide angles.
     alpha_u, alpha_v
         Width of the lobe along u and v, Beckmann's alpha; they differ where the face has a lay.
-    beckmann
-        Share of Beckmann in the lobe; the rest has the long tail of GGX.
-    mirror_u, mirror_v
-        Width of the mirror-like part along u and v.
+    beckmann, mirror_u, mirror_v
+        Share of Beckmann in the lobe, whose rest has the long tail of GGX; width of the mirror-like part.
     height_um
         Rms height Rq [um], which determines the share of the mirror-like part, and speckle.
     as_made
@@ -155,10 +150,6 @@ def lights_of(data: xr.Dataset) -> list[Light | None]:
     count = data.sizes["sample"]
     if any(name not in data.variables for name in SCHEMA):
         return [None] * count
-    columns = {field: data[name].values for field, (name, _, _) in VARIABLES.items()}
-    return [_light(columns, i) if str(columns["kind"][i]) else None for i in range(count)]
-
-
-def _light(columns: Mapping[str, NDArray[Any]], number: int) -> Light:
-    numbers = {name: float(columns[name][number]) for name in NUMBERS}
-    return Light(kind=str(columns["kind"][number]), as_made=bool(columns["as_made"][number]), **numbers)
+    columns = [data[name].values.tolist() for name, _, _ in VARIABLES.values()]
+    rows = (dict(zip(VARIABLES, row, strict=True)) for row in zip(*columns, strict=True))
+    return [Light(**row | {"as_made": bool(row["as_made"])}) if row["kind"] else None for row in rows]

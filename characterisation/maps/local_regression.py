@@ -119,13 +119,10 @@ def local_fit(
     clusters: NDArray[np.int64] | None = None,
     keep: Literal["own", "others"] = "others",
 ) -> LocalFit:
-    """Fit a line about every place, with each of its radii.
+    """Fit a line about every place ``at`` (q, 3), with each of its ``radii`` (q, r) of the kernel.
 
-    - ``data``, ``slopes``: places and values to fit; prior of the slopes and bends.
-    - ``at``, ``radii``: (q, 3) places; (q, r) radii of the kernel.
-    - ``link``: whether the line is that of the value or of its logarithm.
-    - ``clusters``, ``keep``: (q,) a cluster for every place, and whether only this cluster (``"own"``) or only the
-      others are used. Without ``clusters``, all are used.
+    ``link`` says whether the line is that of the value or of its logarithm. With ``clusters`` (q,), one for every
+    place, only this cluster (``keep="own"``) or only the others are used; without, all are.
     """
     estimate = np.full((*radii.shape, data.value.shape[1]), np.nan)
     sums = {name: np.full(radii.shape, np.nan) for name in ("independent", "clustered", "scatter", "rows", "weight")}
@@ -163,11 +160,8 @@ def _exp(values: Floats) -> Floats:
 
 def _polynomial(positions: Floats) -> Floats:
     """Return the regressors (n, 7) of displacements (n, 3): 1, a, b, x, a^2, a b, b^2."""
-    out = np.empty((len(positions), 7))
     a, b = positions[:, 0], positions[:, 1]
-    out[:, 0], out[:, 1:4] = 1.0, positions
-    out[:, 4], out[:, 5], out[:, 6] = a * a, a * b, b * b
-    return out
+    return np.column_stack([np.ones(len(positions)), positions, a * a, a * b, b * b])
 
 
 class _Tile:

@@ -60,9 +60,7 @@ def write_map(data: xr.Dataset, path: str | Path, compact: bool) -> None:
     mantissa (Zender, Geosci. Model Dev. 9 (2016) 3199-3211; rounded to nearest). It is read like any other.
     """
     # most samples of a map have no lay, and NaN there
-    encoding: dict[str, dict[str, Any]] = {
-        name: {"zlib": True, "complevel": 1} for name in LAY_FIELDS.values() if name in data
-    }
+    encoding: dict[str, Any] = {name: {"zlib": True, "complevel": 1} for name in LAY_FIELDS.values() if name in data}
     if compact:
         rounded = data.copy()
         for name, values in data.data_vars.items():

@@ -60,16 +60,9 @@ def place_of(light: Light) -> NDArray[np.float64]:
 
 def nearest_sample(performance_map: PerformanceMap, light: Light) -> Nearest | None:
     """Return the sample of a map that is optically nearest to a surface; None if no sample has optical properties."""
-    positions = {
-        number: place_of(sample_light)
-        for number, sample_light in enumerate(performance_map.lights)
-        if sample_light is not None
-    }
-    if not positions:
-        return None
-    distances = {number: float(np.linalg.norm(position - place_of(light))) for number, position in positions.items()}
-    best = min(distances, key=distances.__getitem__)
-    return Nearest(best, distances[best])
+    place, known = place_of(light), [(number, one) for number, one in enumerate(performance_map.lights) if one]
+    all_nearest = [Nearest(number, float(np.linalg.norm(place_of(one) - place))) for number, one in known]
+    return min(all_nearest, key=lambda nearest: nearest.distance, default=None)
 
 
 def standing_for(

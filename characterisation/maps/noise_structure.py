@@ -44,10 +44,8 @@ def noise_structure(
 
     Parameters
     ----------
-    performance_map
-        Map to look up.
-    finish, roughness, distance, normals, light
-        As in :meth:`~characterisation.maps.performance_map.PerformanceMap.query`.
+    performance_map, finish, roughness, distance, normals, light
+        The map, and as in :meth:`~characterisation.maps.performance_map.PerformanceMap.query`.
     """
     members, rough = performance_map.known.representing(finish, roughness, light)
     data = performance_map.data
@@ -57,20 +55,18 @@ def noise_structure(
     node = np.rint((lambert_projection(normals) - axis[0]) / (axis[1] - axis[0])).astype(int)
     column, row = np.moveaxis(np.clip(node, 0, len(axis) - 1), -1, 0)
     near, way = _between(np.log(data["distance"].values.astype(float)), np.log(distance))
-    roughnesses = data["roughness"].values[members].astype(float)
-    low, part = (
-        (np.array(0), np.array(0.0)) if np.isnan(rough) else _between(np.log(roughnesses), np.log(np.array(rough)))
-    )
-    weights = {int(low): 1 - float(part)}  # of the members, by number: one or two
-    other = min(int(low) + 1, len(members) - 1)
-    weights[other] = weights.get(other, 0.0) + float(part)
+    low, part = 0, 0.0
+    if not np.isnan(rough):
+        roughnesses = data["roughness"].values[members].astype(float)
+        low, part = (value.item() for value in _between(np.log(roughnesses), np.log(np.array(rough))))
+    weights = {low: 1 - part}  # of the members, by number: one or two
+    other = min(low + 1, len(members) - 1)
+    weights[other] = weights.get(other, 0.0) + part
+    least = 2e-9 / len(weights)  # a single knot with a value is used at any distance
+    last = len(data["distance"]) - 1
     knots = [
-        (
-            i,
-            np.minimum(near + step, len(data["distance"]) - 1),
-            sample_weight * np.where(step, way, 1 - way) + 2e-9 / len(weights),
-        )  # a single knot with a value is used at any distance
-        for i, sample_weight in weights.items()
+        (i, np.minimum(near + step, last), weight * np.where(step, way, 1 - way) + least)
+        for i, weight in weights.items()
         for step in (0, 1)
     ]
 

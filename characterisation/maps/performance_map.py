@@ -199,9 +199,8 @@ class PerformanceMap:
             middle = math.sqrt(nearest * farthest)
             distance = float(self._distances[np.abs(np.log(self._distances / middle)).argmin()])
         if not nearest <= distance <= farthest:
-            raise InputError(
-                "plot", "distance", f"{distance:g} mm", f"{nearest:g} to {farthest:g} mm, as characterised"
-            )
+            allowed = f"{nearest:g} to {farthest:g} mm, as characterised"
+            raise InputError("plot", "distance", f"{distance:g} mm", allowed)
         b, a = np.meshgrid(self._axis, self._axis, indexing="ij")
         inside = np.hypot(a, b) <= math.sqrt(2.0)
         normals = inverse_lambert_projection(np.stack([a, b], axis=-1)[inside])
@@ -225,64 +224,37 @@ class PerformanceMap:
         return self._surface(tuple(members), "" if math.isnan(rough) else rough)
 
     def require(self, finish: str, roughness: float, light: Light | None = None) -> float:
-        """Return the Ra [um] at which a surface is looked up, NaN for one that equals a sample.
-
-        Raises
-        ------
-        InputError
-            If the surface was not characterised.
-        """
+        """Return the Ra [um] at which a surface is looked up, NaN for one that equals a sample; InputError if none."""
         return self.known.representing(finish, roughness, light)[1]
 
     def _make_surface(self, numbers: tuple[int, ...], roughness: float | str) -> Surface:
         members = list(numbers)
-        roughnesses = self.known.roughness[members]
         unknown = np.full(self.data["recovered_fraction"].shape[1:], np.nan)
-        stacks = {
-            field: np.stack(
-                [self.data[field].values[i].astype(float) if field in self.data else unknown for i in members]
-            )
-            for field in FIELDS
-        }
-        fields = between_samples(stacks, roughnesses, float(roughness) if roughness != "" else math.nan)
+
+        def surface_fields(stacks: dict[str, Floats], rough: float) -> list[Floats]:
+            whole = {name: stacks.get(name, unknown[None].repeat(len(members), 0)) for name in FIELDS}
+            return between_samples(whole, self.known.roughness[members], rough)
+
+        stacks = {name: self.data[name].values[members].astype(float) for name in FIELDS if name in self.data}
+        fields = surface_fields(stacks, float(roughness) if roughness != "" else math.nan)
         directions = [
             Surface(
-                between_samples(
-                    {field: direction_fields.get(field, unknown)[None] for field in FIELDS}, roughnesses, math.nan
-                ),
+                surface_fields({name: values[None] for name, values in of_direction.items()}, math.nan),
                 self._distances,
                 self._axis,
             )
-            for direction_fields in (directions_of(self.data, members[0]) if len(members) == 1 else ())
+            for of_direction in (directions_of(self.data, members[0]) if len(members) == 1 else ())
         ]
         x, y = (float(self.data[name]) if directions else 0.0 for name in ("lay_mirror_x", "lay_mirror_y"))
         return Surface(fields, self._distances, self._axis, directions, (x, y))
 
     def save(self, path: str | Path, compact: bool = False) -> None:
-        """Write netCDF, atomically.
-
-        Parameters
-        ----------
-        path
-            Path of the file.
-        compact
-            Compress the file, after rounding as :func:`characterisation.maps.map_file.write_map` does.
-
-        See Also
-        --------
-        load : the inverse
-        """
+        """Write netCDF, atomically; ``compact`` compresses it, after rounding errors and values."""
         write_map(self.data, path, compact)
 
     @staticmethod
     def load(path: str | Path) -> PerformanceMap:
-        """Read a map.
-
-        Raises
-        ------
-        InputError
-            If the file is missing, damaged, not a performance map, or has another schema.
-        """
+        """Read a map; raise InputError if the file is missing, damaged, no performance map, or of another schema."""
         return PerformanceMap(read_map(path))
 
 

@@ -18,7 +18,7 @@ import xarray as xr
 from characterisation.coupon.offsets import noise_area
 from characterisation.files.arrays import Floats
 from characterisation.lambert_projection import lambert_projection
-from characterisation.maps.pooling import capture_numbers, patch_normals
+from characterisation.maps.pooling import patch_normals
 
 #: radius of the kernel over which captures are pooled, in the equal-area plane: 0.0175 is about 1 deg. It is wide
 #: because A and p / sigma vary slowly, and one capture determines them poorly
@@ -41,21 +41,16 @@ def pool_offsets(patches: xr.Dataset, positions: Floats) -> PooledOffsets:
     """Estimate A, p / sigma and beta / sigma at positions (q, 2) of the equal-area plane, from the offsets of patches.
 
     Every capture gives K_0, K_1, K_2 in units of the mean square of its own patches' sigma. Those within
-    ``POOLING_RADIUS`` are averaged with their numbers of patches and the biweight as weights. The result is NaN where
-    there is no capture.
+    ``POOLING_RADIUS`` are averaged with their numbers of patches and the biweight as weights; NaN without a capture.
     """
-    nothing = PooledOffsets(*np.full((3, len(positions)), np.nan))
-    if "ray_offset" not in patches:  # tables made before offsets were measured
-        return nothing
     columns = [patches[name].values.astype(float) for name in ("offset_product_touching", "offset_product_apart")]
     offset = patches["ray_offset"].values.astype(float)
     columns = [patches["ray_noise_inliers"].values ** 2, offset**2, *columns, offset]
     normal = patch_normals(patches)
     use = np.isfinite(np.stack([*columns, *normal.T])).all(0)
     if not use.any():
-        return nothing
-    capture = capture_numbers(patches, normal)[use]
-    capture = np.unique(capture, return_inverse=True)[1].ravel()
+        return PooledOffsets(*np.full((3, len(positions)), np.nan))
+    capture = np.unique(patches["orientation"].values[use], return_inverse=True)[1]
     number = np.bincount(capture).astype(float)
     square, *products, mean = (np.bincount(capture, column[use]) / number for column in columns)
     centre = np.stack([np.bincount(capture, axis) / number for axis in lambert_projection(normal[use]).T], axis=-1)

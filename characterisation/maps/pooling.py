@@ -35,7 +35,7 @@ so that they explain the differences between nearby captures and their predictio
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -98,8 +98,7 @@ def pool(patches: xr.Dataset, nominal: float, positions: Floats) -> Pooled:
     distance.
 
     ``patches`` is a table of :func:`characterisation.coupon.patches.measure_patches` with the column ``orientation``,
-    the number of the capture. Without this column, patches of one normal are one capture. Without ``distance``, all are
-    at the ``nominal`` one, |V| [mm] of the coupon's centre.
+    the number of the capture. ``nominal`` is |V| [mm] of the coupon's centre.
     """
     with threadpool_limits(1, user_api="blas"):  # threads slow down thousands of small fits
         return _pool(patches, nominal, positions)
@@ -115,14 +114,8 @@ def _pool(patches: xr.Dataset, nominal: float, positions: Floats) -> Pooled:
     gap = cKDTree(rows.position[:, :2]).query(at[:, :2])[0]
 
     count, possible = rows.value[:, 0], rows.weight
-    fractions = Observations(
-        rows.position,
-        np.column_stack([count / possible, rows.value[:, 1]]),
-        possible * rows.share,
-        rows.share,
-        rows.cluster,
-        rows.within,
-    )
+    shares = np.column_stack([count / possible, rows.value[:, 1]])
+    fractions = replace(rows, value=shares, weight=possible * rows.share)
     fitted = local_fit(fractions, at, ladder, FRACTION_SLOPES)
     floor = _binomial(fitted, float(np.median(possible)))
     common, bend = _common(_predicted(fractions, FRACTION_SLOPES, "identity"), at[:, :2])
@@ -133,24 +126,18 @@ def _pool(patches: xr.Dataset, nominal: float, positions: Floats) -> Pooled:
 
     degrees = np.where(count - 3 >= LEAST_DEGREES, count - 3.0, 0.0) * np.isfinite(rows.value[:, 2])
     use = degrees > 0
-    sigma, sigma_error = np.full(len(at), np.nan), np.full(len(at), np.nan)
+    sigma, sigma_error = np.full((2, len(at)), np.nan)
     if use.any():
         along_normal = rows.value[use, 2:] * inverse_lambert_projection(rows.position[use, :2])[:, 2:]
-        variances = Observations(
-            rows.position[use],
-            along_normal**2,
-            (degrees * rows.share)[use],
-            rows.share[use],
-            np.unique(rows.cluster[use], return_inverse=True)[1].astype(np.int64),
-            rows.within[use],
-        )
+        weight, share = (degrees * rows.share)[use], rows.share[use]
+        cluster = np.unique(rows.cluster[use], return_inverse=True)[1].astype(np.int64)
+        variances = Observations(rows.position[use], along_normal**2, weight, share, cluster, rows.within[use])
         fitted = local_fit(variances, at, ladder, VARIANCE_SLOPES, "log")
         floor = np.broadcast_to(2.0 / float(np.median(degrees[use])), ladder.shape)
         common, bend = _common(_predicted(variances, VARIANCE_SLOPES, "log"), at[:, :2])
         log_variance, error, _ = _averaged(fitted, ladder, floor, common, bend * gap**2)
-        sigma = np.where(
-            fraction > 1e-6, np.exp(log_variance / 2) / inverse_lambert_projection(at[:, :2])[:, 2], np.nan
-        )
+        along_ray = np.exp(log_variance / 2) / inverse_lambert_projection(at[:, :2])[:, 2]
+        sigma = np.where(fraction > 1e-6, along_ray, np.nan)
         sigma_error = sigma * error / 2
     out = np.full((6, len(positions)), np.nan)
     out[:, inside] = fraction, sigma, fraction_error, sigma_error, false, effective
@@ -163,34 +150,17 @@ def patch_normals(patches: xr.Dataset) -> Floats:
     return np.stack([n_x, n_y, np.sqrt(np.maximum(1 - n_x**2 - n_y**2, 0))], axis=-1)
 
 
-def capture_numbers(patches: xr.Dataset, normals: Floats) -> NDArray[np.int64]:
-    """Return the capture number of each patch (n,).
-
-    It is ``orientation`` where the table has it; otherwise patches of one normal are one capture.
-    """
-    if "orientation" in patches:
-        return np.asarray(patches["orientation"].values, np.int64)
-    if not len(normals):
-        return np.zeros(0, np.int64)
-    return np.unique(np.round(normals, 6), axis=0, return_inverse=True)[1].ravel().astype(np.int64)
-
-
 def _rows(patches: xr.Dataset, nominal: float) -> Observations:
     """Return the table as observations of (points, false fraction, sigma), sorted by capture."""
-    normals = patch_normals(patches)
-    count = len(normals)
-    ratio = np.log(patches["distance"].values / nominal) if "distance" in patches else np.zeros(count)
-    capture = capture_numbers(patches, normals)
-    share = patches["independent_share"].values if "independent_share" in patches else np.ones(count)
-    possible = patches["points_possible"].values.astype(float)
-    columns = [patches[name].values.astype(float) for name in ("points", "false_fraction", "ray_noise_inliers")]
+    normals, ratio = patch_normals(patches), np.log(patches["distance"].values / nominal)
+    capture, possible = patches["orientation"].values, patches["points_possible"].values.astype(float)
     used = np.flatnonzero((possible > 0) & np.isfinite(normals[:, 0]) & np.isfinite(ratio))
     used = used[np.argsort(capture[used], kind="stable")]
     number = np.unique(capture[used], return_inverse=True)[1].astype(np.int64)
-    positions = np.column_stack([lambert_projection(normals), ratio])
-    return Observations(
-        positions[used], np.column_stack(columns)[used], possible[used], share[used], number, np.zeros(len(used))
-    )
+    positions = np.column_stack([lambert_projection(normals), ratio])[used]
+    columns = [patches[name].values[used].astype(float) for name in ("points", "false_fraction", "ray_noise_inliers")]
+    share, within = patches["independent_share"].values[used], np.zeros(len(used))
+    return Observations(positions, np.column_stack(columns), possible[used], share, number, within)
 
 
 def _triangles(vertices: Floats, positions: Floats) -> tuple[NDArray[np.bool_], Floats]:
@@ -275,17 +245,13 @@ def _common(predicted: _Predicted, at: Floats) -> tuple[Floats, Floats]:
     if number < LEAST_CAPTURES:
         return np.full(len(at), np.nan), np.zeros(len(at))
     near = cKDTree(predicted.position).query(at, k=number)[1].reshape(len(at), number)
-    excess, clustered, gap = (
-        (predicted.squared - predicted.chance)[near],
-        predicted.clustered[near],
-        predicted.gap[near],
-    )
+    excess = (predicted.squared - predicted.chance)[near]
+    clustered, gap = predicted.clustered[near], predicted.gap[near]
     middle = np.median(gap, axis=1, keepdims=True)
     small, large = gap <= middle, gap > 1.2 * middle
     common = np.maximum((small * excess).sum(1) / (small * clustered).sum(1), 0.0)
-    bend_excess = np.where(large, excess - common[:, None] * clustered, 0.0).sum(1) / np.maximum(
-        (large * gap**2).sum(1), 1e-12
-    )
+    bend_excess = np.where(large, excess - common[:, None] * clustered, 0.0).sum(1)
+    bend_excess /= np.maximum((large * gap**2).sum(1), 1e-12)
     either = excess.sum(1) / np.maximum((gap**2).sum(1), 1e-12) / 2
     bend = np.where(large.sum(1) >= LEAST_CAPTURES, bend_excess, either)
     return common, np.maximum(bend, 0.0)
@@ -318,9 +284,8 @@ def _averaged(
     error = variance + np.nan_to_num(bias)
     with np.errstate(divide="ignore", invalid="ignore"):
         # a line through fewer rows than coefficients depends on the prior more than on the rows
-        usable = (
-            np.isfinite(error) & np.isfinite(estimate) & ((fitted.rows >= LEAST_ROWS) | (np.arange(RUNGS) == RUNGS - 1))
-        )
+        usable = (fitted.rows >= LEAST_ROWS) | (np.arange(RUNGS) == RUNGS - 1)
+        usable &= np.isfinite(error) & np.isfinite(estimate)
         weight = np.where(usable, 1.0 / np.maximum(error, 1e-12) ** 2, 0.0)
         weight /= weight.sum(1, keepdims=True)
         total = np.einsum("qr,qr->q", weight, np.nan_to_num(error)) + bent

@@ -128,10 +128,8 @@ def _mixed(near: list[Floats], far: list[Floats], t: Floats, bends: list[Floats]
         out[k + 2] = np.sqrt(((1 - t) * near[k + 2]) ** 2 + (t * far[k + 2]) ** 2 + left**2)
     alone = np.isnan(near[1]) ^ np.isnan(far[1])  # sigma at one knot only, whose error does not apply here
     out[1] = np.where(alone, np.where(np.isnan(near[1]), far[1], near[1]), out[1])
-    return [
-        np.where(t < AT_KNOT, n, np.where(t > 1 - AT_KNOT, f, value))
-        for n, f, value in zip(near, far, out, strict=True)
-    ]
+    ends = zip(near, far, out, strict=True)
+    return [np.where(t < AT_KNOT, n, np.where(t > 1 - AT_KNOT, f, value)) for n, f, value in ends]
 
 
 class Surface:
@@ -162,17 +160,15 @@ class Surface:
         self.knots, self.first, self.step = np.log(distances), axis[0], axis[1] - axis[0]
         self.count = len(axis)
         self.fields = [field.reshape(len(distances), -1) for field in fields]
-        pairs = range(max(len(distances) - 1, 1))
+        pairs = range(len(distances) - 1)
+        self.bends = [np.full_like(self.fields[0], np.nan) for _ in (0, 1)]
         if len(distances) > 1:
-            bends = [
+            self.bends = [
                 np.stack([_interpolation_error(self.knots, self.fields[k], self.fields[k + 2], j) for j in pairs])
                 for k in (0, 1)
             ]
-        else:
-            bends = [np.full_like(self.fields[0], np.nan) for _ in (0, 1)]
-        self.bends = bends
         self.spread = bool(np.isfinite(self.fields[4]).any())
-        self.tables = [np.ascontiguousarray(f, np.float32).ravel() for f in (*self.fields[:4], *bends)]
+        self.tables = [np.ascontiguousarray(f, np.float32).ravel() for f in (*self.fields[:4], *self.bends)]
         self.plain = self._plain().ravel()
 
     def _plain(self) -> NDArray[np.bool_]:
@@ -206,9 +202,8 @@ class Surface:
             interval, t, within = self._along(np.log(distance))
             last = np.float32(self.count - 1)
             # the outermost nodes lie on the limit itself, so rounding needs a tolerance
-            within &= (
-                (np.minimum(column, row) >= -1e-4) & (np.maximum(column, row) <= last + np.float32(1e-4)) & (z > 0)
-            )
+            within &= (np.minimum(column, row) >= -1e-4) & (np.maximum(column, row) <= last + np.float32(1e-4))
+            within &= z > 0
         column, row = (np.clip(np.where(within, coordinate, 0), 0, last) for coordinate in (column, row))
         left, low = (np.minimum(coordinate.astype(np.int32), self.count - 2) for coordinate in (column, row))
         column -= left
@@ -218,9 +213,8 @@ class Surface:
         if self.spread:
             plain = np.zeros_like(plain)
         chosen: slice | NDArray[np.int64] = slice(None) if plain.all() else np.flatnonzero(plain)
-        for values, answer in zip(
-            out, self._with_all_corners(cell[chosen], t[chosen], column[chosen], row[chosen]), strict=False
-        ):
+        answers = self._with_all_corners(cell[chosen], t[chosen], column[chosen], row[chosen])
+        for values, answer in zip(out, answers, strict=False):
             values[chosen] = answer
         incomplete = np.flatnonzero(within & ~plain)
         if len(incomplete):
@@ -243,12 +237,11 @@ class Surface:
     def _with_all_corners(self, cell: NDArray[np.int64], t: Singles, u: Singles, v: Singles) -> tuple[Singles, ...]:
         """Return F, sigma and errors where all corners have values."""
         upper = u * v
-        shares = (1 - u - v + upper, u - upper, v - upper, upper)
-        steps = (0, 1, self.count, self.count + 1)
+        shares = {1: u - upper, self.count: v - upper, self.count + 1: upper}
 
         def bilinear(table: Singles) -> Singles:
-            total = table.take(cell, mode="clip") * shares[0]
-            for share, step in zip(shares[1:], steps[1:], strict=True):
+            total = table.take(cell, mode="clip") * (1 - u - v + upper)
+            for step, share in shares.items():
                 total += table[step:].take(cell, mode="clip") * share
             return total
 
@@ -272,10 +265,8 @@ class Surface:
         corner = cell[:, None] + np.array([0, 1, self.count, self.count + 1])
         share = np.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], axis=1).astype(float)
         beyond = self.count**2 if len(self.knots) > 1 else 0
-        near = [field.ravel()[corner] for field in self.fields]
-        far = [field.ravel()[corner + beyond] for field in self.fields]
-        bends = [bend.ravel()[corner] for bend in self.bends]
-        fields = _mixed(near, far, t[:, None].astype(float), bends)
+        near, far = ([field.ravel()[at] for field in self.fields] for at in (corner, corner + beyond))
+        fields = _mixed(near, far, t[:, None].astype(float), [bend.ravel()[corner] for bend in self.bends])
         out = []
         for field in fields:
             usable = np.isfinite(field) & (share > 0)

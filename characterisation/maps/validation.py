@@ -86,20 +86,14 @@ def residual_table(pairs: Sequence[Pair]) -> xr.Dataset:
 
 def within_limits(table: xr.Dataset) -> NDArray[np.bool_]:
     """Return which rows of a residual table are within both limits; a row without sigma is within that of sigma."""
-    sigma = table["sigma_residual"].values
-    return np.asarray(
-        (table["fraction_residual"].values <= FRACTION_LIMIT) & (np.isnan(sigma) | (sigma <= SIGMA_LIMIT))
-    )
+    fraction, sigma = (table[name].values for name in ("fraction_residual", "sigma_residual"))
+    return np.asarray((fraction <= FRACTION_LIMIT) & ~(sigma > SIGMA_LIMIT))
 
 
 def _row(pairs: Sequence[Pair]) -> dict[str, float]:
-    valued_pairs = [
-        pair for pair in pairs if math.isfinite(pair.predicted.fraction) and math.isfinite(pair.measured.fraction)
-    ]
-    fraction = np.array([pair.predicted.fraction - pair.measured.fraction for pair in valued_pairs])
-    fraction_error = np.array(
-        [math.hypot(pair.measured.fraction_error, pair.predicted.fraction_error) for pair in valued_pairs]
-    )
+    valued_pairs = [p for p in pairs if math.isfinite(p.predicted.fraction) and math.isfinite(p.measured.fraction)]
+    fraction = np.array([p.predicted.fraction - p.measured.fraction for p in valued_pairs])
+    fraction_error = np.array([math.hypot(p.measured.fraction_error, p.predicted.fraction_error) for p in valued_pairs])
     both = [p for p in valued_pairs if _has_sigma(p.predicted) and _has_sigma(p.measured)]
     sigma = np.array([p.predicted.sigma / p.measured.sigma - 1 for p in both])
     sigma_error = np.array(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -71,10 +72,8 @@ def draw_cloud(
 
     Parameters
     ----------
-    axes
-        To draw into; x is the column and y the row of a pixel.
-    values, label, residual
-        (H, W) [mm], NaN where a pixel has no point; label of their scale, which is symmetric about 0 for a residual.
+    axes, values, label, residual
+        To draw into; (H, W) [mm], NaN where a pixel has no point; label of their scale, that of a residual symmetric.
     status, names
         (H, W) number of each pixel's status, and names by number, as in :data:`REASONS`.
     """
@@ -93,23 +92,13 @@ def draw_cloud(
     axes.set(xlabel="column [px]", ylabel="row [px]")
     side_bar(axes, shown, label)
     counts = np.bincount(status[missing].ravel(), minlength=numbers[-1] + 1)
-    order = [number for number in np.argsort(-counts, kind="stable").tolist() if counts[number]]
-    legend = [
-        Patch(
-            facecolor=REASONS[names[number]][1],
-            label=f"{REASONS[names[number]][0]}: {100 * counts[number] / status.size:.2g} %",
-        )
-        for number in order
-    ]
+    legend = []
+    for number in np.argsort(-counts, kind="stable").tolist():
+        if counts[number]:
+            words, colour = REASONS[names[number]]
+            legend.append(Patch(facecolor=colour, label=f"{words}: {100 * counts[number] / status.size:.2g} %"))
     if legend:
-        axes.legend(
-            handles=legend,
-            title="pixels without a point",
-            title_fontsize=8.0,
-            loc="upper left",
-            bbox_to_anchor=(0.0, 0.0),
-            bbox_transform=axes.transAxes + ScaledTranslation(0, -_UNDER_IN, figure_of(axes).dpi_scale_trans),
-            borderaxespad=0.0,
-            handlelength=1.1,
-            alignment="left",
-        )
+        under = axes.transAxes + ScaledTranslation(0, -_UNDER_IN, figure_of(axes).dpi_scale_trans)
+        place: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (0.0, 0.0), "bbox_transform": under}
+        title: dict[str, Any] = {"title": "pixels without a point", "title_fontsize": 8.0, "alignment": "left"}
+        axes.legend(handles=legend, borderaxespad=0.0, handlelength=1.1, **place, **title)

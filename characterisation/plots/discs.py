@@ -7,6 +7,7 @@ rings are incidence angles.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -33,16 +34,13 @@ def noise_limits(sigma: NDArray[np.floating]) -> tuple[float, float]:
     return (low, high) if high > 1.05 * low else (low / 1.05, high * 1.05)
 
 
-def disc(axes: Axes, radius: float, colour: str = FIELD) -> Circle:
+def disc(axes: Axes, radius: float) -> Circle:
     """Turn axes into an empty disc about the origin, and return its circle for clipping."""
-    axes.set_aspect("equal")
-    axes.set_xlim(-1.08 * radius, 1.08 * radius)
-    axes.set_ylim(-1.08 * radius, 1.08 * radius)
-    axes.set_xticks([])
-    axes.set_yticks([])
+    limits = (-1.08 * radius, 1.08 * radius)
+    axes.set(aspect="equal", xlim=limits, ylim=limits, xticks=[], yticks=[])
     for spine in axes.spines.values():
         spine.set_visible(False)
-    circle = Circle((0, 0), radius, facecolor=colour, edgecolor="none", zorder=0)
+    circle = Circle((0, 0), radius, facecolor=FIELD, edgecolor="none", zorder=0)
     axes.add_patch(circle)
     return circle
 
@@ -52,20 +50,14 @@ def disc_image(axes: Axes, values: NDArray[np.floating], axis: NDArray[np.floati
 
     Parameters
     ----------
-    axes, values
-        Axes to draw into, and values (b, a) at the nodes; NaN is left empty.
-    axis, largest
-        Nodes (n,) of both coordinates [1], equidistant, Lambert's equal-area projection; largest incidence [rad].
+    axes, values, axis, largest
+        Axes to draw into; values (b, a) at the nodes, NaN is left empty; nodes (n,) of both coordinates [1],
+        equidistant, Lambert's equal-area projection; largest incidence [rad].
     """
     rim = disc(axes, 2 * math.sin(largest / 2))
     reach = float(axis[-1]) + float(axis[1] - axis[0]) / 2
-    shown = axes.imshow(
-        np.ma.masked_invalid(values),
-        origin="lower",
-        extent=(-reach, reach, -reach, reach),
-        interpolation="none",
-        zorder=1,
-    )
+    extent = (-reach, reach, -reach, reach)
+    shown = axes.imshow(np.ma.masked_invalid(values), origin="lower", extent=extent, interpolation="none", zorder=1)
     shown.set_clip_path(rim)
     return shown
 
@@ -80,22 +72,15 @@ def disc_view(axes: Axes, largest: float, labelled: bool = True) -> None:
         axes.plot(radius * np.cos(angle), radius * np.sin(angle), color=INK, lw=0.4, alpha=0.45, zorder=2)
         if not labelled:
             continue
-        position = radius * np.array([math.cos(math.radians(62)), math.sin(math.radians(62))])
-        text = axes.text(
-            float(position[0]), float(position[1]), f"{ring}°", fontsize=6, ha="center", va="center", zorder=4
-        )
+        x, y = radius * math.cos(math.radians(62)), radius * math.sin(math.radians(62))
+        text = axes.text(x, y, f"{ring}°", fontsize=6, ha="center", va="center", zorder=4)
         text.set_bbox({"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.6})
         text.set_color("#1c1c1c")  # the label's box is white in every page theme
     if not labelled:
         return
     rim = 2 * math.sin(largest / 2)
-    axes.annotate(
-        "",
-        xy=(1.0 * rim, -1.06 * rim),
-        xytext=(0.35 * rim, -1.06 * rim),
-        annotation_clip=False,
-        arrowprops={"arrowstyle": "->", "color": INK, "lw": 0.8, "shrinkA": 0, "shrinkB": 0},
-    )
+    arrow = {"arrowstyle": "->", "color": INK, "lw": 0.8, "shrinkA": 0, "shrinkB": 0}
+    axes.annotate("", (rim, -1.06 * rim), (0.35 * rim, -1.06 * rim), annotation_clip=False, arrowprops=arrow)
     axes.text(0.32 * rim, -1.06 * rim, "baseline", fontsize=6.5, ha="right", va="center")
 
 
@@ -119,12 +104,10 @@ def draw_performance(
 
     Parameters
     ----------
-    pair, fraction, sigma
-        Axes (2,) of F and of sigma; F [1] and sigma [mm] (b, a) at the nodes.
+    pair, fraction, sigma, limits
+        Axes (2,) of F and of sigma; F [1] and sigma [mm] (b, a) at the nodes; ends of the scale of sigma [mm].
     axis, largest
         As in :func:`disc_image`.
-    limits
-        Ends of the logarithmic scale of sigma [mm].
     """
     quantities = (
         (fraction, Normalize(0, 1), SEQUENTIAL, "fraction of points recovered F [1]", "neither"),
@@ -134,9 +117,8 @@ def draw_performance(
         shown = disc_image(axes, values, axis, largest)
         shown.set(norm=norm, cmap=colours)
         disc_view(axes, largest)
-        bar = figure_of(axes).colorbar(
-            shown, ax=axes, location="bottom", label=label, extend=extend, shrink=0.85, pad=0.04
-        )
+        place: dict[str, Any] = {"location": "bottom", "shrink": 0.85, "pad": 0.04}
+        bar = figure_of(axes).colorbar(shown, ax=axes, label=label, extend=extend, **place)
         if isinstance(norm, LogNorm):
             plain_log_ticks(bar, *limits)
         bar.outline.set_visible(False)  # type: ignore[operator]

@@ -30,10 +30,9 @@ def label_columns(axes: Axes, positions: Mapping[str, Floats], low: Floats, high
 
     Parameters
     ----------
-    axes
-        To draw into. Its limits are set to hold the picture and the names.
-    positions, low, high
-        Place (2,) of each name, the most important names first; corners (2,) of the picture.
+    axes, positions, low, high
+        To draw into, with limits set to hold the picture and the names; place (2,) of each name, the most important
+        names first; corners (2,) of the picture.
     longest
         Largest number of characters of a name; longer ones lack their middle.
     """
@@ -56,9 +55,8 @@ def label_columns(axes: Axes, positions: Mapping[str, Floats], low: Floats, high
             position = positions[name]
             axes.plot([x, position[0]], [y, position[1]], color=MUTED, lw=0.7, zorder=4)
             axes.plot(*position, "o", ms=2.5, color=INK, zorder=5)
-            axes.text(
-                x + way * 0.01 * float(span.max()), y, cut(name, longest), ha=side, va="center", fontsize=8, zorder=8
-            )
+            beside = x + way * 0.01 * float(span.max())
+            axes.text(beside, y, cut(name, longest), ha=side, va="center", fontsize=8, zorder=8)
     room = aside + _ROOM * float(span.max())
     axes.set_xlim(low[0] - room, high[0] + room)
     axes.set_ylim(min(every) - step / 2, max(every) + step / 2)
@@ -76,14 +74,9 @@ def spread(heights: Sequence[float], step: float) -> list[float]:
     for height in heights:
         groups.append([height, 1.0])
         while len(groups) > 1 and groups[-1][0] < groups[-2][0] + groups[-2][1] * step:
-            (first, first_count), (second, second_count) = groups[-2], groups[-1]
+            (first, before), (second, more) = groups[-2], groups[-1]
             # least squares: the mean of the shifts of its labels is 0
-            groups[-2:] = [
-                [
-                    (first * first_count + (second - first_count * step) * second_count) / (first_count + second_count),
-                    first_count + second_count,
-                ]
-            ]
+            groups[-2:] = [[(first * before + (second - before * step) * more) / (before + more), before + more]]
     return [first + k * step for first, number in groups for k in range(int(number))]
 
 
@@ -92,10 +85,8 @@ def scale_bar(axes: Axes, left_end: tuple[float, float], length: float, label: s
 
     Parameters
     ----------
-    axes, left_end, length
-        Axes to draw into; left end (x, y) and length of the bar, in data units.
-    label, rise
-        Text above the bar, and its distance from it in data units.
+    axes, left_end, length, label, rise
+        Axes to draw into; left end (x, y) and length of the bar; text above it, and its distance; in data units.
     """
     x, y = left_end
     axes.plot([x, x + length], [y, y], color=INK, lw=2.2, solid_capstyle="butt", zorder=6)

@@ -76,11 +76,8 @@ def depth_buffer(vertices: Floats, depth: Floats, size: tuple[int, ...]) -> tupl
         second = ((cx[t] - x) * (ay[t] - y) - (ax[t] - x) * (cy[t] - y)) / area[t]
         third = 1 - first - second
         inside = np.minimum(np.minimum(first, second), third) >= -_ON_EDGE
-        here, t, pixel = (
-            (first * depth[t, 0] + second * depth[t, 1] + third * depth[t, 2])[inside],
-            t[inside],
-            (y * columns + x)[inside],
-        )
+        here = first * depth[t, 0] + second * depth[t, 1] + third * depth[t, 2]
+        here, t, pixel = here[inside], t[inside], (y * columns + x)[inside]
         order = np.lexsort((-t, here, pixel))
         last = order[np.diff(pixel[order], append=-1) != 0]  # the nearest of each pixel
         won = last[here[last] > nearest[pixel[last]]]

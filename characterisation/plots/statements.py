@@ -91,12 +91,11 @@ def draw_budget(axes: Axes, rows: Sequence[ErrorRow]) -> None:
 
     Shares that the trials are too few to tell are hatched.
     """
-    order = _groups(rows)
+    order = {group: GROUPS.get(group, (_OTHER_GROUP, group))[0] for group in _groups(rows)}
     for y, row in enumerate(rows):
         left = 0.0
-        for group in order:
-            share = row.budget.get(group, 0.0)
-            colour, hatch = GROUPS.get(group, (_OTHER_GROUP, ""))[0], "////" if group in row.open_groups else None
+        for group, colour in order.items():
+            share, hatch = row.budget.get(group, 0.0), "////" if group in row.open_groups else None
             axes.barh(y, 100 * share, 0.6, left=100 * left, color=colour, hatch=hatch, edgecolor="white", lw=0)
             left += share
     axes.set_ylim(len(rows) - 0.5, -0.5)
@@ -108,11 +107,8 @@ def draw_budget(axes: Axes, rows: Sequence[ErrorRow]) -> None:
 
 def budget_legend(axes: Axes, rows: Sequence[ErrorRow]) -> None:
     """Add the legend of the groups that occur in the budgets of all rows, below the axes."""
-    order = _groups(rows)
-    handles = [
-        Patch(facecolor=GROUPS.get(group, (_OTHER_GROUP, group))[0], label=GROUPS.get(group, ("", group))[1])
-        for group in order
-    ]
+    shown = [GROUPS.get(group, (_OTHER_GROUP, group)) for group in _groups(rows)]
+    handles = [Patch(facecolor=colour, label=name) for colour, name in shown]
     figure_of(axes).legend(handles=handles, loc="outside lower right", ncols=min(len(handles), 4), handlelength=1.1)
 
 

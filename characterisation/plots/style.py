@@ -104,10 +104,8 @@ def axes_for(
     ax
         Axes of the caller, one or an array of as many as ``shape`` has; None for a new figure of pyplot, which a
         notebook shows.
-    shape, size_in
-        Rows and columns, and width and height of a new figure [in].
-    subplots
-        Further arguments of :func:`matplotlib.pyplot.subplots`.
+    shape, size_in, subplots
+        Rows and columns, width and height [in], and further arguments of a new figure.
     """
     with drawing():
         if ax is None:
@@ -141,9 +139,6 @@ def side_bar(axes: Axes, shown: ScalarMappable, label: str) -> None:
 
 def bare(axes: Axes) -> None:
     """Remove ticks from axes, and draw a frame around them in the proportions of the data."""
-    axes.set_xticks([])
-    axes.set_yticks([])
-    axes.set_aspect("equal")
+    axes.set(xticks=[], yticks=[], aspect="equal")
     for spine in axes.spines.values():
-        spine.set_visible(True)
-        spine.set_color(MUTED)
+        spine.set(visible=True, color=MUTED)

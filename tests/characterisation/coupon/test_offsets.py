@@ -111,7 +111,6 @@ def test_pooling_answers_where_captures_are_and_takes_old_tables() -> None:
     # one capture says nothing of what captures have in common
     assert found.persistent[0] == pytest.approx(0.05 / 0.5) and found.bias[0] == 0
     assert np.isnan([found.area[1], found.persistent[1], found.bias[1]]).all()
-    assert np.isnan(pool_offsets(table.drop_vars("ray_offset"), np.zeros((3, 2))).persistent).all()
 
 
 @pytest.mark.parametrize(("bias", "lasting"), [(0.0, 0.2), (-0.3, 0.1), (0.3, 0.0)])

@@ -16,6 +16,7 @@ from characterisation.coupon.view_frame import in_view_frame
 from characterisation.lambert_projection import lambert_projection
 
 POSSIBLE = 113
+OFFSETS = ("ray_offset", "offset_product_touching", "offset_product_apart")
 NOMINAL = 600.0
 
 #: of the lobe in which the sensor blinds itself: place, and standard deviation (3 deg) in the equal-area plane
@@ -80,6 +81,8 @@ def shown(campaign, rng, fraction_effect=0.0, sigma_effect=0.0, fraction=known_f
             "normal_x": seen[:, 0],
             "normal_y": seen[:, 1],
             "orientation": np.full(len(count), number),
+            "independent_share": np.ones(len(count)),
+            **dict.fromkeys(OFFSETS, np.full(len(count), np.nan)),  # not measured
         }
         for name, values in row.items():
             columns.setdefault(name, []).append(values)
