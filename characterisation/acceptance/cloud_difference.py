@@ -82,10 +82,7 @@ class Difference:
 
 
 def difference_along_rays(cloud: PointCloud, reference: PointCloud, window: Window = _ALL) -> Floats:
-    """Return the difference (h, w) [mm] of two clouds on one grid in a window, NaN where either has no point.
-
-    Raises InputError if the grids are not the same.
-    """
+    """Return the difference (h, w) [mm] of clouds of one grid in a window, NaN where one has no point."""
     if not cloud.grid.same_rays(reference.grid):
         allowed = f"the grid of the reference: {_described(reference.grid)}"
         hint = "or use the difference to the surface"

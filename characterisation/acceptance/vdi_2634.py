@@ -41,10 +41,7 @@ LEAST_BULGE = 0.006
 
 @dataclass(frozen=True)
 class ProbingError:
-    """Probing errors of a sphere.
-
-    ``form`` PF [mm], ``size`` PS [mm] (measured minus calibrated diameter), ``centre`` (3,) [mm].
-    """
+    """Errors of a sphere: ``form`` PF and ``size`` PS (measured minus calibrated) [mm], ``centre`` (3,) [mm]."""
 
     form: float
     size: float

@@ -39,10 +39,7 @@ def disc_offsets(radius_px: float) -> NDArray[np.int64]:
 
 
 def lens_share(distance: ArrayLike, radius: float) -> Floats:
-    """Return the common area of two discs, divided by the area of one.
-
-    ``distance`` [px] between the centres has any shape; ``radius`` [px] is that of both discs.
-    """
+    """Return the common area of two discs of one radius [px] at a distance (...) [px], divided by the area of one."""
     x = np.clip(np.asarray(distance, float) / (2.0 * radius), 0.0, 1.0)
     return np.asarray(2.0 / np.pi * (np.arccos(x) - x * np.sqrt(1.0 - x**2)))
 

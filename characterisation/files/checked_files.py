@@ -76,10 +76,7 @@ def read_text_bounded(file: Path, absent: str | None = None, hint: str = "", lar
 
 
 def read_json_object(file: Path, absent: str | None = None, hint: str = "") -> dict[str, Any]:
-    """Read a JSON object from a plain file.
-
-    Raises InputError as :func:`read_text_bounded`, or if the text is no JSON object.
-    """
+    """Read a JSON object from a plain file; InputError as :func:`read_text_bounded`, or if the text is none."""
     text = read_text_bounded(file, absent, hint)
     try:
         table = json.loads(text)

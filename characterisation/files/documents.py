@@ -40,10 +40,7 @@ LONGEST_NAME = 100
 
 
 def checked_name(name: str) -> str:
-    """Return a name that may become part of a file's name or of a page.
-
-    Raises ValueError if the name is not allowed; pydantic turns it into an :class:`InputError`.
-    """
+    """Return a name that may become part of a file's name or of a page; ValueError, for pydantic, if it may not."""
     # marks belong to the letter before them, as in Thai and Hindi; none is a letter of its own
     letters = name[:1] + "".join(letter for letter in name[1:] if not unicodedata.category(letter).startswith("M"))
     if len(name.encode("utf-8", "replace")) > LONGEST_NAME or not re.fullmatch(_NAME, letters):

@@ -45,18 +45,14 @@ def keep_blas_to_one_thread() -> None:
     """Limit BLAS to one thread in this process, if NumPy is not loaded yet, and in the processes that it starts.
 
     A variable of :data:`BLAS_VARIABLES` that is set keeps its value. On two cores that other programs use as well, two
-    threads take 90 ms for 361,000 points times a 3 x 3 matrix, one takes 1 ms; a QR decomposition of 20,000 x 60
-    numbers takes 730 to 1530 ms instead of 55 (OpenBLAS 0.3 of NumPy's wheels).
+    threads take 90 ms for 361,000 points times a 3 x 3 matrix, one takes 1 ms (OpenBLAS 0.3 of NumPy's wheels).
     """
     for name in BLAS_VARIABLES:
         os.environ.setdefault(name, "1")
 
 
 def in_threads(work: Callable[[Piece], Result], pieces: Iterable[Piece], most: int = MOST_THREADS) -> list[Result]:
-    """Return the result of ``work`` for every piece, in order, computed in at most ``most`` threads.
-
-    The first exception of a piece is raised.
-    """
+    """Return the result of ``work`` for every piece, in order, by at most ``most`` threads; raise the first error."""
     items = list(pieces)
     count = min(thread_count(), most, len(items))
     if count < 2:

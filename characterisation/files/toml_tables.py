@@ -27,10 +27,7 @@ _DECIMAL_COMMA = re.compile(r"=\s*[+-]?\d+,\d")
 
 
 def read_toml_table(path: str | Path) -> dict[str, Any]:
-    """Read one TOML file as a table, of which only nesting and numbers are checked.
-
-    Raises InputError if the file is missing or is not TOML.
-    """
+    """Read one TOML file as a table, of which nesting and numbers are checked; InputError if missing or not TOML."""
     path = Path(path)
     near = "" if is_file(path) else _neighbours(path)
     text = read_text_bounded(path, "a TOML file", near, LARGEST_TOML).replace("\r\n", "\n")

@@ -56,10 +56,7 @@ class Observations:
     within: Floats  # (n,) variance of the first column among the rows that were joined to one
 
     def joined(self, cell: float) -> Observations:
-        """Return the data with all rows of one cluster and square cell joined to one row at their mean.
-
-        Cells are those of the first two regressors, of side ``cell``.
-        """
+        """Return the data with all rows of one cluster and square cell of the plane joined to one row at their mean."""
         if cell == 0:
             return self
         cells = np.floor(self.position[:, :2] / cell).astype(np.int64)

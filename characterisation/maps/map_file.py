@@ -73,10 +73,7 @@ def write_map(data: xr.Dataset, path: str | Path, compact: bool) -> None:
 
 
 def read_map(path: str | Path) -> xr.Dataset:
-    """Read the data of a map.
-
-    Raises InputError if the file is missing, damaged, not a performance map, or has another schema.
-    """
+    """Read the data of a map; raise InputError if the file is missing, damaged, no map, or of another schema."""
     path = Path(path)
     data = read_dataset(path, _SCHEMA)
     version = data.attrs.get("schema_version")

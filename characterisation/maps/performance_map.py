@@ -69,12 +69,8 @@ class PerformanceMap:
         self.data = data
         self._distances = data["distance"].values.astype(float)
         self._axis = data["a"].values.astype(float)
-        self.known = Samples(
-            [str(name) for name in data["finish"].values],
-            data["roughness"].values.astype(float),
-            lights_of(data),
-            str(data.attrs.get("name", "performance map")),
-        )
+        names, roughness = data["finish"].values.astype(str).tolist(), data["roughness"].values.astype(float)
+        self.known = Samples(names, roughness, lights_of(data), str(data.attrs.get("name", "performance map")))
         # all views of a part query the same few surfaces
         self._surface = lru_cache(maxsize=16)(self._make_surface)
 

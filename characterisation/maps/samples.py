@@ -69,10 +69,7 @@ class Samples:
         return members, float(roughness)
 
     def members(self, finish: str) -> list[int]:
-        """Return the numbers of the samples of a finish, by Ra; the first sample of each Ra.
-
-        Raises InputError if the finish was not characterised.
-        """
+        """Return the numbers of the samples of a finish, by Ra; the first of each Ra. InputError if there is none."""
         members: dict[str, int] = {}
         for i, name in enumerate(self.names):
             if name == finish:

@@ -180,10 +180,7 @@ class Surface:
         return (cell[:-1] & cell[1:]) if len(cell) > 1 else cell
 
     def look_up(self, distance: Floats, normals: NDArray[np.floating]) -> list[Floats]:
-        """Return F, sigma [mm], their errors and spreads, (n,) each; NaN where unknown.
-
-        ``distance`` |V| is (n,) [mm] and ``normals`` N is (n, 3).
-        """
+        """Return F, sigma [mm], their errors and spreads at |V| (n,) [mm] and N (n, 3), (n,) each; NaN if unknown."""
         out = [np.full(len(distance), np.nan) for _ in FIELDS]
         runs = [slice(start, start + RUN) for start in range(0, len(distance), RUN)]
 

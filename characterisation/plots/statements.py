@@ -87,10 +87,7 @@ def draw_errors(axes: Axes, rows: Sequence[ErrorRow], unit: str) -> None:
 
 
 def draw_budget(axes: Axes, rows: Sequence[ErrorRow]) -> None:
-    """Draw a bar for each measurement, divided into the shares of the groups of unknowns in its variance.
-
-    Shares that the trials are too few to tell are hatched.
-    """
+    """Draw a bar for each measurement: shares of groups of unknowns in its variance, hatched if not well known."""
     order = {group: GROUPS.get(group, (_OTHER_GROUP, group))[0] for group in _groups(rows)}
     for y, row in enumerate(rows):
         left = 0.0

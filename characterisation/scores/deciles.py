@@ -134,10 +134,8 @@ def deciles(score: ArrayLike, error: ArrayLike, tried: ArrayLike | None = None) 
         columns[f"{name}_rank"] = ranks = bin_ranks(values, columns["views"])
         ranked = np.isfinite(ranks)
         correlations[f"{name}_correlation"] = spearman(np.flatnonzero(ranked), ranks[ranked])
-    data: dict[str, Any] = {
-        name: ("bin", values, {"long_name": _QUANTITIES[name]} if name in _QUANTITIES else {})
-        for name, values in columns.items()
-    }
+    data: dict[str, Any] = {name: ("bin", values) for name, values in columns.items()}
+    data |= {name: ("bin", columns[name], {"long_name": long_name}) for name, long_name in _QUANTITIES.items()}
     coordinates = {"bin": np.arange(BINS + 1), "view": np.arange(len(bins))}
     return xr.Dataset(data | {"bin_of_view": ("view", bins)}, coordinates, correlations)
 
@@ -171,14 +169,11 @@ def mean_ranks(cells: Sequence[xr.Dataset], quantity: str = "error") -> xr.Datas
     ranks = np.array([cell[f"{quantity}_rank"].values[1:] for cell in cells]).reshape(-1, BINS)
     rows = np.array([mean_interval(column[np.isfinite(column)]) for column in ranks.T])
     correlations = np.array([cell.attrs[f"{quantity}_correlation"] for cell in cells], float)
-    middle, low, high = mean_interval(correlations[np.isfinite(correlations)], least=-1.0)
-    attributes: dict[str, Any] = {
-        "correlation": middle,
-        "correlation_low": low,
-        "correlation_high": high,
-        "correlated": int(np.isfinite(correlations).sum()),
-    }
-    columns = {name: ("bin", rows[:, number]) for number, name in enumerate(("rank", "rank_low", "rank_high"))}
+    interval = mean_interval(correlations[np.isfinite(correlations)], least=-1.0)
+    ends = ("", "_low", "_high")
+    attributes = {f"correlation{end}": value for end, value in zip(ends, interval, strict=True)}
+    attributes["correlated"] = int(np.isfinite(correlations).sum())
+    columns = {f"rank{end}": ("bin", column) for end, column in zip(ends, rows.T, strict=True)}
     columns["cells"] = ("bin", np.isfinite(ranks).sum(axis=0))
     return xr.Dataset(columns, {"bin": np.arange(1, BINS + 1)}, attributes)
 

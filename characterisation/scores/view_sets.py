@@ -51,10 +51,7 @@ _HALVINGS = 40
 
 @dataclass(frozen=True)
 class FeatureInformation:
-    """Information on one feature, and its use.
-
-    ``information`` (views, p, p) is P_v; ``quadratic`` (measurements, p, p) is G_m, 0 where not needed.
-    """
+    """Information P_v (views, p, p) on one feature, and its use: G_m (measurements, p, p), 0 where not needed."""
 
     information: Floats
     quadratic: Floats

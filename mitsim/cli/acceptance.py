@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Option
 
 from characterisation.files.errors import InputError
 from characterisation.words.progress import say
@@ -23,7 +24,7 @@ def acceptance(
     clouds: options.Clouds,
     plane: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="NAME=COLUMN,ROW,WIDTH,HEIGHT,DISTANCE",
             help="A flat target in a window of the cloud [px] and its true distance along its normal [mm]; "
             "NAME=DISTANCE: the whole cloud. Without DISTANCE, no depth error.",
@@ -31,17 +32,17 @@ def acceptance(
     ] = None,
     sphere: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="NAME=COLUMN,ROW,WIDTH,HEIGHT,DIAMETER",
             help="A sphere in a window [px] and its calibrated diameter [mm].",
         ),
     ] = None,
     spacing: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME,NAME,DISTANCE", help="Two spheres and the calibrated distance of their centres."),
+        Option(metavar="NAME,NAME,DISTANCE", help="Two spheres and the calibrated distance of their centres."),
     ] = None,
     baseline: Annotated[
-        float | None, typer.Option(min=1.0, max=10000.0, help="Baseline of a stereo camera [mm]: adds sub-pixel RMS.")
+        float | None, Option(min=1.0, max=10000.0, help="Baseline of a stereo camera [mm]: adds sub-pixel RMS.")
     ] = None,
     simulated: options.Simulated = None,
     topic: options.Topic = None,
@@ -62,15 +63,8 @@ def acceptance(
     from characterisation.tasks.result import repeatability
     from mitsim.cli.acceptance_request import Artefacts, cloud_figures, joint_figures, read_artefacts
     from mitsim.cli.simulated_beside import RecordedTarget, beside_simulated, beside_table
+    from mitsim.decoding import measured_document as documents
     from mitsim.decoding.input_clouds import cloud_paths, read_cloud, tell_of_copies
-    from mitsim.decoding.measured_document import (
-        beside_document,
-        measured_document,
-        result_table,
-        result_tables,
-        result_values,
-        summary,
-    )
 
     options.check_unit(unit)
     artefacts = read_artefacts(plane or [], sphere or [], spacing or [])
@@ -106,17 +100,17 @@ def acceptance(
         beside = beside_simulated(input_clouds[0], targets, simulated, figures, seed)
     if as_json:
         whose = [(input_cloud.path, input_cloud.cloud.sensor, input_cloud.cloud.source) for input_cloud in input_clouds]
-        document = measured_document(whose, results, over)
-        document |= {"all_clouds": [result_values(result) for result in together]}
+        document = documents.measured_document(whose, results, over)
+        document |= {"all_clouds": [documents.result_values(result) for result in together]}
         if beside is not None:
-            document |= {"beside": beside_document(simulated or "", *beside)}
+            document |= {"beside": documents.beside_document(simulated or "", *beside)}
         print(json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False))
     else:
-        print(result_tables([input_cloud.path for input_cloud in input_clouds], results, over))
+        print(documents.result_tables([input_cloud.path for input_cloud in input_clouds], results, over))
         if together:
-            print("\nall clouds\n" + result_table(together))
+            print("\nall clouds\n" + documents.result_table(together))
         if beside is not None:
             print(f"\n{input_clouds[0].path}, beside a simulation\n" + beside_table(*beside, simulated or ""))
-    say(summary([*results, together] if together else results))
+    say(documents.summary([*results, together] if together else results))
     if not all(result.possible for cloud_results in [*results, together] for result in cloud_results):
         raise typer.Exit(1)

@@ -13,13 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.acceptance.depth_quality import (
-    global_planarity_trueness,
-    local_planarity_precision,
-    mean_depth_error,
-    plane_quality,
-    typical_temporal_noise,
-)
+from characterisation.acceptance import depth_quality
 from characterisation.acceptance.range_uncertainty import flatness_uncertainty, form_error_uncertainty
 from characterisation.acceptance.vdi_2634 import flatness_error, probing_error, sphere_spacing_error
 from characterisation.coupon.patches import Coupon
@@ -121,12 +115,14 @@ def joint_figures(clouds: Sequence[PointCloud], artefacts: Artefacts) -> list[Re
     out: list[Result] = []
     for name, (window, distance) in artefacts.planes.items():
         region = _mask(clouds[0], window_slices(window, clouds[0], name))
-        noise, reason = typical_temporal_noise(clouds, region), "no pixel has a point in two of the clouds"
-        out.append(figure_or_reason(f"{name} temporal noise", "mm", noise, reason))
-        trueness, reason = global_planarity_trueness(clouds, region), "fewer than 4 pixels have a point in every cloud"
-        out.append(figure_or_reason(f"{name} global planarity trueness", "mm", trueness, reason))
+        noise = depth_quality.typical_temporal_noise(clouds, region)
+        trueness = depth_quality.global_planarity_trueness(clouds, region)
+        why = "no pixel has a point in two of the clouds"
+        out.append(figure_or_reason(f"{name} temporal noise", "mm", noise, why))
+        why = "fewer than 4 pixels have a point in every cloud"
+        out.append(figure_or_reason(f"{name} global planarity trueness", "mm", trueness, why))
         if distance is not None:
-            error = mean_depth_error(clouds, _perpendicular_plane(clouds[0], distance), region)
+            error = depth_quality.mean_depth_error(clouds, _perpendicular_plane(clouds[0], distance), region)
             out.append(figure_or_reason(f"{name} mean depth error", "%", error, "a cloud has too few points"))
     return out
 
@@ -138,14 +134,14 @@ def _plane_figures(
     region, points = _mask(cloud, window_slices(window, cloud, name)), window_points(window, cloud, name)
     count = int(region.sum())
     truth = None if distance is None else _perpendicular_plane(cloud, distance)
-    quality = plane_quality(cloud, region, truth, baseline_mm)
+    quality = depth_quality.plane_quality(cloud, region, truth, baseline_mm)
     enough = len(points) >= LEAST_POINTS
     values = {
         ("fill rate", "%"): quality.fill_rate,
         ("flatness error", "mm"): flatness_error(points) if enough else np.nan,
         ("plane-fit RMS", "mm"): quality.plane_fit_rms if enough else np.nan,
         ("plane-fit RMS over distance", "%"): quality.plane_fit_rms_percent if enough else np.nan,
-        ("local planarity precision", "mm"): local_planarity_precision(cloud, region),
+        ("local planarity precision", "mm"): depth_quality.local_planarity_precision(cloud, region),
     }
     if distance is not None:
         values["Z accuracy", "%"] = quality.z_accuracy if enough else np.nan

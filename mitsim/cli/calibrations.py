@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from characterisation.files.errors import InputError, nearest
 from characterisation.words.progress import say
@@ -17,26 +18,24 @@ def rig(
     context: typer.Context,
     sensor: Annotated[
         str,
-        typer.Argument(
+        Argument(
             metavar="SENSOR|CORNERS",
             help="Virtual calibration: a preset, or a sensor TOML file. Real one: a folder of images of a board, or a "
             "file of its corners (.csv, .npz, OpenCV's .yml, .yaml, .xml, .json).",
         ),
     ],
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="TOML file to write: the covariance of the calibration.")
-    ],
+    output: Annotated[Path, Option("--output", "-o", help="TOML file to write: the covariance of the calibration.")],
     board: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="Calibration board: COLUMNSxROWSxSQUARE_MM:GRADE, in squares; grade glass, composite or paper; "
             "default of a virtual calibration: half as wide as the field."
         ),
     ] = None,
-    poses: Annotated[int, typer.Option(help="Number of poses of the board, over range and field of view.")] = 20,
+    poses: Annotated[int, Option(help="Number of poses of the board, over range and field of view.")] = 20,
     drift: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             "--drift",
             help="Drift since the calibration, for the printed accuracy only: NAME=VALUE, one sigma. Repeatable. "
             "Other terms are as in the sensor file.",
@@ -44,7 +43,7 @@ def rig(
     ] = None,
     check: Annotated[
         int,
-        typer.Option(
+        Option(
             min=0,
             max=10000,
             help="Also simulate this many calibrations, and count those inside the stated 95 % intervals.",
@@ -111,24 +110,20 @@ def rig(
 
 def verify(
     context: typer.Context,
-    capture: Annotated[Path, typer.Argument(help="Capture folder that shows a board or a plate of dots.")],
+    capture: Annotated[Path, Argument(help="Capture folder that shows a board or a plate of dots.")],
     board: Annotated[
-        str | None, typer.Option(help="Chequerboard: COLUMNSxROWSxSQUARE_MM:GRADE, grade glass, composite or paper.")
+        str | None, Option(help="Chequerboard: COLUMNSxROWSxSQUARE_MM:GRADE, grade glass, composite or paper.")
     ] = None,
     dots: Annotated[
         str | None,
-        typer.Option(
-            metavar="PITCH[,COLUMN,ROW,WIDTH,HEIGHT]", help="Plate of dots of known pitch [mm], in a window [px]."
-        ),
+        Option(metavar="PITCH[,COLUMN,ROW,WIDTH,HEIGHT]", help="Plate of dots of known pitch [mm], in a window [px]."),
     ] = None,
     printed: Annotated[
-        float, typer.Option(min=0, max=0.1, help="Relative standard uncertainty of the pitch of the dots.")
+        float, Option(min=0, max=0.1, help="Relative standard uncertainty of the pitch of the dots.")
     ] = 2e-4,
     sensor: Annotated[
         str | None,
-        typer.Option(
-            help="Preset or sensor file whose calibration is stated; default: the preset that the capture names."
-        ),
+        Option(help="Preset or sensor file whose calibration is stated; default: the preset that the capture names."),
     ] = None,
 ) -> None:
     """Verify a calibration by one capture of a board or a plate of dots: use it, or calibrate again.
@@ -198,16 +193,10 @@ def _is_recorded(argument: str) -> bool:
 
 def _recorded(path: Path, output: Path, board: str | None) -> None:
     """Calibrate from recorded corners; print the result, and write it with its covariance."""
+    from mitsim.study.calibration import written
     from mitsim.study.calibration.board import parse_board
     from mitsim.study.calibration.corner_files import read_corners
     from mitsim.study.calibration.halves import calibrate_checked
-    from mitsim.study.calibration.written import (
-        calibration_table,
-        noisy_pose_hints,
-        other_size_hints,
-        sensor_lines,
-        write_calibration,
-    )
 
     if board is None:
         raise InputError("--board", "", "none", "the board of the recording: COLUMNSxROWSxSQUARE_MM:GRADE")
@@ -222,9 +211,9 @@ def _recorded(path: Path, output: Path, board: str | None) -> None:
     say(f"calibrating {', '.join(corners.sizes)}: {len(corners.boards)} poses, and two halves of them")
     source = f"recorded corners: {path.name}, {chequerboard}"[:400]
     checked = calibrate_checked(corners, source, str(path))
-    print(calibration_table(checked), end="")
-    for hint in [*other_size_hints(checked.calibration.rig), *noisy_pose_hints(checked, corners)]:
+    print(written.calibration_table(checked), end="")
+    for hint in [*written.other_size_hints(checked.calibration.rig), *written.noisy_pose_hints(checked, corners)]:
         say(f"warning: {hint}")
-    rig_file = write_calibration(checked, output)
+    rig_file = written.write_calibration(checked, output)
     say(f"calibration: {output}, {rig_file}; in a sensor file:")
-    say(sensor_lines(checked.calibration.rig, rig_file, output))
+    say(written.sensor_lines(checked.calibration.rig, rig_file, output))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from characterisation.files.errors import InputError
 from characterisation.words.progress import say
@@ -17,29 +18,26 @@ def compare(
     context: typer.Context,
     real: Annotated[
         Path,
-        typer.Argument(
-            help="Real capture of a flat object: a capture folder, or a recording that mitsim import accepts."
-        ),
+        Argument(help="Real capture of a flat object: a capture folder, or a recording that mitsim import accepts."),
     ],
     output: options.Out,
     simulated: Annotated[
-        Path | None,
-        typer.Argument(help="Simulated capture of the same object; default: simulated from REAL and --sensor."),
+        Path | None, Argument(help="Simulated capture of the same object; default: simulated from REAL and --sensor.")
     ] = None,
     sensor: Annotated[
-        str | None, typer.Option(help="Sensor to simulate, a preset or TOML file; default: the one that REAL names.")
+        str | None, Option(help="Sensor to simulate, a preset or TOML file; default: the one that REAL names.")
     ] = None,
     window: options.ObjectWindow = None,
     projector: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="State of the projector in REAL, on or off; needed for a stereo pair whose settings do not state it."
         ),
     ] = None,
     frame: Annotated[
-        int | None, typer.Option(min=0, help="For a recording: number of the view or image set, from 0.")
+        int | None, Option(min=0, help="For a recording: number of the view or image set, from 0.")
     ] = None,
-    calibration: Annotated[Path | None, typer.Option(help="For a recording: calibration file of its cameras.")] = None,
+    calibration: Annotated[Path | None, Option(help="For a recording: calibration file of its cameras.")] = None,
     seed: options.Seed = 1,
     variant: options.Variant = None,
 ) -> None:

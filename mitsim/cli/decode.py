@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from characterisation.words.progress import say
 from mitsim.cli import options
@@ -16,23 +17,19 @@ if TYPE_CHECKING:
 
 
 def decode(
-    capture: Annotated[Path, typer.Argument(help="Capture folder.")],
+    capture: Annotated[Path, Argument(help="Capture folder.")],
     output: options.OutCloud,
     sensor: Annotated[
         str | None,
-        typer.Option(
-            help="Decode with the settings of this sensor (preset or TOML file), not with those in the capture."
-        ),
+        Option(help="Decode with the settings of this sensor (preset or TOML file), not with those in the capture."),
     ] = None,
     depth_range: Annotated[
-        tuple[float, float] | None, typer.Option("--range", help="Nearest and farthest depth to decode [mm].")
+        tuple[float, float] | None, Option("--range", help="Nearest and farthest depth to decode [mm].")
     ] = None,
-    block: Annotated[
-        int | None, typer.Option(min=3, max=31, help="For stereo matching: side of a block, odd [px].")
-    ] = None,
+    block: Annotated[int | None, Option(min=3, max=31, help="For stereo matching: side of a block, odd [px].")] = None,
     contrast: Annotated[
         float | None,
-        typer.Option(
+        Option(
             min=0,
             max=255,
             help="Smallest accepted contrast [8-bit DN]: minimum_contrast_dn of stereo matching, "
@@ -40,7 +37,7 @@ def decode(
         ),
     ] = None,
     points_in: Annotated[
-        str, typer.Option(help="Frame of the points in the file: sensor, or workspace (needs the Link of an Ensenso).")
+        str, Option(help="Frame of the points in the file: sensor, or workspace (needs the Link of an Ensenso).")
     ] = "sensor",
 ) -> None:
     """Compute the point cloud of a capture; print how many pixels have a point, and why the others have none.

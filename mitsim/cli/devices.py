@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Option
 
 from characterisation.files.errors import InputError
 from characterisation.words.progress import say, track
@@ -15,12 +16,11 @@ from mitsim.cli import options
 
 def capture(
     output: options.Out,
-    device: Annotated[str, typer.Option(help="Camera: ensenso:SERIAL, depthai or depthai:ID.")],
+    device: Annotated[str, Option(help="Camera: ensenso:SERIAL, depthai or depthai:ID.")],
     settings: Annotated[
-        Path | None,
-        typer.Option(help="TOML file of camera settings, with the keys of [device.settings] in a campaign."),
+        Path | None, Option(help="TOML file of camera settings, with the keys of [device.settings] in a campaign.")
     ] = None,
-    repeats: Annotated[int, typer.Option(min=1, max=10000, help="Number of captures.")] = 1,
+    repeats: Annotated[int, Option(min=1, max=10000, help="Number of captures.")] = 1,
 ) -> None:
     """Capture with a live camera; each capture gets a new numbered folder.
 
@@ -42,10 +42,7 @@ def capture(
 
 
 def mount(sample: str, distance: float) -> None:
-    """Ask the user to mount a coupon, and to place the stage as calibrated for a distance [mm].
-
-    Raises InputError if there is no terminal.
-    """
+    """Ask the user to mount a coupon, and to place the stage as calibrated for a distance [mm]."""
     if not sys.stdin.isatty():
         pending = f"{sample} at {distance:g} mm, which somebody must mount next"
         allowed = "one sample at one distance without a terminal"

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from characterisation.files.atomic_io import write_text
 from characterisation.files.errors import InputError
@@ -19,22 +20,22 @@ RUN_SUFFIXES = (".glb", ".usda", ".usdc", ".usdz", ".rrd", ".mcap", ".e57")
 RESULT_SUFFIXES = (".qif", ".xml", ".csv", ".json")
 
 Views = Annotated[
-    str, typer.Option(help="best (views that are best for a measurement, or have a cloud), all, or numbers: 3,12.")
+    str, Option(help="best (views that are best for a measurement, or have a cloud), all, or numbers: 3,12.")
 ]
 
 
 def cloud(
     context: typer.Context,
-    cloud: Annotated[Path, typer.Argument(help="PLY file that mitsim wrote.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(CLOUD_SUFFIXES)}.")],
+    cloud: Annotated[Path, Argument(help="PLY file that mitsim wrote.")],
+    output: Annotated[Path, Option("--output", "-o", help=f"File to write: {', '.join(CLOUD_SUFFIXES)}.")],
     pose: Annotated[
-        Path | None, typer.Option(help="Pose of the sensor: pose.json, statement.json, or poses.json with --view.")
+        Path | None, Option(help="Pose of the sensor: pose.json, statement.json, or poses.json with --view.")
     ] = None,
     view: options.ViewOfPoses = None,
     frame: Annotated[
-        str, typer.Option("--in", help="Frame of the points in PLY and PCD: sensor, or part (needs --pose).")
+        str, Option("--in", help="Frame of the points in PLY and PCD: sensor, or part (needs --pose).")
     ] = "sensor",
-    unit: Annotated[str, typer.Option(help="Unit of PLY and PCD: mm or m. E57 and MCAP are in metres.")] = "mm",
+    unit: Annotated[str, Option(help="Unit of PLY and PCD: mm or m. E57 and MCAP are in metres.")] = "mm",
 ) -> None:
     """Write a cloud with the covariance of every point as PLY, PCD, E57, or a ROS 2 message in MCAP.
 
@@ -80,8 +81,8 @@ def cloud(
 
 
 def run(
-    folder: Annotated[Path, typer.Argument(help="Folder of mitsim run, or of mitsim study choose (best sensor).")],
-    output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(RUN_SUFFIXES)}.")],
+    folder: Annotated[Path, Argument(help="Folder of mitsim run, or of mitsim study choose (best sensor).")],
+    output: Annotated[Path, Option("--output", "-o", help=f"File to write: {', '.join(RUN_SUFFIXES)}.")],
     views: Views = "best",
 ) -> None:
     """Write part, views and clouds of a run in one frame as glTF, USD, Rerun, MCAP (ROS 2 with tf) or E57.
@@ -125,16 +126,14 @@ def run(
 
 def results(
     context: typer.Context,
-    folder: Annotated[Path, typer.Argument(help="Folder of mitsim run, or of mitsim study choose (best sensor).")],
-    output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(RESULT_SUFFIXES)}.")],
-    task: Annotated[
-        Path | None, typer.Option(help="Task TOML file of the run; default: the copy in the folder.")
-    ] = None,
-    laboratory: Annotated[str, typer.Option(help="For .xml: who issues the certificate.")] = "",
-    country: Annotated[str, typer.Option(help="For .xml: its country after ISO 3166-1, two letters.")] = "",
-    responsible: Annotated[str, typer.Option(help="For .xml: the person who signs.")] = "",
-    customer: Annotated[str, typer.Option(help="For .xml: for whom.")] = "",
-    serial: Annotated[str, typer.Option(help="For .xml: serial number of the sensor.")] = "",
+    folder: Annotated[Path, Argument(help="Folder of mitsim run, or of mitsim study choose (best sensor).")],
+    output: Annotated[Path, Option("--output", "-o", help=f"File to write: {', '.join(RESULT_SUFFIXES)}.")],
+    task: Annotated[Path | None, Option(help="Task TOML file of the run; default: the copy in the folder.")] = None,
+    laboratory: Annotated[str, Option(help="For .xml: who issues the certificate.")] = "",
+    country: Annotated[str, Option(help="For .xml: its country after ISO 3166-1, two letters.")] = "",
+    responsible: Annotated[str, Option(help="For .xml: the person who signs.")] = "",
+    customer: Annotated[str, Option(help="For .xml: for whom.")] = "",
+    serial: Annotated[str, Option(help="For .xml: serial number of the sensor.")] = "",
 ) -> None:
     """Write the expected uncertainty of every measurement as QIF 3.0, CSV or JSON, or as DCC (.xml).
 
@@ -165,12 +164,12 @@ def results(
 
 
 def targets(
-    folder: Annotated[Path, typer.Argument(help="Folder of mitsim run, study score or study choose (best sensor).")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="File to write.")],
-    robot: Annotated[str, typer.Option(help="Make of the robot: abb, kuka, ur or moveit.")],
+    folder: Annotated[Path, Argument(help="Folder of mitsim run, study score or study choose (best sensor).")],
+    output: Annotated[Path, Option("--output", "-o", help="File to write.")],
+    robot: Annotated[str, Option(help="Make of the robot: abb, kuka, ur or moveit.")],
     views: Annotated[
         str,
-        typer.Option(
+        Option(
             help="best (the set of the run, or the best view of each measurement; the stated view first), all, or "
             "numbers: 3,12."
         ),
@@ -197,10 +196,10 @@ def targets(
 
 def map_(
     map_file: options.MapFile,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
+    output: Annotated[Path, Option("--output", "-o", help="Folder to write.")],
     sensor: Annotated[
         str,
-        typer.Option(
+        Option(
             help="Sensor of the map, a preset or TOML file; it gives the direction of the baseline. Default: the "
             "preset."
         ),
@@ -228,12 +227,12 @@ def map_(
 
 
 def bop(
-    folder: Annotated[Path, typer.Argument(help="Folder of mitsim render --many.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write; it must not exist.")],
-    split: Annotated[str, typer.Option(help="Name of the split: train, val or test.")] = "train",
+    folder: Annotated[Path, Argument(help="Folder of mitsim render --many.")],
+    output: Annotated[Path, Option("--output", "-o", help="Folder to write; it must not exist.")],
+    split: Annotated[str, Option(help="Name of the split: train, val or test.")] = "train",
     objects: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             "--object",
             help="Pattern of the shapes that form one object: 'pin_1*'. Repeatable; default: all shapes "
             "are one object.",
@@ -271,10 +270,8 @@ def _suffix(output: Path, allowed: tuple[str, ...]) -> str:
 
 
 def report(
-    folder: Annotated[Path, typer.Argument(help="Folder of mitsim run or mitsim study choose.")],
-    pdf: Annotated[
-        bool, typer.Option("--pdf", help="Write a statement of uncertainty on one A4 sheet, to sign.")
-    ] = False,
+    folder: Annotated[Path, Argument(help="Folder of mitsim run or mitsim study choose.")],
+    pdf: Annotated[bool, Option("--pdf", help="Write a statement of uncertainty on one A4 sheet, to sign.")] = False,
 ) -> None:
     """Rewrite the HTML page of a finished run or of a comparison of sensors.
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from characterisation.files.atomic_io import write_json
 from characterisation.files.errors import InputError
@@ -17,24 +18,21 @@ from mitsim.cli import options
 
 
 def finish(
-    captures: Annotated[list[Path], typer.Argument(help="Capture folders of one flat coupon.")],
+    captures: Annotated[list[Path], Argument(help="Capture folders of one flat coupon.")],
     sensor: Annotated[
-        str | None,
-        typer.Option(help="Name of a preset, or path of a sensor TOML file; default: the preset of the captures."),
+        str | None, Option(help="Name of a preset, or path of a sensor TOML file; default: the preset of the captures.")
     ] = None,
     scene: Annotated[
         Path | None,
-        typer.Option(
-            help="Scene of the coupon, with its size, metal and process; default: the one that the captures name."
-        ),
+        Option(help="Scene of the coupon, with its size, metal and process; default: the one that the captures name."),
     ] = None,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="JSON file to write.")] = None,
+    output: Annotated[Path | None, Option("--output", "-o", help="JSON file to write.")] = None,
     figure: Annotated[
-        Path | None, typer.Option(help="PNG picture to write: image, model and residual of the view that fits worst.")
+        Path | None, Option(help="PNG picture to write: image, model and residual of the view that fits worst.")
     ] = None,
     block: Annotated[
         int | None,
-        typer.Option(
+        Option(
             min=4,
             max=128,
             help="Side of the blocks over which pixels are averaged [px]; default: 8, or 32 for an unknown pattern.",
@@ -42,7 +40,7 @@ def finish(
     ] = None,
     window: Annotated[
         tuple[int, int, int, int] | None,
-        typer.Option(
+        Option(
             metavar="COLUMN ROW WIDTH HEIGHT",
             help="Window of the first camera's image that shows only the coupon [px]; default: from its pose, or from "
             "the plane with most points.",
@@ -86,27 +84,21 @@ def sensor_(
     context: typer.Context,
     captures: Annotated[
         list[Path] | None,
-        typer.Argument(
-            help="Capture folders of a flat object, with the projector on unless their settings say otherwise."
-        ),
+        Argument(help="Capture folders of a flat object, with the projector on unless their settings say otherwise."),
     ] = None,
-    sensor: Annotated[str, typer.Option(help="Sensor to start from: a preset or a TOML file.")] = "",
-    output: Annotated[Path, typer.Option("--output", "-o", help="Sensor TOML file to write.")] = Path("my-camera.toml"),
-    off: Annotated[list[Path] | None, typer.Option(help="Capture with the projector off; once for each.")] = None,
-    dark: Annotated[list[Path] | None, typer.Option(help="Capture with all light off; once for each.")] = None,
+    sensor: Annotated[str, Option(help="Sensor to start from: a preset or a TOML file.")] = "",
+    output: Annotated[Path, Option("--output", "-o", help="Sensor TOML file to write.")] = Path("my-camera.toml"),
+    off: Annotated[list[Path] | None, Option(help="Capture with the projector off; once for each.")] = None,
+    dark: Annotated[list[Path] | None, Option(help="Capture with all light off; once for each.")] = None,
     window: options.ObjectWindow = None,
     study: Annotated[
         Path | None,
-        typer.Option(
-            help="Study TOML file: after the fit, also make the map of the sensor, and run the study with both."
-        ),
+        Option(help="Study TOML file: after the fit, also make the map of the sensor, and run the study with both."),
     ] = None,
     campaign: Annotated[
-        Path | None, typer.Option(help="With --study: campaign TOML file of the map; default: the one of the study.")
+        Path | None, Option(help="With --study: campaign TOML file of the map; default: the one of the study.")
     ] = None,
-    minutes: Annotated[
-        float | None, typer.Option(min=0.1, help="With --study: time of the run of the study [min].")
-    ] = None,
+    minutes: Annotated[float | None, Option(min=0.1, help="With --study: time of the run of the study [min].")] = None,
     yes: options.Yes = False,
     seed: options.Seed = 1,
     variant: options.Variant = None,

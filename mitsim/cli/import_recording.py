@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Option
 
 from characterisation.files.errors import InputError
 from characterisation.words.progress import say
@@ -27,96 +27,89 @@ SETTINGS_TO_CHECK = (
 
 
 def import_(
-    path: Annotated[Path, typer.Argument(help="File or folder that a device or another program saved.")],
+    path: Annotated[Path, Argument(help="File or folder that a device or another program saved.")],
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output", "-o", help="Capture folder to write; default: named after PATH, in the current folder."
-        ),
+        Option("--output", "-o", help="Capture folder to write; default: named after PATH, in the current folder."),
     ] = None,
     sensor: Annotated[
-        str | None,
-        typer.Option(help="Sensor that took it, a preset or TOML file; it supplies name, cameras and range."),
+        str | None, Option(help="Sensor that took it, a preset or TOML file; it supplies name, cameras and range.")
     ] = None,
     calibration: Annotated[
         str | None,
-        typer.Option(
-            metavar="FILE", help="Calibration of the cameras: TOML, JSON, OpenCV's YAML or XML, DepthAI's JSON."
-        ),
+        Option(metavar="FILE", help="Calibration of the cameras: TOML, JSON, OpenCV's YAML or XML, DepthAI's JSON."),
     ] = None,
     kind: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--as",
             help="Kind of recording: ensenso, depthai, ros, robi, stereo-pair, images, depth, ply, pcd, zdf or npy; "
             "default: detected.",
         ),
     ] = None,
-    camera: Annotated[str | None, typer.Option(help="For a depth image or cloud: the name of its camera.")] = None,
+    camera: Annotated[str | None, Option(help="For a depth image or cloud: the name of its camera.")] = None,
     frame: Annotated[
-        str | None, typer.Option(help="Image set, pair or frame to import: its number, from 0, or its name.")
+        str | None, Option(help="Image set, pair or frame to import: its number, from 0, or its name.")
     ] = None,
     topic: options.Topic = None,
     images: Annotated[
         list[str] | None,
-        typer.Option(help="For a folder of images: files of one camera, NAME=PATTERN (left='cam0_*.png'). Repeatable."),
+        Option(help="For a folder of images: files of one camera, NAME=PATTERN (left='cam0_*.png'). Repeatable."),
     ] = None,
-    channel: Annotated[str | None, typer.Option(help="For colour images: red, green or blue; default green.")] = None,
-    exposure_s: Annotated[float | None, typer.Option("--exposure", help="Exposure time of every image [s].")] = None,
+    channel: Annotated[str | None, Option(help="For colour images: red, green or blue; default green.")] = None,
+    exposure_s: Annotated[float | None, Option("--exposure", help="Exposure time of every image [s].")] = None,
     pose: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="FILE",
             help="Pose of the sensor: pose.json, or a text file with the 4 x 4 matrix world_from_sensor [mm].",
         ),
     ] = None,
     sample: Annotated[
-        str | None, typer.Option(help="For a coupon: the label of its sample in a campaign (aluminium/ground Ra 0.4).")
+        str | None, Option(help="For a coupon: the label of its sample in a campaign (aluminium/ground Ra 0.4).")
     ] = None,
     coupon: Annotated[
         tuple[int, int, int, int] | None,
-        typer.Option(
+        Option(
             metavar="COLUMN ROW WIDTH HEIGHT",
             help="For a coupon: window of the cloud's pixels that shows only it; its plane gives the pose.",
         ),
     ] = None,
-    projector: Annotated[str | None, typer.Option(help="State of the projector: on or off.")] = None,
+    projector: Annotated[str | None, Option(help="State of the projector: on or off.")] = None,
     range_mm: Annotated[
-        tuple[float, float] | None, typer.Option("--range", help="Nearest and farthest depth to decode [mm].")
+        tuple[float, float] | None, Option("--range", help="Nearest and farthest depth to decode [mm].")
     ] = None,
     scale_mm: Annotated[
         float | None,
-        typer.Option("--scale", min=1e-6, max=1e4, help="For a depth image: depth per grey level [mm]; default 1."),
+        Option("--scale", min=1e-6, max=1e4, help="For a depth image: depth per grey level [mm]; default 1."),
     ] = None,
     invalid: Annotated[
-        int | None,
-        typer.Option(min=0, max=65535, help="For a depth image: grey level of pixels without depth; default 0."),
+        int | None, Option(min=0, max=65535, help="For a depth image: grey level of pixels without depth; default 0.")
     ] = None,
     along: Annotated[
         str | None,
-        typer.Option(help="For a depth image: its numbers are distances along the axis of the camera, or the ray."),
+        Option(help="For a depth image: its numbers are distances along the axis of the camera, or the ray."),
     ] = None,
     unit: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="Unit of a cloud: um, mm, cm, m, inch or foot; default: m if the median distance is below 20, else mm."
         ),
     ] = None,
     axes: Annotated[
         str | None,
-        typer.Option(help="Axes of a cloud: opencv (y down, z forward) or opengl (y up, z backward); default opencv."),
+        Option(help="Axes of a cloud: opencv (y down, z forward) or opengl (y up, z backward); default opencv."),
     ] = None,
     link: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="FILE",
             help="For a cloud of an Ensenso: its *_calib.json. Its Link (the transform to a workspace) is undone, so "
             "that points are in the sensor frame.",
         ),
     ] = None,
     subpixel_bits: Annotated[
-        int | None,
-        typer.Option(min=0, max=8, help="For a DepthAI disparity: n if its unit is 1/2^n px; default: detected."),
+        int | None, Option(min=0, max=8, help="For a DepthAI disparity: n if its unit is 1/2^n px; default: detected.")
     ] = None,
 ) -> None:
     """Import a recording of a device or another program as a capture folder; the kind of recording is detected.

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
+from typer import Argument, Option
 
 from characterisation.files.atomic_io import write_json
 from characterisation.words.progress import say, track
@@ -19,17 +19,16 @@ _ONE_AT_A_TIME = ("a campaign with a [device]", "no such option: a device takes 
 
 def make(
     context: typer.Context,
-    campaign: Annotated[Path, typer.Argument(help="Campaign TOML file.")],
+    campaign: Annotated[Path, Argument(help="Campaign TOML file.")],
     output: options.Out,
     sensor: options.SensorOption = "ensenso-n10",
     captures: Annotated[
-        Path | None, typer.Option(help="Use the captures of coupons in this folder; do not take new ones.")
+        Path | None, Option(help="Use the captures of coupons in this folder; do not take new ones.")
     ] = None,
     scheduler: options.Scheduler = None,
     processes: options.Processes = 1,
     compact: Annotated[
-        Path | None,
-        typer.Option(help="Also write the map to this file, rounded and compressed: about 0.1 MB per sample."),
+        Path | None, Option(help="Also write the map to this file, rounded and compressed: about 0.1 MB per sample.")
     ] = None,
     variant: options.Variant = None,
 ) -> None:
@@ -89,13 +88,12 @@ def make(
 
 def compare(
     maps: Annotated[
-        list[str],
-        typer.Argument(help="map.nc files, or sensors whose map comes with mitsim; default: all such sensors."),
+        list[str], Argument(help="map.nc files, or sensors whose map comes with mitsim; default: all such sensors.")
     ] = [],  # noqa: B006
     output: options.Out = Path("compare"),
     distance: Annotated[
         float | None,
-        typer.Option(
+        Option(
             min=10,
             max=20000,
             help="Distance from the sensor at which to compare [mm]; default: the middle of each map.",
@@ -125,7 +123,7 @@ def predict(
     scene: options.Scene,
     output: options.OutCloud,
     map_file: Annotated[
-        Path, typer.Option("--map", metavar="MAP", help="A map.nc file, or a sensor whose map comes with mitsim.")
+        Path, Option("--map", metavar="MAP", help="A map.nc file, or a sensor whose map comes with mitsim.")
     ],
     position: options.Position,
     target: options.Target = (0.0, 0.0, 0.0),
@@ -133,7 +131,7 @@ def predict(
     sensor: options.SensorOption = "ensenso-n10",
     noise: Annotated[
         Literal["independent", "correlated"],
-        typer.Option(help="Errors of neighbouring points: independent, or correlated as measured in the map."),
+        Option(help="Errors of neighbouring points: independent, or correlated as measured in the map."),
     ] = "independent",
     seed: options.Seed = 1,
     define: options.Defines = None,
@@ -171,15 +169,13 @@ def predict(
 def validate(
     context: typer.Context,
     map_file: options.MapFile,
-    campaign: Annotated[Path, typer.Argument(help="Campaign TOML file with the coupons to capture.")],
+    campaign: Annotated[Path, Argument(help="Campaign TOML file with the coupons to capture.")],
     output: options.Out,
     sensor: options.SensorOption = "ensenso-n10",
-    poses: Annotated[int, typer.Option(min=1, max=10000, help="Poses of each sample at each distance.")] = 24,
+    poses: Annotated[int, Option(min=1, max=10000, help="Poses of each sample at each distance.")] = 24,
     repeats: Annotated[
         int,
-        typer.Option(
-            min=1, max=1000, help="Captures of each pose; up to four times as many where few points are recovered."
-        ),
+        Option(min=1, max=1000, help="Captures of each pose; up to four times as many where few points are recovered."),
     ] = 1,
     seed: options.Seed = 1,
     scheduler: options.Scheduler = None,
@@ -200,9 +196,7 @@ def validate(
     from characterisation.maps.performance_map import PerformanceMap
     from characterisation.maps.shipped import map_path
     from characterisation.maps.validation import residual_table, within_limits
-    from mitsim.capture.simulated.simulate import SimulatedSensor
     from mitsim.maps.campaign import hold_out
-    from mitsim.maps.campaign.acquire import CaptureSource, simulated_source
     from mitsim.maps.campaign.campaign_file import CampaignFile
     from mitsim.maps.campaign.live import live_source
     from mitsim.maps.campaign.orders import PreparedSensor
@@ -221,18 +215,13 @@ def validate(
     plan = hold_out.held_out_campaign(campaign, chosen, performance_map) if live is None else live.campaign
     shots = hold_out.held_out_shots(plan, poses, seed)
     options.check_folder(output)
-    workers = options.requested_workers(scheduler, processes)
-    if workers is not None:
+    if live is None:
         orders = hold_out.held_out_orders(plan, shots, path, repeats)
+        workers = options.requested_workers(scheduler, processes)
         pairs = results_of(orders, hold_out.hold_out_order, workers, "hold out")
     else:
-        source: AbstractContextManager[CaptureSource]
-        if live is None:
-            source = nullcontext(simulated_source(SimulatedSensor(plan.sensor), plan.file.samples_per_pixel))
-        else:
-            source = live_source(live, mount)
         prepared = PreparedSensor(plan.sensor)
-        with source as take:
+        with live_source(live, mount) as take:
             compared = (hold_out.compared(shot, prepared, performance_map, take, repeats) for shot in shots)
             pairs = list(track(compared, "hold out", len(shots)))
     table = residual_table(pairs)
@@ -248,7 +237,7 @@ def validate(
 
 
 def sheet(
-    sensors: Annotated[list[str], typer.Argument(help="Presets or sensor TOML files; default: all presets.")] = [],  # noqa: B006
+    sensors: Annotated[list[str], Argument(help="Presets or sensor TOML files; default: all presets.")] = [],  # noqa: B006
     output: options.Out = Path("datasheet"),
     seed: options.Seed = 1,
     scheduler: options.Scheduler = None,

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Option
 
 from characterisation.files.errors import InputError
 from characterisation.words.progress import say
@@ -26,72 +27,67 @@ def clouds(
     inputs: options.Clouds,
     plane: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar=_WINDOW,
             help="Flatness, noise, distance and normal of the plane in a window [px]; NAME alone: the whole cloud.",
         ),
     ] = None,
     sphere: Annotated[
         list[str] | None,
-        typer.Option(metavar=_WINDOW, help="Diameter, noise, distance and centre of the sphere in a window."),
+        Option(metavar=_WINDOW, help="Diameter, noise, distance and centre of the sphere in a window."),
     ] = None,
     cylinder: Annotated[
-        list[str] | None,
-        typer.Option(metavar=_WINDOW, help="Diameter, cylindricity and noise of the cylinder in a window."),
+        list[str] | None, Option(metavar=_WINDOW, help="Diameter, cylindricity and noise of the cylinder in a window.")
     ] = None,
     angle: Annotated[
-        list[str] | None, typer.Option(metavar="NAME,NAME", help="Angle between two planes or cylinders, 0 to 90 deg.")
+        list[str] | None, Option(metavar="NAME,NAME", help="Angle between two planes or cylinders, 0 to 90 deg.")
     ] = None,
     distance: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME,NAME", help="Distance between planes, cylinders, spheres, or a sphere and a plane [mm]."
-        ),
+        Option(metavar="NAME,NAME", help="Distance between planes, cylinders, spheres, or a sphere and a plane [mm]."),
     ] = None,
     dots: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="NAME=COLUMN,ROW,WIDTH,HEIGHT,PITCH",
             help="Spacing of the dots of a plate with known PITCH [mm]; NAME=PITCH: the whole image. Captures only.",
         ),
     ] = None,
-    bright_dots: Annotated[bool, typer.Option("--bright-dots", help="The dots are brighter than the plate.")] = False,
-    task: Annotated[Path | None, typer.Option(help="Task TOML file: measure what it defines; needs --scene.")] = None,
-    scene: Annotated[Path | None, typer.Option(help="Scene of the part; it assigns pixels to features.")] = None,
+    bright_dots: Annotated[bool, Option("--bright-dots", help="The dots are brighter than the plate.")] = False,
+    task: Annotated[Path | None, Option(help="Task TOML file: measure what it defines; needs --scene.")] = None,
+    scene: Annotated[Path | None, Option(help="Scene of the part; it assigns pixels to features.")] = None,
     pose: options.PoseFile = None,
     view: options.ViewOfPoses = None,
     correct: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             metavar="STATEMENT",
             help="Subtract the bias in this statement.json, made for the same view, from the values of the task.",
         ),
     ] = None,
     against: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             metavar="CLOUD", help="Reference cloud: signed difference of each cloud from it, in the same frame [mm]."
         ),
     ] = None,
     by: Annotated[
         str,
-        typer.Option(
+        Option(
             help="Direction of the difference: rays, surface (normal), or auto: rays if both clouds have the same grid."
         ),
     ] = "auto",
     window: Annotated[
         tuple[int, int, int, int] | None,
-        typer.Option(metavar="COLUMN ROW WIDTH HEIGHT", help="Window of the difference [px]."),
+        Option(metavar="COLUMN ROW WIDTH HEIGHT", help="Window of the difference [px]."),
     ] = None,
     picture: Annotated[
         Path | None,
-        typer.Option(
-            help="PNG picture to write: the difference, or the distances and windows; numbered for several clouds."
-        ),
+        Option(help="PNG picture to write: the difference, or the distances and windows; numbered for several clouds."),
     ] = None,
     points_in: Annotated[
         str,
-        typer.Option(
+        Option(
             metavar="FRAME",
             help="Frame of centres, axes, normals and perpendicular distances: sensor; workspace (an Ensenso's Link); "
             "board=COLUMNS,ROWS,PITCH, the inner corners of a chequerboard in the images [mm]; or the pose.json of "

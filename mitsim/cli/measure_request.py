@@ -16,12 +16,8 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.acceptance.cloud_difference import (
-    Difference,
-    difference_along_rays,
-    difference_to_surface,
-    distribution,
-)
+from characterisation.acceptance import cloud_difference
+from characterisation.acceptance.cloud_difference import Difference
 from characterisation.files.documents import checked_name
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
@@ -85,10 +81,10 @@ class Request:
         if reference is None:
             return results, lambda: _figures().distance_figure(cloud, boxes)
         values = self._difference(input_cloud, reference)
-        difference = distribution(values, int(cloud.valid[window_slices(self.window, cloud, "difference")].sum()))
-        return results + _difference_results(difference), lambda: _figures().difference_figure(
-            values, difference, boxes, self.window
-        )
+        given = int(cloud.valid[window_slices(self.window, cloud, "difference")].sum())
+        difference = cloud_difference.distribution(values, given)
+        shown = values, difference, boxes, self.window
+        return results + _difference_results(difference), lambda: _figures().difference_figure(*shown)
 
     def _difference(self, input_cloud: InputCloud, reference: InputCloud) -> NDArray[np.float64]:
         """Return the difference (H, W) [mm] of a cloud from the reference, NaN outside the window."""
@@ -96,10 +92,10 @@ class Request:
         inside = window_slices(self.window, cloud, "difference")
         out = np.full(cloud.status.shape, np.nan)
         if self.by == "rays" or (self.by == "auto" and cloud.grid.same_rays(other.grid)):
-            out[inside] = difference_along_rays(cloud, other, inside)
+            out[inside] = cloud_difference.difference_along_rays(cloud, other, inside)
         else:
             progress = partial(track_if_long, label="difference, blocks of points")
-            out[inside] = difference_to_surface(cloud, other, inside, progress)
+            out[inside] = cloud_difference.difference_to_surface(cloud, other, inside, progress)
         return out
 
     def _boxes(self) -> dict[str, Roi]:

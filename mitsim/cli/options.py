@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
 from typer.core import TyperCommand, TyperGroup
 
 from characterisation.files.atomic_io import pointed_to
@@ -21,33 +22,29 @@ if TYPE_CHECKING:
     from characterisation.point_cloud import PointCloud
     from mitsim.running.executor import Executor
 
-Out = Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")]
-OutCloud = Annotated[Path, typer.Option("--output", "-o", help="Point cloud to write, a PLY file.")]
-Scene = Annotated[Path, typer.Argument(help="Scene XML file of the part, in mm.")]
-Variant = Annotated[str | None, typer.Option(help="Mitsuba variant: cuda_ad_mono (GPU) or llvm_ad_mono (CPU).")]
-SensorOption = Annotated[str, typer.Option(help="Name of a preset, or path of a sensor TOML file.")]
-Defines = Annotated[list[str] | None, typer.Option("-D", help="Set a <default> of the scene: name=value. Repeatable.")]
-Position = Annotated[
-    tuple[float, float, float], typer.Option(help="Position of the sensor in the frame of the scene [mm].")
-]
+Out = Annotated[Path, Option("--output", "-o", help="Folder to write.")]
+OutCloud = Annotated[Path, Option("--output", "-o", help="Point cloud to write, a PLY file.")]
+Scene = Annotated[Path, Argument(help="Scene XML file of the part, in mm.")]
+Variant = Annotated[str | None, Option(help="Mitsuba variant: cuda_ad_mono (GPU) or llvm_ad_mono (CPU).")]
+SensorOption = Annotated[str, Option(help="Name of a preset, or path of a sensor TOML file.")]
+Defines = Annotated[list[str] | None, Option("-D", help="Set a <default> of the scene: name=value. Repeatable.")]
+Position = Annotated[tuple[float, float, float], Option(help="Position of the sensor in the frame of the scene [mm].")]
 Target = Annotated[
-    tuple[float, float, float], typer.Option(help="Point that the sensor looks at, in the frame of the scene [mm].")
+    tuple[float, float, float], Option(help="Point that the sensor looks at, in the frame of the scene [mm].")
 ]
-Roll = Annotated[float, typer.Option(help="Rotation about the view axis [deg].")]
-Seed = Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Random seed; the same seed gives the same result.")]
+Roll = Annotated[float, Option(help="Rotation about the view axis [deg].")]
+Seed = Annotated[int, Option(min=0, max=2**63 - 1, help="Random seed; the same seed gives the same result.")]
 
 
 Scheduler = Annotated[
-    str | None,
-    typer.Option(help="Distribute the work to a Dask cluster: the address of its scheduler, tcp://HOST:8786."),
+    str | None, Option(help="Distribute the work to a Dask cluster: the address of its scheduler, tcp://HOST:8786.")
 ]
 Processes = Annotated[
-    int,
-    typer.Option(min=0, max=1024, help="Worker processes on this machine; 0: as many as its cores and memory allow."),
+    int, Option(min=0, max=1024, help="Worker processes on this machine; 0: as many as its cores and memory allow.")
 ]
 Clouds = Annotated[
     list[Path],
-    typer.Argument(
+    Argument(
         metavar="CLOUD...",
         help="Point clouds (.ply, .pcd, .zdf, .npy, .mat, .xyz), recordings and capture folders (decoded first), or "
         "folders of these.",
@@ -55,50 +52,46 @@ Clouds = Annotated[
 ]
 Topic = Annotated[
     list[str] | None,
-    typer.Option(
-        help="For a bag of ROS: the topic of depth images or of clouds; twice for the left and the right images."
-    ),
+    Option(help="For a bag of ROS: the topic of depth images or of clouds; twice for the left and the right images."),
 ]
 Unit = Annotated[
     str | None,
-    typer.Option(
+    Option(
         help="Unit of clouds of other programs: um, mm, cm, m, inch or foot; default: that of the file, else m if the "
         "median distance is below 20, else mm."
     ),
 ]
 Frame = Annotated[
-    str | None, typer.Option(help="For a recording with several: image set, pair or frame, its number or name.")
+    str | None, Option(help="For a recording with several: image set, pair or frame, its number or name.")
 ]
 Simulated = Annotated[
     str | None,
-    typer.Option(
+    Option(
         metavar="SENSOR",
         help="Sensor to simulate before the same planes and spheres, a preset or TOML file: its figures beside those "
         "of the first cloud, with F and sigma of the planes.",
     ),
 ]
-MapFile = Annotated[str, typer.Argument(metavar="MAP", help="A map.nc file, or a sensor whose map comes with mitsim.")]
+MapFile = Annotated[str, Argument(metavar="MAP", help="A map.nc file, or a sensor whose map comes with mitsim.")]
 ObjectWindow = Annotated[
     tuple[int, int, int, int] | None,
-    typer.Option(
+    Option(
         metavar="COLUMN ROW WIDTH HEIGHT",
         help="Window of the first camera's image that shows the object [px]; default: the whole image.",
     ),
 ]
 PoseFile = Annotated[
     Path | None,
-    typer.Option(
+    Option(
         help="Pose of the sensor: pose.json, statement.json, or poses.json with --view; default: that of the capture."
     ),
 ]
-ViewOfPoses = Annotated[int | None, typer.Option(min=0, help="Number of the view in poses.json.")]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON in place of the table.")]
-DecodedAs = Annotated[str | None, typer.Option(help="Decode captures with the settings of this sensor.")]
-Overwrite = Annotated[bool, typer.Option(help="Replace a finished run; its finished trials are reused.")]
+ViewOfPoses = Annotated[int | None, Option(min=0, help="Number of the view in poses.json.")]
+Json = Annotated[bool, Option("--json", help="Print JSON in place of the table.")]
+DecodedAs = Annotated[str | None, Option(help="Decode captures with the settings of this sensor.")]
+Overwrite = Annotated[bool, Option(help="Replace a finished run; its finished trials are reused.")]
 
-Yes = Annotated[
-    bool, typer.Option("--yes", "-y", help="Characterise finishes that are missing in the map, without asking.")
-]
+Yes = Annotated[bool, Option("--yes", "-y", help="Characterise finishes that are missing in the map, without asking.")]
 
 
 def asking(yes: bool, extension: str = "") -> Callable[[str], bool] | None:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from characterisation.files.atomic_io import write_text
 from characterisation.files.errors import InputError
@@ -24,32 +25,31 @@ def check(
     scene: options.Scene,
     position: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(help="Position of the sensor in the frame of the scene [mm]; default: 45 deg above the part."),
+        Option(help="Position of the sensor in the frame of the scene [mm]; default: 45 deg above the part."),
     ] = None,
     target: options.Target = (0.0, 0.0, 0.0),
     roll: options.Roll = 0.0,
     pose: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="File with the pose of the sensor, in place of --position: pose.json, statement.json, or poses.json "
             "with --view."
         ),
     ] = None,
     view: options.ViewOfPoses = None,
     sensor: options.SensorOption = "ensenso-n10",
-    task: Annotated[Path | None, typer.Option(help="Task TOML file; check that the scene has its features.")] = None,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="PNG picture to write.")] = None,
+    task: Annotated[Path | None, Option(help="Task TOML file; check that the scene has its features.")] = None,
+    output: Annotated[Path | None, Option("--output", "-o", help="PNG picture to write.")] = None,
     bounces: Annotated[
         Path | None,
-        typer.Option(help="PNG picture to write: the share of interreflected light, and the face that it comes from."),
+        Option(help="PNG picture to write: the share of interreflected light, and the face that it comes from."),
     ] = None,
     every: Annotated[
-        bool, typer.Option("--all", help="Print every shape and finding, not the measured and first shapes only.")
+        bool, Option("--all", help="Print every shape and finding, not the measured and first shapes only.")
     ] = False,
     json: options.Json = False,
     html: Annotated[
-        Path | None,
-        typer.Option(help="HTML page to write: edit names, finishes and measurements, then download the files."),
+        Path | None, Option(help="HTML page to write: edit names, finishes and measurements, then download the files.")
     ] = None,
     define: options.Defines = None,
     variant: options.Variant = None,
@@ -139,51 +139,45 @@ def _inspected(
 
 def part(
     context: typer.Context,
-    file: Annotated[Path, typer.Argument(help="STEP file, or a mesh: STL, OBJ, PLY, OFF, 3MF or glTF.")],
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="Scene folder to write.")] = None,
+    file: Annotated[Path, Argument(help="STEP file, or a mesh: STL, OBJ, PLY, OFF, 3MF or glTF.")],
+    output: Annotated[Path | None, Option("--output", "-o", help="Scene folder to write.")] = None,
     units: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="Unit of a file that states none: um, mm, cm, m, inch or foot; default: that of the file, else mm."
         ),
     ] = None,
-    metal: Annotated[str | None, typer.Option(help="Metal of all faces; default aluminium.")] = None,
-    process: Annotated[str | None, typer.Option(help="Machining process of all faces; default ground.")] = None,
+    metal: Annotated[str | None, Option(help="Metal of all faces; default aluminium.")] = None,
+    process: Annotated[str | None, Option(help="Machining process of all faces; default ground.")] = None,
     roughness: Annotated[
-        float | None, typer.Option("--Ra", help="Roughness average Ra of all faces [um]; default 0.8.")
+        float | None, Option("--Ra", help="Roughness average Ra of all faces [um]; default 0.8.")
     ] = None,
     finish: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="Plastic, casting or paint in place of metal, process and Ra: black_plastic, grey_plastic, "
             "white_plastic, glossy_black_plastic, iron_casting, aluminium_casting, powder_coat, gloss_paint, "
             "matt_white."
         ),
     ] = None,
-    reflectance: Annotated[
-        float | None, typer.Option(help="Diffuse reflectance of a paint or plastic, 0 to 1.")
-    ] = None,
-    gloss: Annotated[float | None, typer.Option(help="Gloss of a paint or plastic at 60 deg [GU].")] = None,
+    reflectance: Annotated[float | None, Option(help="Diffuse reflectance of a paint or plastic, 0 to 1.")] = None,
+    gloss: Annotated[float | None, Option(help="Gloss of a paint or plastic at 60 deg [GU].")] = None,
     angle: Annotated[
-        float,
-        typer.Option(help="For a mesh: neighbouring triangles that meet at less than this angle form one face [deg]."),
+        float, Option(help="For a mesh: neighbouring triangles that meet at less than this angle form one face [deg].")
     ] = 20.0,
     sensor: Annotated[
-        str | None,
-        typer.Option(help="For a STEP file: mesh it as finely as this sensor resolves (preset or TOML file)."),
+        str | None, Option(help="For a STEP file: mesh it as finely as this sensor resolves (preset or TOML file).")
     ] = None,
-    chord: Annotated[
-        float | None, typer.Option(help="For a STEP file: chord error of the mesh [mm]; default 0.01.")
-    ] = None,
+    chord: Annotated[float | None, Option(help="For a STEP file: chord error of the mesh [mm]; default 0.01.")] = None,
     edit: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--edit",
             help="Serve a page to edit names, finishes and measurements; it saves to the folder. "
             "FILE may also be the XML file of a scene.",
         ),
     ] = False,
-    port: Annotated[int, typer.Option(help="Port of --edit on 127.0.0.1; 0: any free port.")] = 0,
+    port: Annotated[int, Option(help="Port of --edit on 127.0.0.1; 0: any free port.")] = 0,
 ) -> None:
     """Convert a STEP file or a mesh to a scene with one named shape per face, and a task with the drawing's dimensions.
 

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Option
 
 from characterisation.files.atomic_io import FULL
 from characterisation.files.errors import InputError, MissingEnvironmentError
@@ -81,9 +82,9 @@ def _version(asked: bool) -> None:
 @app.callback()
 def _common(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+        bool, Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
     ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Do not print progress.")] = False,
+    quiet: Annotated[bool, Option("--quiet", "-q", help="Do not print progress.")] = False,
 ) -> None:
     be_quiet(quiet)
 

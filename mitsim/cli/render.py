@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Option
 
 from characterisation.files.errors import InputError
 from characterisation.words.progress import say
@@ -25,19 +26,19 @@ def render(
     output: options.Out,
     position: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(help="Position of the sensor in the frame of the scene [mm]; or use --many."),
+        Option(help="Position of the sensor in the frame of the scene [mm]; or use --many."),
     ] = None,
     target: options.Target = (0.0, 0.0, 0.0),
     roll: options.Roll = 0.0,
     sensor: options.SensorOption = "ensenso-n10",
     seed: options.Seed = 1,
-    samples: Annotated[int, typer.Option(min=1, max=65536, help="Light paths per pixel.")] = 16,
+    samples: Annotated[int, Option(min=1, max=65536, help="Light paths per pixel.")] = 16,
     depth: Annotated[
-        int, typer.Option(min=1, max=16, help="Largest number of surfaces on a light path; 1: direct light only.")
+        int, Option(min=1, max=16, help="Largest number of surfaces on a light path; 1: direct light only.")
     ] = 3,
     smoothing: Annotated[
         float,
-        typer.Option(
+        Option(
             min=0,
             max=10,
             help="Standard deviation of a filter over the interreflections on each shape [px]; virtual measurements "
@@ -46,32 +47,26 @@ def render(
     ] = 0.0,
     noise: Annotated[
         str,
-        typer.Option(
+        Option(
             help="Noise sources: all, none, a list (shot,read), or all but some (no-speckle). Without quantisation "
             "images have 16 bits."
         ),
     ] = "all",
     deviation: Annotated[
         str,
-        typer.Option(
-            help="Shift the uncertain parameters of the finishes by standard deviations: alpha=1,wide_angle=-1."
-        ),
+        Option(help="Shift the uncertain parameters of the finishes by standard deviations: alpha=1,wide_angle=-1."),
     ] = "",
-    truth: Annotated[
-        bool, typer.Option("--truth", help="Also write the true geometry at each pixel, as OpenEXR.")
-    ] = False,
+    truth: Annotated[bool, Option("--truth", help="Also write the true geometry at each pixel, as OpenEXR.")] = False,
     many: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="TOML plan of views and finishes: simulate each one into a folder in OUTPUT; continues an "
             "interrupted plan."
         ),
     ] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(
-            help="With --many: address of a Dask scheduler whose workers simulate the captures, tcp://HOST:8786."
-        ),
+        Option(help="With --many: address of a Dask scheduler whose workers simulate the captures, tcp://HOST:8786."),
     ] = None,
     processes: options.Processes = 1,
     define: options.Defines = None,

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from characterisation.files.atomic_io import write_json
 from characterisation.files.errors import InputError
@@ -21,19 +22,19 @@ if TYPE_CHECKING:
     from mitsim.study.run_document import ViewSetEntry
 
 
-StudyFile = Annotated[Path, typer.Argument(help="Study TOML file: part, task, sensor and views.")]
+StudyFile = Annotated[Path, Argument(help="Study TOML file: part, task, sensor and views.")]
 PlanExposures = Annotated[
     bool,
-    typer.Option(
+    Option(
         "--plan-exposures",
         help="Plan the exposures of the stated view (see `mitsim study exposures`), with the limits in [exposure] "
         "of the study. Views are screened and compared with the sensor's own exposure.",
     ),
 ]
 RequireFit = Annotated[
-    bool, typer.Option("--require-fit", help="End with exit code 1 unless every tolerance and limit is kept.")
+    bool, Option("--require-fit", help="End with exit code 1 unless every tolerance and limit is kept.")
 ]
-ViewNumber = Annotated[int, typer.Option(min=0, help="Number of the view in scores.csv and poses/.")]
+ViewNumber = Annotated[int, Option(min=0, help="Number of the view in scores.csv and poses/.")]
 
 
 def run(
@@ -41,7 +42,7 @@ def run(
     output: options.Out,
     minutes: Annotated[
         float | None,
-        typer.Option(
+        Option(
             min=0.1,
             help="Time for the whole command [min], shared among screening, comparing views, statement and report; "
             "default: until the statement is settled or known well enough ([statement] of the study).",
@@ -95,16 +96,16 @@ def choose(
     output: options.Out,
     sensors: Annotated[
         str,
-        typer.Option(
+        Option(
             help="all (presets), or presets and sensor files separated by commas; SENSOR=MAP uses a map of your own."
         ),
     ] = "all",
-    minutes: Annotated[float, typer.Option(min=0.1, help="Total time, shared among the sensors [min].")] = 10.0,
+    minutes: Annotated[float, Option(min=0.1, help="Total time, shared among the sensors [min].")] = 10.0,
     plan: PlanExposures = False,
     require_fit: RequireFit = False,
     scheduler: options.Scheduler = None,
     processes: options.Processes = 1,
-    as_json: Annotated[bool, typer.Option("--json", help="Print choice.json in place of the table.")] = False,
+    as_json: Annotated[bool, Option("--json", help="Print choice.json in place of the table.")] = False,
     overwrite: options.Overwrite = False,
     yes: options.Yes = False,
     variant: options.Variant = None,
@@ -175,7 +176,7 @@ def state(
     view: ViewNumber,
     minutes: Annotated[
         float | None,
-        typer.Option(
+        Option(
             min=0.1,
             help="Time for the whole command [min]; default: until every measurement is settled or known well enough "
             "([statement] of the study).",
@@ -219,21 +220,20 @@ def exposures(
     output: options.Out,
     view: ViewNumber,
     most: Annotated[
-        int | None, typer.Option(min=1, max=7, help="Largest number of exposures to merge; default: from the study.")
+        int | None, Option(min=1, max=7, help="Largest number of exposures to merge; default: from the study.")
     ] = None,
     within: Annotated[
         float | None,
-        typer.Option(
+        Option(
             min=0.01,
             max=1,
             help="Fraction by which points and uncertainty may miss their limit; default: from the study.",
         ),
     ] = None,
     minutes: Annotated[
-        float | None,
-        typer.Option(min=0.1, help="Time for the whole command [min]; default: until the plan is finished."),
+        float | None, Option(min=0.1, help="Time for the whole command [min]; default: until the plan is finished.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print exposures.json in place of the table.")] = False,
+    as_json: Annotated[bool, Option("--json", help="Print exposures.json in place of the table.")] = False,
     variant: options.Variant = None,
 ) -> None:
     """Find the fewest exposures of one view with which every feature nearly reaches its least possible uncertainty.
@@ -309,11 +309,11 @@ def _tell_statement(
 def score(
     study: StudyFile,
     output: options.Out,
-    top: Annotated[int, typer.Option(min=1, max=10000, help="Number of views to print for each measurement.")] = 10,
-    measurement: Annotated[list[str] | None, typer.Option(help="Print only this measurement. Repeatable.")] = None,
+    top: Annotated[int, Option(min=1, max=10000, help="Number of views to print for each measurement.")] = 10,
+    measurement: Annotated[list[str] | None, Option(help="Print only this measurement. Repeatable.")] = None,
     map_file: Annotated[
         str,
-        typer.Option(
+        Option(
             "--map",
             metavar="MAP",
             help="A map.nc file, or the name of a sensor whose map comes with mitsim; default: the map of the study.",

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from characterisation.words.progress import say
 from mitsim.cli import options
@@ -14,20 +15,18 @@ from mitsim.running.time_limit import TimeLimit, ending_in_order, stopped_by_use
 
 def talk(
     context: typer.Context,
-    file: Annotated[Path, typer.Argument(metavar="TALK", help="Talk TOML file: sensor, samples, views.")],
+    file: Annotated[Path, Argument(metavar="TALK", help="Talk TOML file: sensor, samples, views.")],
     output: options.Out,
-    kept: Annotated[
-        bool, typer.Option("--kept", help="Draw from kept results alone, of any version; make nothing.")
-    ] = False,
-    fresh: Annotated[bool, typer.Option("--fresh", help="Make again what comes with the talk file.")] = False,
+    kept: Annotated[bool, Option("--kept", help="Draw from kept results alone, of any version; make nothing.")] = False,
+    fresh: Annotated[bool, Option("--fresh", help="Make again what comes with the talk file.")] = False,
     measured: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             metavar="FOLDER",
             help="Real captures of the artefact: their errors replace the virtual measurements of their sample.",
         ),
     ] = None,
-    minutes: Annotated[float | None, typer.Option(min=0.1, help="Time for the whole command [min].")] = None,
+    minutes: Annotated[float | None, Option(min=0.1, help="Time for the whole command [min].")] = None,
     scheduler: options.Scheduler = None,
     processes: options.Processes = 1,
     variant: options.Variant = None,

@@ -32,10 +32,7 @@ class Results:
         self._known: dict[str, xr.Dataset] = {}
 
     def get(self, name: str) -> xr.Dataset | None:
-        """Return the result of a piece, or None if it is missing or depends on something that has changed.
-
-        Raises InputError if its file is damaged.
-        """
+        """Return the result of a piece, or None if it is missing or depends on something that has changed."""
         if name not in self._known and (result := self._read(name)) is not None:
             self._known[name] = result
         return self._known.get(name)

@@ -43,10 +43,7 @@ def scores_of(folder: str, file: StudyFile) -> xr.Dataset:
 
 
 def errors_of(trials: TrialFolder, views: Sequence[int], count: int) -> xr.Dataset:
-    """Return the errors (measurement, view, trial) of finished virtual measurements, NaN without a value.
-
-    ``tried`` (view,) is the number of finished trials.
-    """
+    """Return the errors (measurement, view, trial) of virtual measurements, and the number ``tried`` (view,)."""
     errors = np.full((len(trials.measurements), len(views), count), np.nan, np.float32)
     tried = np.zeros(len(views), np.int64)
     for number, view in enumerate(views):

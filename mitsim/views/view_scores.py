@@ -5,8 +5,7 @@ every point from the map -> expected fits and measurements with their uncertaint
 (:mod:`characterisation.tasks.prediction`), and the points and noise of the talk's score V_m -> ranks by each, and the
 limiting factor of each view -> sets of views.
 
-Scores are expectations; nothing is drawn at random. Within a limit of time, views far apart are scored first; a view
-that time did not reach counts as one that cannot measure.
+Scores are expectations; nothing is drawn at random.
 """
 
 from __future__ import annotations
@@ -31,19 +30,10 @@ from characterisation.tasks.prediction import ExpectedMeasurement, expected_inpu
 from characterisation.tasks.task_file import Task
 from characterisation.words.progress import track
 from mitsim.maps.campaign.acquire import one_ahead
-from mitsim.maps.prediction import (
-    CharacterisedScene,
-    Effect,
-    Perturbation,
-    Predictor,
-    SceneView,
-    ViewPoints,
-    expected_points,
-    feature_statistics,
-    map_answers,
-    surfaces_of,
-    together,
-)
+from mitsim.maps.prediction import CharacterisedScene, Effect, Perturbation, Predictor, SceneView, ViewPoints
+from mitsim.maps.prediction.perturbation import together
+from mitsim.maps.prediction.point_statistics import expected_points, feature_statistics, map_answers
+from mitsim.maps.prediction.predictor import surfaces_of
 from mitsim.running.time_limit import TimeLimit, in_time
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish

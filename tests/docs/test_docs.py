@@ -383,9 +383,9 @@ def flat_cloud() -> PointCloud:
 
 
 def test_documented_variables_of_samples_and_map(patches):
-    table = SampleTable("matt_white", np.nan, 500.0, patches, light=nominal_light("matt_white", np.nan, 850.0))
-    written = {*map(str, _all_patches([table]).variables), "orientation"}  # added where a campaign counts its captures
-    assert first_column("columns: samples.nc") == written
+    counted = patches.assign(orientation=("patch", np.zeros(patches.sizes["patch"], int)))  # as a campaign counts them
+    table = SampleTable("matt_white", np.nan, 500.0, counted, light=nominal_light("matt_white", np.nan, 850.0))
+    assert first_column("columns: samples.nc") == set(map(str, _all_patches([table]).variables))
     data = build_map([table], {}, 0.3, nodes=5).data
     with_a_lay = with_directions(PerformanceMap(data), [PerformanceMap(data)] * 4, (50.0, 0.0)).data
     assert first_column("columns: map.nc") == set(map(str, with_a_lay.variables))

@@ -121,10 +121,7 @@ def _check_map(campaign: Campaign, performance_map: PerformanceMap) -> None:
 
 
 def held_out_shots(campaign: Campaign, count: int, seed: int) -> list[Shot]:
-    """Return ``count`` shots of each series of a campaign at random normals that its stage can show.
-
-    Raises InputError if the stage shows hardly any of them.
-    """
+    """Return ``count`` shots of each series at random normals that the stage can show; InputError if hardly any."""
     shots = []
     for number, series in enumerate(campaign.series):
         if series.variant is not None:
@@ -224,10 +221,7 @@ def held_out_orders(campaign: Campaign, shots: list[Shot], map_path: Path, repea
 
 
 def hold_out_order(held_out: HeldOutOrder) -> Pair:
-    """Take, predict and compare one shot; workers call this function.
-
-    Raises InputError if the map is missing, or has another content.
-    """
+    """Take, predict and compare one shot; workers call this function. InputError if the map is another."""
     performance_map = _map(held_out.map_path, held_out.digest)
     prepared = prepared_sensor(held_out.order.sensor)
     take = simulated_source(prepared.simulated, held_out.order.samples_per_pixel)

@@ -23,10 +23,7 @@ from mitsim.sensor.transforms import Transform
 
 
 def performance(ideal: Ideal, scene: Scene, performance_map: PerformanceMap) -> tuple[Floats, Floats]:
-    """Return F and sigma (n,) of every ideal point; 0 and NaN if an eye does not see it, NaN if the map has no answer.
-
-    The scene has the finishes of the shapes.
-    """
+    """Return F and sigma (n,) of every ideal point; 0 and NaN if an eye does not see it, NaN without an answer."""
     answers = map_answers(ideal, scene, performance_map)
     return answers.fraction, answers.sigma
 

@@ -146,10 +146,7 @@ class Predictor:
         return self._labels(scene, world_from_sensor, surfaces.shape, Roi.whole(self.grid.width, self.grid.height))
 
     def quick_labels(self, scene: Scene, world_from_sensor: Transform) -> NDArray[np.int16]:
-        """Return :meth:`labels` for decoded points, at a tenth of the cost.
-
-        Back faces, which return no light, count as shapes.
-        """
+        """Return :meth:`labels` for decoded points, at a tenth of the cost; back faces count as shapes."""
         roi = self.view.roi(scene.bounds, world_from_sensor, self.margin)  # all beyond it is -1
         shape = shapes_met(scene, self.rays.within(roi), world_from_sensor)
         labels = np.full((self.grid.height, self.grid.width), -1, np.int16)

@@ -16,7 +16,6 @@ from characterisation.coupon.view_frame import in_view_frame
 from characterisation.lambert_projection import lambert_projection
 
 POSSIBLE = 113
-OFFSETS = ("ray_offset", "offset_product_touching", "offset_product_apart")
 NOMINAL = 600.0
 
 #: of the lobe in which the sensor blinds itself: place, and standard deviation (3 deg) in the equal-area plane
@@ -55,6 +54,12 @@ def uneven_plan():
     return np.unique(np.round(normals, 9), axis=0)
 
 
+def without_offsets(count):
+    """Columns of independent patches whose offsets were not measured."""
+    names = ("ray_offset", "offset_product_touching", "offset_product_apart")
+    return {"independent_share": np.ones(count), **dict.fromkeys(names, np.full(count, np.nan))}
+
+
 def shown(campaign, rng, fraction_effect=0.0, sigma_effect=0.0, fraction=known_fraction, sigma=known_sigma):
     """Table of patches; the effects are standard deviations common to a capture, of F and of ln sigma."""
     angle = np.linspace(-campaign.reach, campaign.reach, campaign.across)
@@ -81,8 +86,7 @@ def shown(campaign, rng, fraction_effect=0.0, sigma_effect=0.0, fraction=known_f
             "normal_x": seen[:, 0],
             "normal_y": seen[:, 1],
             "orientation": np.full(len(count), number),
-            "independent_share": np.ones(len(count)),
-            **dict.fromkeys(OFFSETS, np.full(len(count), np.nan)),  # not measured
+            **without_offsets(len(count)),
         }
         for name, values in row.items():
             columns.setdefault(name, []).append(values)

@@ -17,6 +17,7 @@ from characterisation.lambert_projection import inverse_lambert_projection, lamb
 from characterisation.maps.building import SampleTable, build_map
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.tables import from_probit, to_probit
+from tests.characterisation.maps.known_sensor import without_offsets
 
 LARGEST = math.radians(50)
 
@@ -27,6 +28,13 @@ def known_fraction(normals):
 
 def known_sigma(normals, distance, roughness):
     return 1e-6 * distance**2 * (1 + 0.8 * (1 - normals[:, 2])) * (1 + 0.2 * math.log(roughness))
+
+
+def at_nominal(normals, distance):
+    """Columns of patches of which those of one normal are one capture."""
+    capture = np.unique(np.round(normals, 6), axis=0, return_inverse=True)[1].ravel()
+    nominal = np.full(len(normals), float(distance))
+    return {"orientation": capture, "distance": nominal, **without_offsets(len(normals))}
 
 
 def table_of(normals, distance, roughness, finish, rng):
@@ -42,6 +50,7 @@ def table_of(normals, distance, roughness, finish, rng):
         points_possible=possible,
         ray_noise_inliers=measured,
         false_fraction=np.zeros(len(normals)),
+        **at_nominal(normals, distance),
     )
     return SampleTable(finish, roughness if finish != "matt_white" else math.nan, distance, patches)
 
@@ -156,6 +165,7 @@ def with_spread(finish, roughness, distances=(400.0, 600.0)):
             points_possible=1000 * many,
             ray_noise_inliers=(0.2 - shift / 5) / normals[:, 2],
             false_fraction=0 * many,
+            **at_nominal(normals, distance),
         )
         return SampleTable(finish, roughness, distance, patches, variant)
 
