@@ -58,7 +58,8 @@ def noise_structure(
     low, part = 0, 0.0
     if not np.isnan(rough):
         roughnesses = data["roughness"].values[members].astype(float)
-        low, part = (value.item() for value in _between(np.log(roughnesses), np.log(np.array(rough))))
+        below, share = _between(np.log(roughnesses), np.log(np.array(rough)))
+        low, part = int(below), float(share)
     weights = {low: 1 - part}  # of the members, by number: one or two
     other = min(low + 1, len(members) - 1)
     weights[other] = weights.get(other, 0.0) + part

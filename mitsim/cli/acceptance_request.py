@@ -97,10 +97,10 @@ def cloud_figures(cloud: PointCloud, artefacts: Artefacts, baseline_mm: float | 
         out.append(figure_or_reason(labels[0], "mm", error.form, "", len(points), count, uncertainty))
         out.append(Result(labels[1], "mm", error.size, points=len(points), points_given=count))
     for first, second, distance in artefacts.spacings:
-        both = [window_points(artefacts.spheres[name][0], cloud, name) for name in (first, second)]
-        label, count = f"{first}-{second} spacing error SD", sum(map(len, both))
+        one, other = (window_points(artefacts.spheres[name][0], cloud, name) for name in (first, second))
+        label, count = f"{first}-{second} spacing error SD", len(one) + len(other)
         try:
-            out.append(Result(label, "mm", sphere_spacing_error(*both, distance), points=count))
+            out.append(Result(label, "mm", sphere_spacing_error(one, other, distance), points=count))
         except InputError as unfit:
             out.append(failed(label, "mm", str(unfit), count))
     return out

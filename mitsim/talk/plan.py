@@ -103,8 +103,8 @@ def pieces_of(talk: Talk) -> list[Piece]:
         for entry in (file.finishes or file.samples)[:1]
     ]
     for finish in file.finishes:
-        arguments, scenes = (talk.study_file(finish), number), (_scene(finish),)
-        pieces.append(Piece(f"finish_{finish.key}", "finish", arguments, sensor, scenes, files=(file.task,)))
+        asked, scenes = (talk.study_file(finish), number), (_scene(finish),)
+        pieces.append(Piece(f"finish_{finish.key}", "finish", asked, sensor, scenes, files=(file.task,)))
     coupon_place = CouponPlace(coupons.campaign, file.sensor, coupons.distance_mm, coupons.roughness_um)
     campaign = read_toml(talk.folder / coupons.campaign, CampaignFile)
     of_coupons = tuple((str(Path(coupons.campaign).parent / sample.scene), ()) for sample in campaign.samples)

@@ -125,13 +125,13 @@ def _refined(
     assert campaign.file.refine is not None
     fresh: dict[Series, list[NDArray[np.float64]]] = {}
     unresolved = 0
-    added = np.empty((0, 3))
+    added, largest = np.empty((0, 3)), math.radians(campaign.file.largest_deg)
     for series in campaign.series:  # a sample comes before its variants
         if series.variant is None:
             normals = np.concatenate(wanted[series])
             seen = [astuple(overall(done[series.name, campaign.shot(series, n).name].patches)) for n in normals]
-            columns = np.array(seen, float).reshape(-1, 4).T
-            rough = refine(normals, *columns, campaign.file.refine, math.radians(campaign.file.largest_deg))
+            fraction, fraction_error, sigma, sigma_error = np.array(seen, float).reshape(-1, 4).T
+            rough = refine(normals, fraction, fraction_error, sigma, sigma_error, campaign.file.refine, largest)
             added = rough.normals[campaign.reachable(rough.normals)] if len(rough.normals) else rough.normals
             unresolved += rough.unresolved
         wanted[series].append(added)
