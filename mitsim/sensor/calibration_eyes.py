@@ -13,19 +13,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.files.errors import InputError
+from mitsim.sensor.calibration_lenses import lens_in
 from mitsim.sensor.calibration_names import USUAL_NAMES
-from mitsim.sensor.calibration_numbers import Composed, by_rows, dotted, vector
-from mitsim.sensor.calibration_poses import pose_in, second_from_first
-from mitsim.sensor.lens_models import check_fourth, is_fisheye
+from mitsim.sensor.calibration_numbers import Composed, by_rows, dotted, number_of, vector
+from mitsim.sensor.calibration_poses import named_poses, pose_in, second_from_first
+from mitsim.sensor.lens_models import is_fisheye
 
 #: number of maps around the deepest one that is searched; chosen
 _DEEPEST = 8
@@ -41,23 +40,10 @@ _DOUBLE = (("focal_length", "focallength", "focal_px", "focal"), ("principal_poi
 #: names of an image's width and height
 _SIDES = (("width", "height"), ("image_width", "image_height"), ("img_width", "img_height"), ("w", "h"))
 
-#: names in small letters: of matrices in a map, of sizes, and of distortions
+#: names in small letters: of matrices in a map, and of sizes
 _MATRICES = frozenset(name.lower() for name in (*USUAL_NAMES["matrix"][0], "matrix", "intrinsics", "intrinsic"))
 _SIZES = frozenset(name.lower() for name in USUAL_NAMES["size"][0])
-_LENSES = frozenset(name.lower() for name in (*USUAL_NAMES["distortion"][0], "coeffs"))
 
-#: single numbers of the distortion in OpenCV's order, and those of a fisheye lens
-_BENT = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "taux", "tauy")
-_FISHEYE = ("k1", "k2", "k3", "k4")
-
-#: names of lists of these names, which state the order of a list of coefficients
-_NAMES_OF_BENT = re.compile(r"(?i:(?:dist|coef).*(?:names|order|labels))")
-
-#: names of lists of radial and of tangential coefficients; MATLAB's are written together
-_RADIAL_TANGENTIAL = (
-    ("radial_distortion", "radial_coefficients", "radial"),
-    ("tangential_distortion", "tangential_coefficients", "tangential"),
-)
 
 #: a map by its dotted name
 _Named = tuple[str, dict[str, Any]]
@@ -87,11 +73,14 @@ class CalibratedEye:
     @property
     def place(self) -> int | None:
         """Return its place among cameras, which its name states: that of left and right, or a number."""
+        number = re.search(r"(\d{1,4})$", self.name)
+        return self.side if self.side is not None or number is None else int(number[1])
+
+    @property
+    def side(self) -> int | None:
+        """Return 0 of a left camera, 1 of a right one, which its name states."""
         name = self.name.rpartition(".")[2].lower()
-        if "left" in name or "right" in name:
-            return int("right" in name)
-        number = re.search(r"(\d{1,4})$", name)
-        return None if number is None else int(number[1])
+        return int("right" in name) if "left" in name or "right" in name else None
 
 
 def eyes_of(tree: dict[str, Any]) -> list[CalibratedEye]:
@@ -100,7 +89,8 @@ def eyes_of(tree: dict[str, Any]) -> list[CalibratedEye]:
     A matrix under a usual name in no map is none of them, since such names need no search.
     """
     matrix_paths = []
-    for path in islice(_maps([("", _without_dots(tree))]), _MOST):
+    paths = paths_of(tree)
+    for path in paths:
         matrix = _matrix(*path[-1])
         if matrix is not None and not any("radialdistortion" in map(str.lower, table) for _, table in path):
             matrix_paths.append((path, matrix))  # MATLAB's, whose pixels count from 1, has other readers
@@ -114,12 +104,31 @@ def eyes_of(tree: dict[str, Any]) -> list[CalibratedEye]:
             or (sum(other[at][1] is path[at][1] for other, _ in matrix_paths if len(other) > at) == 1 and (at or alone))
         )
         out.append(_eye(path, depth, matrix))
-    return out
+    named = named_poses([path[-1] for path in paths], [eye.name for eye in out])
+    return [replace(eye, values=eye.values | named.get(eye.name, {})) for eye in out]
+
+
+def paths_of(tree: dict[str, Any]) -> list[list[_Named]]:
+    """Return the path to each map of a file, by their dotted names: the maps around it, and the map itself last."""
+    return list(islice(_maps([("", _without_dots(tree))]), _MOST))
+
+
+def poses_of(eyes: Sequence[CalibratedEye]) -> dict[str, Mapping[str, Composed]]:
+    """Return the values of eyes by name, the cameras in their order and first."""
+    projectors = [eye for eye in eyes if eye.is_projector]
+    return {eye.name: eye.values for eye in (*cameras_of(eyes)[0], *projectors)}
 
 
 def cameras_of(eyes: Sequence[CalibratedEye]) -> tuple[list[CalibratedEye], bool]:
-    """Return the eyes that are no projectors, and whether their order is known: from their names, or from a pose."""
+    """Return the eyes that are no projectors, and whether it is known which is the first, and the second of a pair.
+
+    Their names tell, or a pose. Of more than two cameras, those named left and right are the pair.
+    """
     cameras = [eye for eye in eyes if not eye.is_projector]
+    if len(cameras) > 2:
+        sides = sorted((eye for eye in cameras if eye.side is not None), key=lambda eye: eye.side or 0)
+        others = sorted((eye for eye in cameras if eye not in sides), key=lambda eye: eye.place or 0)
+        return [*sides, *others], [eye.side for eye in sides] == [0, 1]
     positions = [eye.place for eye in cameras]
     if None not in positions and len(set(positions)) == len(positions):
         return sorted(cameras, key=lambda eye: eye.place or 0), True
@@ -142,10 +151,12 @@ def usual_values(eyes: Sequence[CalibratedEye]) -> dict[str, Composed]:
     elif ordered and cameras:
         out |= _under(cameras[0], {"matrix": "+K1", "distortion": "+D1", "size": "+size"})
         out |= _under(cameras[1], {"matrix": "+K2", "distortion": "+D2", "size": "+size2"})
-        out |= second_from_first(cameras[0].values, cameras[1].values)
+        out |= second_from_first(poses_of(eyes), cameras[0].name, cameras[1].name)
     for eye in [eye for eye in eyes if eye.is_projector][:1]:
         out |= _under(eye, {"matrix": "+K_proj", "distortion": "+D_proj", "size": "+size_proj"})
-        out |= _under(eye, {"rotation": "+R_proj", "translation": "+T_proj"})
+        first = cameras[0].name if cameras and (ordered or len(cameras) == 1) else ""
+        posed = second_from_first(poses_of(eyes), first, eye.name)
+        out |= {f"{name}_proj": value for name, value in posed.items()}
     return out
 
 
@@ -225,7 +236,7 @@ def _matrix(name: str, table: dict[str, Any]) -> Composed | None:
     four = vector(table.get(low.get("intrinsics", "")))
     keys = [next((low[spelling] for spelling in names if spelling in low), "") for names in (*_SINGLE, *_DOUBLE)]
     if all(keys[:4]):
-        fx, fy, cx, cy = (_number(table[key]) for key in keys[:4])
+        fx, fy, cx, cy = (number_of(table[key]) for key in keys[:4])
         sources = keys[:4]
         if "fl_x" in low and keys[0] == low["fl_x"]:  # of COLMAP, whose pixels have their centres at halves
             cx, cy = cx - 0.5, cy - 0.5
@@ -237,68 +248,8 @@ def _matrix(name: str, table: dict[str, Any]) -> Composed | None:
         sources = [low["intrinsics"]]
     else:
         return None
-    skew = vector(table.get(low.get("skew", ""), 0.0), 1)  # which the check of the matrix refuses
-    K = np.array([[fx, 0 if skew is None else skew[0], cx], [0, fy, cy], [0, 0, 1]])
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     return Composed(K, tuple(dotted(name, source) for source in sources), {})
-
-
-def lens_in(maps: Sequence[_Named], fisheye: bool) -> Composed | None:
-    """Return the distortion in the first of several maps that states one: a list, single numbers, or two lists.
-
-    The two lists are those of radial and of tangential coefficients. ``maps`` have their dotted names.
-    """
-    for name, table in maps:
-        low = {key.lower(): key for key in table}
-        for spelling in sorted(_LENSES & set(low)):
-            bent = vector(table[low[spelling]])
-            if bent is not None:
-                return Composed(bent, (dotted(name, low[spelling]),), table)
-        plain = {key.replace("_", ""): written for key, written in low.items()}  # tau_x
-        known = _FISHEYE if fisheye else _BENT
-        names = [each for each in known if vector(table.get(plain.get(each, "")), 1) is not None]
-        if names:
-            numbers = _ordered({coefficient: _number(table[plain[coefficient]]) for coefficient in names}, fisheye)
-            return Composed(numbers, tuple(dotted(name, plain[coefficient]) for coefficient in names), table)
-        radial, tangential = (next((key for key in keys if key in table), "") for keys in _RADIAL_TANGENTIAL)
-        k, p = vector(table.get(radial)), vector(table.get(tangential, [0.0, 0.0]), 2)
-        if k is not None and p is not None and 1 <= len(k) <= 3:
-            k1, k2, k3 = [*k, 0.0, 0.0][:3]
-            sources = tuple(dotted(name, source) for source in (radial, tangential) if source)
-            return Composed(np.array([k1, k2, *p, k3]), sources, table)
-    return None
-
-
-def in_opencvs_order(value: Any, table: Mapping[str, Any], fisheye: bool, where: Path) -> Any:
-    """Return coefficients in OpenCV's order if their map states another; anything else as it is.
-
-    ``value``: the coefficients, as the file has them. ``table``: their map, which may have a list of names, such as
-    ``distortion_names``. ``fisheye``: whether they are those of a fisheye lens. ``where``: the file, for messages.
-    Raises InputError if a name is unknown, or there are not as many names as coefficients.
-    """
-    numbers = vector(value)
-    if numbers is None or not numbers.size:
-        return value
-    for key in filter(_NAMES_OF_BENT.search, table):
-        stated = table[key]
-        words = stated.replace(",", " ").split() if isinstance(stated, str) else np.ravel(np.asarray(stated, object))
-        if not all(isinstance(word, str) for word in words):
-            continue
-        names = [word.strip().lower().replace("_", "") for word in words]
-        known = _FISHEYE if fisheye else _BENT
-        if sorted(set(names) & set(known)) != sorted(names) or len(names) != numbers.size:
-            allowed = f"the name of each of the {numbers.size} coefficients, of {', '.join(known)}"
-            raise InputError(where, key, ", ".join(words), allowed)
-        check_fourth(names, numbers.tolist(), fisheye, where)
-        return _ordered(dict(zip(names, numbers.tolist(), strict=True)), fisheye)
-    return value
-
-
-def _ordered(named: Mapping[str, float], fisheye: bool) -> NDArray[np.float64]:
-    """Return coefficients by name in OpenCV's order, 0 for those that are missing: four for a fisheye lens alone."""
-    order, lengths = (_FISHEYE, (4,)) if fisheye else (_BENT, (5, 8, 12, 14))
-    last = max(order.index(name) for name in named)
-    count = next(length for length in lengths if length > last)
-    return np.array([named.get(name, 0.0) for name in order[:count]])
 
 
 def _size(maps: list[_Named]) -> Composed | None:
@@ -325,9 +276,3 @@ def size_of(value: Any) -> NDArray[np.float64] | None:
         if numbers is not None:
             return numbers
     return None
-
-
-def _number(value: Any) -> float:
-    """Return a number; NaN of what is none, which the check of the matrix refuses."""
-    numbers = vector(value, 1)
-    return float("nan") if numbers is None else float(numbers[0])

@@ -43,6 +43,12 @@ def vector(value: Any, size: int | None = None) -> NDArray[np.float64] | None:
     return numbers if np.isfinite(numbers).all() and (size is None or len(numbers) == size) else None
 
 
+def number_of(value: Any) -> float:
+    """Return a value as a number; NaN of what is none, which the check of the matrix refuses."""
+    numbers = vector(value, 1)
+    return float("nan") if numbers is None else float(numbers[0])
+
+
 def numbers_of(value: Any, file: Path, key: str, shapes: tuple[tuple[int, ...], ...]) -> NDArray[np.float64]:
     """Convert a matrix or lists to an array of one of several shapes; row and column vectors are equivalent.
 
@@ -93,14 +99,27 @@ def by_rows(K: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
     return (K.T if by_columns else K), by_columns
 
 
-def checked_matrix(K: NDArray[np.float64], name: str, file: str) -> NDArray[np.float64]:
+def skew_beside(table: dict[str, Any], fx: float) -> float:
+    """Return the skew [px] that stands beside a camera matrix with the focal length ``fx`` [px]; 0 without one.
+
+    ``alpha_c`` is that of Bouguet's toolbox, skew over fx.
+    """
+    for name, value in table.items():
+        unit = {"skew": 1.0, "s": 1.0, "alpha_c": fx}.get(name.lower())
+        if unit is not None and (skew := vector(value, 1)) is not None and skew[0]:
+            return float(unit * skew[0])
+    return 0.0
+
+
+def checked_matrix(K: NDArray[np.float64], name: str, file: str, skew: float = 0.0) -> NDArray[np.float64]:
     """Return K (3, 3), the matrix of the eye ``name`` in a ``file``, after a check that it is a camera matrix.
 
-    Raises InputError if it has a skew, or is no camera matrix by rows.
+    ``skew``: that beside K [px]. Raises InputError if there is a skew, or K is no camera matrix by rows.
     """
-    if abs(K[0, 1]) > 1e-9 and K[0, 0] > 0:
-        hint = "calibrate without skew: est_alpha = 0 in MATLAB's toolbox"
-        raise InputError(file, f"matrix of {name}", f"a skew of {K[0, 1]:.3g} px", "fx 0 cx, 0 fy cy, 0 0 1", hint)
+    skew = float(K[0, 1]) or skew
+    if abs(skew) > 1e-9 and K[0, 0] > 0:
+        hint = "calibrate without skew: est_alpha = 0 in MATLAB's toolbox, no B2 in Metashape"
+        raise InputError(file, f"matrix of {name}", f"a skew of {skew:.3g} px", "fx 0 cx, 0 fy cy, 0 0 1", hint)
     if K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs([K[1, 0], *(K[2] - [0, 0, 1])]).max() > 1e-9:
         raise InputError(file, f"matrix of {name}", np.round(K, 3).tolist(), "fx 0 cx, 0 fy cy, 0 0 1")
     return K

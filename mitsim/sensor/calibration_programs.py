@@ -24,10 +24,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.sensor.calibration_eyes import eyes_of, lens_in, usual_values
+from mitsim.sensor.calibration_eyes import CalibratedEye, eyes_of, paths_of, usual_values
+from mitsim.sensor.calibration_lenses import lens_in
 from mitsim.sensor.calibration_names import USUAL_NAMES
 from mitsim.sensor.calibration_numbers import Composed, dotted, vector
-from mitsim.sensor.calibration_poses import inverse
+from mitsim.sensor.calibration_poses import inverse, pose_in
 from mitsim.sensor.calibration_qualifiers import OF_FORMAT, rectified_pair
 from mitsim.sensor.calibration_quaternions import with_rotations
 from mitsim.sensor.lens_models import is_fisheye
@@ -37,6 +38,9 @@ _ENDINGS = ("", "_left", "_right", "_cam", "_proj", "_camera", "_projector")
 
 #: names of the distortion of a camera or projector
 _DISTORTIONS = [name for names in USUAL_NAMES["distortion"] for name in names if "+" not in name]
+
+#: names of maps with the pose of the second camera from the first, or of the projector from the camera
+_BETWEEN = re.compile(r"stereo\w*|extrinsics?|extrinsic_parameters", re.IGNORECASE)
 
 #: number of maps around a structure of MATLAB, beyond the first, that are searched; chosen
 _DEEPEST = 3
@@ -54,11 +58,32 @@ def with_usual_names(tree: dict[str, Any]) -> dict[str, Any]:
     """Return the tree of one file, with composed values under names that begin with a plus."""
     tree = _of_old_orb_slam(with_rotations(tree))
     out = _of_message(_with_lenses(tree))
-    out |= usual_values(eyes_of(out)) | _bouguet(out)
-    out |= _orb_slam(out)
+    eyes = eyes_of(out)
+    out |= usual_values(eyes) | _bouguet(out)
+    out = _between(out, eyes) | out | _orb_slam(out)
     if "+D1" not in out and (lens := _lens_beside_matrix(tree)) is not None:
         out["+D1"] = lens
     return out | _toolbox(tree, out)
+
+
+def _between(tree: dict[str, Any], eyes: list[CalibratedEye]) -> dict[str, Any]:
+    """Return R and T of two eyes of one file from a map of their own, or from vectors beside the matrices.
+
+    A file of one eye may have the pose of a board under these names.
+    """
+    others = {name for names in USUAL_NAMES["matrix"][1:] for name in names}
+    if len(eyes) < 2 and not others & set(tree):
+        return {}
+    own = tuple(f"{eye.name}." for eye in eyes if eye.name)
+    for *_, (name, table) in paths_of(tree):
+        if name.startswith(own) or not _BETWEEN.fullmatch(name.rpartition(".")[2]):
+            continue
+        if pose := pose_in([(name, table)]):
+            return {"+R": pose["rotation"], "+T": pose["translation"]}
+    turn, shift = vector(tree.get("rvec"), 3), vector(tree.get("tvec"), 3)
+    if turn is None or shift is None:
+        return {}
+    return {"+R": Composed(turn, ("rvec",), tree), "+T": Composed(shift, ("tvec",), tree)}
 
 
 def _with_lenses(tree: dict[str, Any]) -> dict[str, Any]:

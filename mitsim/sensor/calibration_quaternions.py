@@ -1,5 +1,7 @@
 """Replace quaternions in the maps of a file by rotation matrices, if the order of their numbers is known.
 
+Camera matrices of 4 x 4, as of ScanNet, are reduced to 3 x 3.
+
 The order is known of a map of ``x``, ``y``, ``z`` and ``w`` (ROS), with or without a ``q`` before each, and of four
 numbers whose name ends in ``xyzw`` or ``wxyz``. Other quaternions remain four numbers, which no reader of rotations
 takes.
@@ -39,6 +41,8 @@ def with_rotations(table: dict[str, Any]) -> dict[str, Any]:
 
 
 def _plain(name: str, value: Any) -> Any:
+    if (K := _padded(value)) is not None:
+        return K
     if isinstance(value, list) and any(isinstance(item, dict) for item in value):
         return [_plain("", item) for item in value]
     if not isinstance(value, dict):
@@ -52,6 +56,14 @@ def _plain(name: str, value: Any) -> Any:
             if numbers is not None:
                 return _matrix(numbers) if len(numbers) == 4 else numbers
     return with_rotations(value)
+
+
+def _padded(value: Any) -> NDArray[np.float64] | None:
+    """Return the camera matrix (3, 3) in the corner of a 4 x 4 matrix; None of anything else."""
+    numbers = vector(value, 16) if isinstance(value, list | np.ndarray) and len(value) in (4, 16) else None
+    if numbers is None or not min(numbers[[0, 5]]) > 1 or numbers[[3, 7, 8, 9, 11, 12, 13, 14]].any():
+        return None
+    return numbers.reshape(4, 4)[:3, :3] if (numbers[[10, 15]] == 1).all() else None
 
 
 def _matrix(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:

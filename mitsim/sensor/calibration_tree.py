@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from characterisation.files.errors import InputError
-from mitsim.sensor.calibration_eyes import CalibratedEye, cameras_of, eyes_of
+from mitsim.sensor.calibration_eyes import CalibratedEye, cameras_of, eyes_of, poses_of
 from mitsim.sensor.calibration_formats import read_documents
 from mitsim.sensor.calibration_numbers import Composed, vector
-from mitsim.sensor.calibration_poses import second_from_first
+from mitsim.sensor.calibration_poses import MOTIONS, is_motion, second_from_first
 from mitsim.sensor.calibration_programs import with_usual_names
 
 #: names of quantities derived from the rest of a calibration, or that state its quality
@@ -92,19 +92,43 @@ class CalibrationTree:
         """Return the cameras and projectors that stand in maps."""
         return [eye for tree in self.values for eye in eyes_of(tree)]
 
+    def relative(self, first: Found | None, second: Found | None) -> dict[str, Found] | None:
+        """Return rotation and translation from an eye to another, which their matrices name; empty if no pose tells.
+
+        None if they are not two eyes in maps of one document.
+        """
+        for i, tree in enumerate(self.values):
+            eyes = eyes_of(tree)
+            named = {", ".join(eye.values["matrix"].sources): eye.name for eye in eyes}
+            names = [named.get(each.name) for each in (first, second) if each and each.file == self.files[i]]
+            if len(eyes) > 1 and len(names) == 2 and names[0] is not None and names[1] is not None:
+                posed = second_from_first(poses_of(eyes), names[0], names[1])
+                if not posed and len(eyes) == 2:
+                    posed = {key: tree[key] for key in ("+R", "+T") if isinstance(tree.get(key), Composed)}
+                self.seen.update((i, source) for value in posed.values() for source in value.sources)
+                return {
+                    quantity: Found(self.files[i], posed[key].value, posed[key].table, ", ".join(posed[key].sources))
+                    for quantity, key in (("rotation", "+R"), ("translation", "+T"))
+                    if key in posed
+                }
+        return None
+
     def names(self) -> list[str]:
         """Return the names in all files; those in maps are dotted."""
         return list(dict.fromkeys(name for tree in self.values for name, _ in _leaves(tree)))
 
     def unread(self) -> list[str]:
-        """Return the names of values that look like optics and were not read."""
+        """Return the names of values that look like optics, or like poses of several eyes, and were not read."""
+        eyes = self.eyes()
+        understood = {source for eye in eyes for source in eye.rotation_sources}
         return [
             name
             for i, tree in enumerate(self.values)
             for name, value in _leaves(tree)
-            if not any((i, name[:end]) in self.seen for end in _ends(name))
+            if name not in understood
+            and not any((i, name[:end]) in self.seen for end in _ends(name))
             and not _DERIVED.fullmatch(name.rpartition(".")[2])
-            and _is_optics(name, value)
+            and (_is_optics(name, value) or (len(eyes) > 1 and _is_pose(name, value)))
         ]
 
 
@@ -115,7 +139,7 @@ def read_tree(files: list[Path]) -> CalibrationTree:
     if len(files) == len(read) == 2:  # of one camera each, as of EuRoC
         first, second = (cameras_of(eyes_of(values))[0] for values in tree.values)
         if len(first) == len(second) == 1 and first[0].rotation_sources:
-            tree.values[1] |= second_from_first(first[0].values, second[0].values)
+            tree.values[1] |= second_from_first({"1": first[0].values, "2": second[0].values}, "1", "2")
             tree.seen.update((0, source) for source in first[0].rotation_sources)
     return tree
 
@@ -157,6 +181,13 @@ def _is_optics(name: str, value: Any) -> bool:
     is_vector = numbers.ndim and numbers.size == max(numbers.shape)
     lens = numbers.size in (4, 5, 8, 12, 14) or (numbers.size > 1 and ("radial" in own or "distortion" in own))
     return bool(is_vector and lens and np.abs(numbers).max() < 100 and numbers.any())
+
+
+def _is_pose(name: str, value: Any) -> bool:
+    """Return whether a value is a rigid motion, 4 x 4, under a name that tells no frames."""
+    numbers = None if name.rpartition(".")[2] in MOTIONS else vector(value, 16)
+    motion = np.zeros((4, 4)) if numbers is None else numbers.reshape(4, 4)
+    return is_motion(motion) and bool(np.abs(motion[:3, :3] @ motion[:3, :3].T - np.eye(3)).max() < 1e-4)
 
 
 def _stepped(tree: dict[str, Any], name: str) -> tuple[str, Any, dict[str, Any]]:

@@ -22,10 +22,11 @@ from scipy.spatial.transform import Rotation
 from characterisation.files.documents import Document, validate
 from characterisation.files.errors import InputError, nearest
 from mitsim.sensor.calibration_doubts import board_unit_note, check_unit, facing_note, matrix_notes, unnamed_lens
-from mitsim.sensor.calibration_eyes import in_opencvs_order, lens_in, size_of
+from mitsim.sensor.calibration_eyes import size_of
 from mitsim.sensor.calibration_formats import beside
+from mitsim.sensor.calibration_lenses import in_opencvs_order, lens_in
 from mitsim.sensor.calibration_names import USUAL_NAMES, Names
-from mitsim.sensor.calibration_numbers import by_rows, checked_matrix, numbers_of, rotation_matrix
+from mitsim.sensor.calibration_numbers import by_rows, checked_matrix, numbers_of, rotation_matrix, skew_beside
 from mitsim.sensor.calibration_poses import is_motion
 from mitsim.sensor.calibration_qualifiers import OF_FORMAT, of_images, read_out_of, rectified_pair, unit_mm
 from mitsim.sensor.calibration_quaternions import ORDERED
@@ -153,7 +154,7 @@ def _own(table: dict[str, Any], *names: str) -> dict[str, Any]:
 class _Values:
     """Values of a calibration by request; missing values are collected and reported together.
 
-    ``tables`` that qualify the matrices found, by eye; ``size`` of the images, if known; ``by_columns``: whether a
+    ``matrices`` and ``tables`` that qualify them, by eye; ``size`` of the images, if known; ``by_columns``: whether a
     matrix is written so.
     """
 
@@ -162,6 +163,7 @@ class _Values:
     ) -> None:
         self.tree, self.calibration_table, self.size = tree, calibration_table, size
         self.missing: list[tuple[str, str, Names]] = []
+        self.matrices: list[Found | None] = []
         self.tables: list[dict[str, Any]] = []
         self.notes: list[str] = []
         self.by_columns = False
@@ -173,7 +175,13 @@ class _Values:
         keys = self.calibration_table.keys.get(name, EyeKeys())
         stated_name = getattr(keys, quantity)
         names = (stated_name,) if stated_name else USUAL_NAMES[quantity][index]
-        if keys.matrix and (quantity == "matrix" or not stated_name):
+        posed = None
+        if quantity in ("rotation", "translation") and not stated_name:
+            chosen = any(each.matrix for each in self.calibration_table.keys.values())
+            posed = self.tree.relative(self.matrices[0], self.matrices[-1]) if chosen else None
+        if posed is not None:
+            names = tuple(key for key in names if "+" not in key)
+        elif keys.matrix and (quantity == "matrix" or not stated_name):
             names = (
                 *(f"+{quantity} of {map_name}" for map_name in (keys.matrix, keys.matrix.rpartition(".")[0])),
                 *names,
@@ -186,8 +194,8 @@ class _Values:
         elif index == 2 and len(self.calibration_table.cameras) == 2 and not stated_name:
             # R and T are those of the second camera
             names = tuple(key for key in names if key not in USUAL_NAMES[quantity][1])
-        for key in names:
-            match = self.tree.find(key)
+        for key in ("", *names):
+            match = self.tree.find(key) if key else (posed or {}).get(quantity)
             if match is not None and quantity == "distortion" and isinstance(match.value, dict):
                 lens = lens_in([(match.name, match.value)], self._is_fisheye(match.table))
                 match = None if lens is None else replace(match, value=lens.value, name=", ".join(lens.sources))
@@ -233,6 +241,7 @@ def _eye(values: _Values, name: str, index: int, sensor_keys: dict[str, Any]) ->
     matrices = ((3, 3), (9,), (4,), (4, 1), (1, 4))
     matrix = values.find(name, index, "matrix", matrices, needed="focal_px" not in sensor_keys)
     table = {} if matrix is None else matrix.table
+    values.matrices.append(matrix)
     values.tables.append(table)
     match = values.find(name, index, "distortion", ((0,), (4,), (5,), (8,), (12,), (14,)), needed=False)
     distortion = np.empty(0) if match is None else match.value
@@ -249,7 +258,7 @@ def _eye(values: _Values, name: str, index: int, sensor_keys: dict[str, Any]) ->
     out: dict[str, Any] = {"model": model, "distortion": distortion.tolist()}
     if matrix is not None:
         K, by_columns = by_rows(matrix.value)
-        K = checked_matrix(K, name, file)
+        K = checked_matrix(K, name, file, skew_beside(table, K[0, 0]))
         values.by_columns |= by_columns
         if by_columns:
             values.notes.append(f"calibration {matrix.file.name}: {name}: its matrix is written by columns")

@@ -240,7 +240,7 @@ def _of_opencv(path: Path, size: tuple[int, int] | None) -> Calibrated:
     for eye in [*eyes, *eyes]:  # only at the second time the tree knows that the others are read
         name = plain_name(eye.name.rpartition(".")[2])
         rig, notes = _rig_of(path, tree, size, [name], {name: {"matrix": eye.matrix_map}})
-        if not any(_sees_alike(rig.reference, other) for other in cameras.values()):
+        if "rotation" in eye.values or not any(_sees_alike(rig.reference, other) for other in cameras.values()):
             cameras[name if name not in cameras else plain_name(eye.name)] = rig.reference
         told = notes if eye is eyes[0] else [*told, *(note for note in notes if note not in told)]
     return Calibrated(Rig(cameras), sensor, notes=tuple(told), unrelated=len(cameras) > 1, depth_scales=scales)

@@ -37,6 +37,12 @@ _POSE = (
     "[-baseline, 0, 0]"
 )
 
+#: what to do with more than two cameras
+_TWO = (
+    'name two of them in a TOML beside the file: [calibration] with file, cameras = ["left", "right"], projector = '
+    "false, and matrix = NAME in each of [calibration.keys.left] and [calibration.keys.right]"
+)
+
 
 def read_stereo_pair(folder: str | Path, options: ReadOptions) -> Capture:
     """Read one pair of images whose names begin with those of the two cameras, ``left_0.png``, or lie in their folders.
@@ -77,12 +83,12 @@ def read_stereo_pair(folder: str | Path, options: ReadOptions) -> Capture:
 
 def names_of_pair(calibrated: Calibrated, where: str | Path) -> list[str]:
     """Return the names of the left and the right camera of a calibration, which must be that of a pair."""
-    names = list(calibrated.rig.cameras)[:2]
+    names = list(calibrated.rig.cameras)
     if len(names) < 2 or calibrated.unrelated:
-        stated = ", ".join(names) + (", without the pose of the second" if calibrated.unrelated else "")
-        hint = "; ".join([*calibrated.notes, _POSE])
+        stated = f"{', '.join(names)}{', without the pose of the second' if len(names) == 2 else ''}"
+        hint = "; ".join([*calibrated.notes, _TWO if len(names) > 2 else _POSE])
         raise InputError(where, "cameras", stated, "two cameras with R and T: a stereo pair", hint)
-    return names
+    return names[:2]
 
 
 def pair_capture(
