@@ -1,4 +1,4 @@
-"""Read the names and values of a calibration file of any format: YAML, JSON, XML, MATLAB's .mat, NumPy's .npz.
+"""Read the names and values of a calibration file of any format: YAML, JSON, XML, .mat, .npz, or text of devices.
 
 Signal chain: bytes -> parser of the format, within bounds -> for each document a map of names to numbers, texts, lists,
 maps and arrays.
@@ -22,12 +22,18 @@ from scipy.io.matlab import MatlabOpaque
 
 from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError, nearest
+from mitsim.sensor.calibration_devices import FORMS, from_azure_kinect, from_metashape, from_text
 from mitsim.sensor.inflated import GZIP, inflated
 from mitsim.sensor.mat_structure import read_mat
 from mitsim.sensor.yaml_values import NotYamlError, matrix_of, read_yaml
 
-_SUFFIXES = (".yml", ".yaml", ".xml", ".json", ".mat", ".npz")
-_KINDS = "a calibration: YAML, JSON, .xml of OpenCV, .mat of MATLAB, .npz of NumPy"
+#: suffixes of text in a form of its own
+_TEXTS = (".txt", ".conf", ".ini", ".cameramodel")
+
+#: suffixes of calibrations
+SUFFIXES = (".yml", ".yaml", ".xml", ".json", ".mat", ".npz", *_TEXTS)
+
+_KINDS = f"a calibration: YAML, JSON, .xml of OpenCV or Metashape, .mat of MATLAB, .npz of NumPy; {FORMS}"
 
 
 #: largest file [bytes]; calibrations are small
@@ -46,10 +52,11 @@ _INDENT = re.compile(rb"^([ \t]+)", re.MULTILINE)
 _DASHES = re.compile(rb"(?:[-?:][ \t]+){40}")
 
 
-def read_documents(file: Path) -> list[dict[str, Any]]:
+def read_documents(file: Path, size: tuple[int, int] | None = None) -> list[dict[str, Any]]:
     """Return the names and values of each document of a file.
 
-    Raises InputError if it is missing, damaged, too large, or of no known format.
+    ``size`` (width, height) [px] of the images chooses the cameras of a device that has several sizes. Raises
+    InputError if the file is missing, damaged, too large, or of no known format.
     """
     data = read_bounded(file, _KINDS, "" if file.exists() else beside(file), largest=_LARGEST)
     if file.suffix.lower() == ".mat":
@@ -72,12 +79,16 @@ def read_documents(file: Path) -> list[dict[str, Any]]:
         except Exception as error:
             raise InputError(file, "", f"a file that NumPy cannot read ({error})", _KINDS) from None
     data = _unpacked(file, data)
+    plain = file.suffix.lower() == ".cameramodel" or not data.lstrip().startswith((b"%YAML", b"<", b"{"))
+    if file.suffix.lower() in _TEXTS and plain:
+        return [from_text(file, data, size)]
     ending = file.with_suffix("").suffix.lower() if file.suffix.lower() == ".gz" else file.suffix.lower()
     of_opencv = data.lstrip().startswith(b"%YAML:1.0")
     if ending == ".json":
-        return [_of_json(file, data)]
+        return [_of_json(file, data, size)]
     if ending not in (".yml", ".yaml") and not of_opencv:
-        return [_of_opencv(file, data)]
+        cameras = from_metashape(file, data) if ending == ".xml" and b"<opencv_storage" not in data else None
+        return [_of_opencv(file, data) if cameras is None else cameras]
     if of_opencv and (b"!!binary" in data or len(data) > _OF_OPENCV):  # numbers in base 64, or whole images of numbers
         return [_of_opencv(file, data)]
     try:
@@ -100,7 +111,7 @@ def _numbers_of(arrays: Any) -> Iterator[tuple[str, Any]]:
                 raise
 
 
-def _of_json(file: Path, data: bytes) -> dict[str, Any]:
+def _of_json(file: Path, data: bytes, size: tuple[int, int] | None) -> dict[str, Any]:
     """Read JSON; that of OpenCV may have numbers that JSON does not allow."""
     try:
         table = json.loads(data.decode("utf-8-sig"))
@@ -111,6 +122,9 @@ def _of_json(file: Path, data: bytes) -> dict[str, Any]:
         raise InputError(file, "", f"text that is not JSON ({reason})", _KINDS) from None
     if not isinstance(table, dict) or not table:
         raise InputError(file, "", "a list" if isinstance(table, list) else "no names", "JSON with names: {...}")
+    kinect = from_azure_kinect(file, table.get("CalibrationInformation"), size)
+    if kinect is not None:
+        return kinect
     return {name: _with_matrices(value, 1) for name, value in table.items()}
 
 
@@ -142,7 +156,7 @@ def _of_opencv(file: Path, data: bytes) -> dict[str, Any]:
     except (cv2.error, SystemError) as error:
         fault = _last_line(error) if isinstance(error, cv2.error) else "no YAML, JSON or XML in it"
     if fault:
-        named = {suffix.lower() for suffix in file.suffixes} & set(_SUFFIXES)
+        named = {suffix.lower() for suffix in file.suffixes} & set(SUFFIXES)
         hint = "" if named else "write its numbers as JSON or YAML under the usual names: cam_K, proj_K, R, T and so on"
         raise InputError(file, "", f"a file that OpenCV cannot read ({fault})", _KINDS, hint)
     try:
@@ -229,7 +243,7 @@ def _matrix(node: Any, of_opencv: bool) -> Any:
 def beside(file: Path) -> str:
     """Suggest calibration files in the folder of a missing one, the most similar first."""
     try:
-        there = sorted(path.name for path in file.parent.iterdir() if path.suffix.lower() in _SUFFIXES)
+        there = sorted(path.name for path in file.parent.iterdir() if path.suffix.lower() in SUFFIXES)
     except OSError:
         return f"the folder {file.parent} does not exist either"
     return nearest(file.name, there) or (f"the folder has: {', '.join(there[:6])}" if there else "")

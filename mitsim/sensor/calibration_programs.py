@@ -56,7 +56,7 @@ _MESSAGE = {
 
 def with_usual_names(tree: dict[str, Any]) -> dict[str, Any]:
     """Return the tree of one file, with composed values under names that begin with a plus."""
-    tree = _of_old_orb_slam(with_rotations(tree))
+    tree = _of_old_orb_slam(_of_camodocal(with_rotations(tree)))
     out = _of_message(_with_lenses(tree))
     eyes = eyes_of(out)
     out |= usual_values(eyes) | _bouguet(out)
@@ -146,6 +146,15 @@ def _of_message(tree: dict[str, Any]) -> dict[str, Any]:
         numbers = vector(tree[name], None if letter == "d" else math.prod(shape))
         out[usual] = tree[name] if numbers is None else numbers.reshape(shape)
     return out | {"image_width": tree["width"], "image_height": tree["height"]}
+
+
+def _of_camodocal(tree: dict[str, Any]) -> dict[str, Any]:
+    """Return the tree; an equidistant lens of camodocal (VINS) counts its coefficients from k2."""
+    names = {"mu": "fx", "mv": "fy", "u0": "cx", "v0": "cy", "k2": "k1", "k3": "k2", "k4": "k3", "k5": "k4"}
+    inner = tree.get("projection_parameters")
+    if not isinstance(inner, dict) or not set(names) <= set(inner):
+        return tree
+    return tree | {"projection_parameters": {names.get(name, name): value for name, value in inner.items()}}
 
 
 def _of_old_orb_slam(tree: dict[str, Any]) -> dict[str, Any]:

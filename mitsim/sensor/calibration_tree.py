@@ -132,9 +132,12 @@ class CalibrationTree:
         ]
 
 
-def read_tree(files: list[Path]) -> CalibrationTree:
-    """Read calibration files. Raises InputError if a file is missing or cannot be read."""
-    read = [(file, with_usual_names(document)) for file in files for document in read_documents(file)]
+def read_tree(files: list[Path], size: tuple[int, int] | None = None) -> CalibrationTree:
+    """Read calibration files, of cameras with images of a ``size`` (width, height) [px] if a file has several.
+
+    Raises InputError if a file is missing or cannot be read.
+    """
+    read = [(file, with_usual_names(document)) for file in files for document in read_documents(file, size)]
     tree = CalibrationTree([file for file, _ in read], [values for _, values in read])
     if len(files) == len(read) == 2:  # of one camera each, as of EuRoC
         first, second = (cameras_of(eyes_of(values))[0] for values in tree.values)

@@ -74,7 +74,8 @@ def with_calibration(
         near = beside(file)
         hint = f"{near}; {hint}" if near else hint.removeprefix("or ")
         raise InputError(file, "", "no such file", f"the calibration that {path.name} names", hint)
-    tree = tree or read_tree(files)
+    own = size_of(_own(table, "cameras", calibration_table.cameras[0]))
+    tree = tree or read_tree(files, size or (None if own is None else (int(own[0]), int(own[1]))))
     values = _Values(tree, _with_files_of_ros(calibration_table, named, tree), size)
     out = dict(table)
     out["cameras"] = {}

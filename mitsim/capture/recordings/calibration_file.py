@@ -8,7 +8,8 @@ DepthAI                   JSON with ``cameraData``: its left and right camera
 a capture's               ``calibration.json`` of a capture folder
 an Ensenso's              ``*_calib.json`` of a recording: left and right camera, manufacturer's rectification
 a folder of EuRoC         ``cam0/sensor.yaml`` and ``cam1/sensor.yaml``
-others                    YAML, XML or JSON of OpenCV, ROS, Kalibr; .mat, .npz, under the usual names
+others                    YAML, XML or JSON of OpenCV, ROS, Kalibr; .mat, .npz, under the usual names; forms of
+                          :mod:`mitsim.sensor.calibration_devices`
 ========================= ============================================================
 """
 
@@ -33,6 +34,7 @@ from mitsim.capture.recordings.nxlib_calibration import NxLibTree, nxlib_rig
 from mitsim.capture.recordings.recording_files import plain_name
 from mitsim.capture.recordings.stated_scale import stated_scales
 from mitsim.sensor.calibration_eyes import cameras_of
+from mitsim.sensor.calibration_formats import SUFFIXES
 from mitsim.sensor.calibration_qualifiers import check_camera
 from mitsim.sensor.calibration_table import CalibrationTable
 from mitsim.sensor.calibration_tree import CalibrationTree, read_tree, tree_of
@@ -100,12 +102,11 @@ def _read(source: str | Path, size: tuple[int, int] | None) -> Calibrated:
         return Calibrated(Rig(rig), "", notes=tuple(notes))
     if path.suffix.lower() == ".toml" or str(source) in presets():
         return _of_toml(path, size)
-    if path.suffix.lower() in (".yml", ".yaml", ".xml", ".mat", ".npz"):
+    if path.suffix.lower() in SUFFIXES and path.suffix.lower() != ".json":
         return _of_opencv(path, size)
     if path.suffix.lower() != ".json":
-        formats = f".toml, .json, .yml, .yaml, .xml, .mat or .npz, or a preset: {', '.join(presets())}"
-        hint = "ROS's calibrator saves the same numbers as .yaml" if path.suffix.lower() in (".ini", ".txt") else ""
-        raise InputError(path, "", f"the ending {path.suffix!r}", formats, hint)
+        formats = f".toml, {', '.join(SUFFIXES)}, or a preset: {', '.join(presets())}"
+        raise InputError(path, "", f"the ending {path.suffix!r}", formats)
     table = parsed_json(read_bounded(path, "a calibration"), path, "a calibration in JSON")
     if is_depthai_calibration(table):
         read = read_depthai_calibration(path)
@@ -226,7 +227,7 @@ def _of_toml(path: Path, size: tuple[int, int] | None) -> Calibrated:
 
 def _of_opencv(path: Path, size: tuple[int, int] | None) -> Calibrated:
     """Read a pair if the file has the second camera; all cameras of its maps if they belong to no pair; else one."""
-    tree = read_tree([path])
+    tree = read_tree([path], size)
     stated = tree.values[0].get("name")
     sensor = stated if isinstance(stated, str) else ""
     scales = dict(scale for values in tree.values for scale in stated_scales(values))
