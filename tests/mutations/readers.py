@@ -313,6 +313,64 @@ def _maps_of_cameras(name):
     return make
 
 
+#: calibrations in forms of their own, by the names of their files
+_FORMS = {
+    "cameras.txt": "# comment\n1 RADIAL 160 120 600 80 60 -0.1 0.1\n2 OPENCV_FISHEYE 160 120 600 601 80 60 0.1 0 0 0\n",
+    "middlebury.txt": "cam0=[600 0 80; 0 600 60; 0 0 1]\ncam1=[600 0 82; 0 600 60; 0 0 1]\ndoffs=2\nbaseline=193\n"
+    "width=160\nheight=120\nndisp=20\n",
+    "kitti.txt": "calib_time: 09-Jan-2012\n"
+    + "".join(
+        f"S_{at}: 1.6e+02 1.2e+02\nK_{at}: 600 0 80 0 600 60 0 0 1\nD_{at}: -0.1 0.1 0 0 0\nR_{at}: 1 0 0 0 1 0 0 0 1\n"
+        f"T_{at}: -0.{at} 0 0\nS_rect_{at}: 150 110\nP_rect_{at}: 600 0 80 -{at} 0 600 60 0 0 0 1 0\n"
+        for at in ("00", "01")
+    ),
+    "SN1.conf": "".join(
+        f"[{side}_CAM_{ending}]\nfx=600\nfy=600\ncx=80\ncy=60\nk1=-0.1\nk2=0.1\np1=0\np2=0\nk3=0\n"
+        for side in ("LEFT", "RIGHT")
+        for ending in ("HD", "VGA")
+    )
+    + "[STEREO]\nBaseline=120\nTY=0.1\nTZ=0.1\nCV_HD=0.01\nRX_HD=0\nRZ_HD=0\nCV_VGA=0.01\nRX_VGA=0\nRZ_VGA=0\n",
+    "metashape.xml": "<calibration><projection>frame</projection><width>160</width><height>120</height><f>600</f>"
+    "<cx>1</cx><cy>2</cy><b1>1</b1><k1>-0.1</k1><p1>0.001</p1></calibration>",
+    "kinect.json": json.dumps(
+        {
+            "CalibrationInformation": {
+                "Cameras": [
+                    {
+                        "Intrinsics": {
+                            "ModelParameters": [0.5, 0.5, 0.5, 0.5, 0.1, 0, 0, 0.1, 0, 0, 0, 0, 0, 0],
+                            "ModelType": "CALIBRATION_LensDistortionModelBrownConrady",
+                        },
+                        "Purpose": "CALIBRATION_CameraPurposeDepth",
+                        "SensorHeight": 1024,
+                        "SensorWidth": 1024,
+                    }
+                ]
+            }
+        }
+    ),
+    "a.cameramodel": "# note\n{ 'lensmodel': 'LENSMODEL_OPENCV4', 'intrinsics': [ 600, 601, 80, 60, -0.1, 0, 0, 0,],\n"
+    "'extrinsics': [ 0, 0.1, 0, 5, 6, 7,], 'imagersize': [ 160, 120 ],\n'optimization_inputs': b'a%&' }\n",
+}
+
+#: the sizes of images of which these forms have cameras [px], others than 160 x 120
+_SIZES = {"SN1.conf": (672, 376), "kinect.json": (640, 576), "kitti.txt": (150, 110)}
+
+
+def _form(name):
+    def make(folder):
+        (folder / name).write_text(_FORMS[name], encoding="utf-8")
+        return folder / name
+
+    return make
+
+
+def _read_form(path):
+    from mitsim.capture.recordings.calibration_file import read_calibration
+
+    read_calibration(path, _SIZES.get(path.name, (160, 120)))
+
+
 _CALIBRATION = {
     "K1": np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]]),
     "D1": np.zeros(5),
@@ -744,6 +802,7 @@ READERS: dict[str, Reader] = {
     "stereo.mat": Reader(_toolbox, _read_cameras),
     "maps.json": Reader(_maps_of_cameras("maps.json"), _read_cameras),
     "maps.yaml": Reader(_maps_of_cameras("maps.yaml"), _read_cameras),
+    **{name: Reader(_form(name), _read_form) for name in _FORMS},
     "heights.npy": Reader(_heights(".npy"), _read_heights),
     "heights.csv": Reader(_heights(".csv"), _read_heights),
     "profile.csv": Reader(_profile, _read_profile),

@@ -30,7 +30,7 @@ NAMES = {
 }
 
 #: suffixes of files that describe cameras, a sensor or a study, and are no recordings
-_DESCRIPTIONS = frozenset({".toml", ".yml", ".yaml", ".xml", ".json", ".mat"})
+_DESCRIPTIONS = frozenset({".toml", ".yml", ".yaml", ".xml", ".json", ".mat", ".conf", ".cameramodel"})
 
 #: first bytes of the files of a kind
 _MARKS = {
