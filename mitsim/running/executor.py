@@ -142,7 +142,7 @@ def finished_orders(
                 if given_up():
                     return
                 idle()
-            for future in done:
+            for future in sorted(done, key=lambda one: one.exception() is not None):  # an error loses no result
                 result = future.result()
                 yield running.pop(future), result
     finally:
@@ -167,6 +167,8 @@ class Pool:
         prepared: Callable[[Item], tuple[Hashable, Hashable]] | None = None,
     ) -> Iterator[tuple[Item, Result]]:
         """Yield items with their results, as they are finished, until given up; dead processes are replaced.
+
+        An error of an order ends the others in work.
 
         Parameters
         ----------
@@ -208,7 +210,7 @@ class Pool:
                         hint = "finished work is kept: use fewer, and run the same command again"
                         raise MissingEnvironmentError(f"--processes {self.processes}: {found}; {hint}") from None
                     say("a worker process died; its work is repeated")
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, Exception):
             self._end()
             raise
         finally:

@@ -5,6 +5,7 @@ import os
 import pickle
 import signal
 import time
+from collections import deque
 from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
@@ -196,6 +197,41 @@ def test_what_a_worker_refuses_is_told_as_it_said_it(pool):
     for error in (caught.value, DeviceError("stage", "move", "nothing", "an answer", "look")):
         again = pickle.loads(pickle.dumps(error))
         assert type(again) is type(error) and str(again) == str(error)
+
+
+def refuse_beside(order):
+    number, mark = order
+    if number:
+        Path(mark).with_suffix(".half").write_text(str(os.getpid()))
+        Path(mark).with_suffix(".half").replace(mark)
+        time.sleep(60)
+    while not Path(mark).exists():
+        time.sleep(0.02)
+    return refuse(number)
+
+
+def test_an_error_of_an_order_ends_the_others_in_work(pool, tmp_path):
+    """Before, the order of a minute went on to its end, and what came next waited for it."""
+    mark = tmp_path / "process"
+    with pytest.raises(InputError):
+        list(pool.distribute([0, 1], lambda number: (number, str(mark)), refuse_beside))
+    working, until = int(mark.read_text()), time.monotonic() + 20
+    while exists(working) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not exists(working)
+
+
+def test_an_error_loses_no_result_that_is_there(monkeypatch):
+    """Of two orders that end together, the finished one comes first; before, it was lost after the error."""
+    bad, good = Future(), Future()
+    bad.set_exception(InputError("a.toml", "key", 1, "another"))
+    good.set_result("done")
+    monkeypatch.setattr(executor, "wait", lambda *_: SimpleNamespace(done=[bad, good]))
+    running = {bad: 0, good: 1}
+    found = executor.finished_orders(deque(), running, Future, lambda: None, lambda: False, 1)
+    assert next(found) == (1, "done")
+    with pytest.raises(InputError):
+        next(found)
 
 
 def test_processes_follow_cores_and_memory(monkeypatch):
