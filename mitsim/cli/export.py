@@ -221,7 +221,7 @@ def map_(
     chosen = load_sensor(sensor or name)
     if chosen.name != name:
         raise InputError("--sensor", "", chosen.name, f"{name}, the sensor of the map")
-    options.check_folder(output.absolute().parent, locked=False)
+    options.check_new_folder(output)
     write_map_kernel(loaded, output, chosen.measuring_rig.baseline_direction)
     say(f"kernel: {output / 'sensor_map.py'}, {output / 'map.npz'}: {len(loaded.samples)} surfaces of {name}")
 
@@ -249,7 +249,9 @@ def bop(
     options.start(variant)
     from mitsim.report.export.bop import find_sources, write_bop
 
-    count = write_bop(find_sources(folder), output, split, objects or ())
+    sources = find_sources(folder)
+    options.check_new_folder(output)
+    count = write_bop(sources, output, split, objects or ())
     say(f"data set: {output}: {count} images")
 
 

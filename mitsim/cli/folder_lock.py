@@ -1,8 +1,8 @@
 """Lock a folder, so that one command at a time writes to it.
 
 The lock is the system's ``flock``: the system releases it when the process ends, for whatever reason. The file
-``.mitsim.lock`` names the process, and other commands print it. The command that locks a folder removes partial files
-of killed processes.
+``.mitsim.lock`` names the process, and other commands print it. It lies in the folder, or beside one that is written
+elsewhere and moved there in one step. The command that locks a folder removes partial files of killed processes.
 """
 
 from __future__ import annotations
@@ -40,26 +40,62 @@ _WITHIN = ("", "captures", "clouds", "coupons", "trials")
 _RUNS = ("", "*", "views/*")
 
 
-def lock_folder(folder: Path) -> Callable[[], None]:
+def lock_folder(folder: Path, whole: bool = False) -> Callable[[], None]:
     """Lock an existing folder and remove abandoned files; return the function that releases it.
 
-    Raises InputError if another command has locked it; the message has its process, machine and start time.
+    ``whole``: the command moves the whole folder to its place, and it need not exist yet. Raises InputError if another
+    command has locked it in either way; the message has its process, machine and start time.
     """
-    handle = _locked(folder)
+    inside, beside = folder / LOCK, folder.parent / f".{folder.name}{LOCK}"
+    lock, other = (beside, inside) if whole else (inside, beside)
+    if other.is_file():
+        _unlocked(other, _locked(other, folder))
+    handle = _locked(lock, folder)
     if handle is None:
         return lambda: None
     about = {"pid": os.getpid(), "host": platform.node(), "since": f"{datetime.now():%Y-%m-%d %H:%M:%S}"}
     about |= {"command": " ".join(sys.argv[1:2])}
     os.ftruncate(handle, 0)
     os.pwrite(handle, json.dumps(about).encode(), 0)
-    remove_partial(folder)
+    if whole:
+        remove_partial_beside(folder)
+    else:
+        remove_partial(folder)
+    return lambda: _unlocked(lock, handle)
 
-    def release() -> None:
+
+#: folders that the running command has locked, each with the function that releases it, and those that it has created
+_locked_folders: dict[Path, Callable[[], None]] = {}
+_created_folders: list[Path] = []
+
+
+def lock_until_end(folder: Path, whole: bool = False) -> None:
+    """Lock a folder as :func:`lock_folder` does, unless this command has; :func:`release_folders` releases it."""
+    if folder not in _locked_folders:
+        _locked_folders[folder] = lock_folder(folder, whole)
+
+
+def create_until_end(folder: Path) -> None:
+    """Create a folder and its parents; :func:`release_folders` removes those that are still empty."""
+    _created_folders.extend(path for path in (*reversed(folder.absolute().parents), folder) if not path.exists())
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+def release_folders() -> None:
+    """Release all folders of the command, however it ended, and remove those of them that it left empty."""
+    while _locked_folders:
+        _locked_folders.popitem()[1]()
+    while _created_folders:
+        with contextlib.suppress(OSError):  # it is not empty
+            _created_folders.pop().rmdir()
+
+
+def _unlocked(lock: Path, handle: int | None) -> None:
+    """Release a lock, and remove its file; nothing without a handle."""
+    if handle is not None:
         with contextlib.suppress(OSError):
-            (folder / LOCK).unlink(missing_ok=True)
+            lock.unlink(missing_ok=True)
             os.close(handle)
-
-    return release
 
 
 def remove_partial(folder: Path) -> list[Path]:
@@ -105,13 +141,12 @@ def _may_be_alive(path: Path, match: re.Match[str]) -> bool:
         return True
 
 
-def _locked(folder: Path) -> int | None:
-    """Return a locked handle of the lock file; None if the system cannot lock files."""
+def _locked(path: Path, folder: Path) -> int | None:
+    """Return a locked handle of the lock file of a folder; None if the system cannot lock files."""
     try:
         import fcntl
     except ImportError:
         return None
-    path = folder / LOCK
     while True:
         handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
         try:

@@ -13,7 +13,6 @@ from characterisation.files.errors import InputError
 from characterisation.words.progress import say
 from mitsim.cli import options
 from mitsim.cli.decode import decoding_step
-from mitsim.cli.folder_lock import remove_partial_beside
 
 if TYPE_CHECKING:
     from mitsim.capture.capture import Capture
@@ -149,10 +148,10 @@ def import_(
         say(f"  pose: {distance:.1f} mm from the coupon, {angle:.1f} deg off its normal")
     for warning in capture.settings.get("warnings", []):
         say(f"warning: {warning}")
-    remove_partial_beside(folder)
     if is_written(capture, folder, imported.originals):
         say(f"capture: {folder}, finished before")
         return
+    options.check_new_folder(folder)
     write_capture(capture, folder, vendor=imported.originals)
     say(f"capture: {folder}; next: {decoding_step(capture, folder, sensor)}")
 

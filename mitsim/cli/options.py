@@ -15,7 +15,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from characterisation.files.atomic_io import pointed_to
 from characterisation.files.errors import InputError
-from mitsim.cli.folder_lock import lock_folder, remove_partial_beside
+from mitsim.cli.folder_lock import create_until_end, lock_until_end, remove_partial_beside
 from mitsim.cli.kept_files import refuse_kept
 
 if TYPE_CHECKING:
@@ -292,28 +292,25 @@ def _is_finished(path: Path) -> bool:
 def check_folder(folder: Path, locked: bool = True) -> None:
     """Check that a folder can be written, create it, and lock it until the command ends.
 
-    ``locked`` is false for the folder of a single file: other commands may write to that folder at the same time.
+    ``locked`` is false for the folder of a single file: other commands may write to that folder at the same time. A
+    folder that is created here is removed at the end of the command if it is still empty.
     """
     whole = str(folder.absolute())
     if locked and whole != whole.encode(errors="replace").decode():
         hint = "rename the folder, or give one elsewhere: -o /tmp/out"
         raise InputError("--output", "", whole, "a path in UTF-8, which netCDF files need", hint)
     try:
-        pointed_to(folder).mkdir(parents=True, exist_ok=True)
+        create_until_end(pointed_to(folder))
     except OSError as error:
         raise InputError("--output", "", f"{folder} ({error.strerror})", "a folder that can be created") from None
     if not os.access(folder, os.W_OK):
         raise InputError("--output", "", f"{folder}, which is not writable", "a writable folder")
-    path = folder.resolve()
-    if locked and path not in _locked_folders:
-        _locked_folders[path] = lock_folder(folder)
+    if locked:
+        lock_until_end(folder.resolve())
 
 
-#: folders that the running command has locked, each with the function that releases it
-_locked_folders: dict[Path, Callable[[], None]] = {}
-
-
-def release_folders() -> None:
-    """Release all folders of the command, however it ended."""
-    while _locked_folders:
-        _locked_folders.popitem()[1]()
+def check_new_folder(folder: Path) -> None:
+    """Check that a folder can be moved to its place, in one step, and lock it until the command ends."""
+    folder = pointed_to(folder).absolute()
+    check_folder(folder.parent, locked=False)
+    lock_until_end(folder, whole=True)

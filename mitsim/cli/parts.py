@@ -215,6 +215,7 @@ def part(
     finishing = Finishing(
         metal or "aluminium", process or "ground", 0.8 if roughness is None else roughness, finish, reflectance, gloss
     )
+    options.check_new_folder(output)
     made = write_part(file, output, units, finishing, angle, fine)
     for remark in made.remarks:
         say(remark)

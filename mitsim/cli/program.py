@@ -44,8 +44,9 @@ from mitsim.cli import (
     studies,
     talk,
 )
+from mitsim.cli.folder_lock import release_folders
 from mitsim.cli.kept_files import note_arguments
-from mitsim.cli.options import Command, Group, command_group, release_folders
+from mitsim.cli.options import Command, Group, command_group
 
 
 class Commands(Group):

@@ -13,7 +13,6 @@ from characterisation.files.errors import InputError
 from characterisation.words.progress import say
 from mitsim.cli import options
 from mitsim.cli.decode import decoding_step
-from mitsim.cli.folder_lock import remove_partial_beside
 
 if TYPE_CHECKING:
     from mitsim.running.executor import Executor
@@ -109,12 +108,12 @@ def render(
     pose = options.pose_of(position, target, roll, chosen)
     origin = origin_of(scene, chosen, defined)
     digest = CaptureJob(chosen, str(scene), "", 0, pose, settings, origin).digest()
-    remove_partial_beside(output)
     if digest_of(output, "render") == digest:
         read_capture(output)
         say(f"capture: {output}, finished before")
         return
     check_free(output)
+    options.check_new_folder(output)
     rendering = Rendering.smoothed(samples, depth, smoothing)
     capture = render_capture(
         loaded, chosen, pose, seed=seed, samples=samples, depth=depth, smoothing_px=smoothing, noise=noise, check=False

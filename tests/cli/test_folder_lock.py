@@ -10,17 +10,20 @@ import time
 from pathlib import Path
 from unittest import mock
 
+import cv2
+import numpy as np
 import pytest
+import trimesh
 
 from characterisation.files.atomic_io import HOST, atomic_write, atomic_write_named, write_folder
 from characterisation.files.errors import InputError
-from mitsim.cli.folder_lock import LOCK, _holder, lock_folder, remove_partial, remove_partial_beside
-from mitsim.cli.options import check_folder, release_folders
+from mitsim.cli.folder_lock import LOCK, _holder, lock_folder, release_folders, remove_partial, remove_partial_beside
+from mitsim.cli.options import check_folder
 from mitsim.study.scoring import score_study
 from mitsim.study.virtual.trials import Outcome, TrialFolder
 from mitsim.study.virtual.world import Trial
 from tests.shell import mitsim_here
-from tests.small_study import small_study
+from tests.small_study import SCENES, small_study
 from tests.smaller_sensors import coarse_sensor
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="locks of POSIX")
@@ -185,9 +188,50 @@ def test_commands_hold_their_folders_and_let_them_go(tmp_path, tmp_path_factory,
     assert (tmp_path / "scores.csv").exists() and not (tmp_path / LOCK).exists()
 
 
+def test_an_export_does_not_replace_a_folder_that_another_command_holds(tmp_path, holder):
+    """Before, the export of a map replaced the folder, with what the other command had written there."""
+    for name in ("map.npz", "README.md", "sensor_map.py"):
+        (tmp_path / name).write_text("of before")
+    call = ("export", "map", "ensenso-n10", "-o", str(tmp_path))
+    assert f"process {holder.pid}" in mitsim_here(*call, code=2).stderr
+    assert (tmp_path / "map.npz").read_text() == "of before" and (tmp_path / LOCK).exists()
+
+
+@pytest.mark.timeout(200)
+def test_two_commands_do_not_make_one_folder(tmp_path):
+    """Before, both worked to their end, and the later one then found the folder there."""
+    folder, scene = tmp_path / "new", str(SCENES / "two_pillars.xml")
+    trimesh.creation.box((40, 30, 20)).export(tmp_path / "box.stl")
+    cv2.imwrite(str(tmp_path / "depth.png"), np.full((48, 64), 600, np.uint16))
+    calls = (
+        ("export", "map", "ensenso-n10"),
+        ("export", "bop", tmp_path),
+        ("part", tmp_path / "box.stl"),
+        ("import", tmp_path / "depth.png", "--sensor", "realsense-d435"),
+        ("render", scene, "--position", 0, -400, 300),
+        ("map", "compare", "ensenso-n10"),
+    )
+    release = lock_folder(folder, whole=True)
+    with mock.patch("mitsim.report.export.bop.find_sources", lambda _: []):
+        for call in calls:
+            assert f"process {os.getpid()}" in mitsim_here(*call, "-o", folder, code=2).stderr, call
+    assert not folder.exists()
+    release()
+    mitsim_here(*calls[0], "-o", folder)
+    assert {path.name for path in folder.iterdir()} == {"map.npz", "README.md", "sensor_map.py"}
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_a_command_that_refuses_its_input_leaves_no_folder(tmp_path):
+    """Before, it left the empty folder, and those above it."""
+    mitsim_here("study", "score", tmp_path / "no.toml", "-o", tmp_path / "runs" / "first", code=2)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_folder_that_a_link_points_to_is_made_and_swept_beside_itself(tmp_path):
     (tmp_path / "run").symlink_to("disk/run")
     check_folder(tmp_path / "run")
+    (tmp_path / "run" / "scores.csv").write_text("")
     release_folders()
     assert (tmp_path / "run").is_symlink() and (tmp_path / "disk" / "run").is_dir()
     left = tmp_path / "disk" / f".run.partial-999999999-{HOST}0b"

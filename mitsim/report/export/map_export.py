@@ -19,6 +19,9 @@ from characterisation.maps.tables import to_probit
 from characterisation.words.version import __version__
 from mitsim.report.export import map_kernel
 
+#: files of an export, all that it may replace
+_FILES = ("map.npz", "sensor_map.py", "README.md")
+
 _README = """# Performance map of {sensor}
 
 Made by mitsim {version} from {source} captures. Licence: Apache-2.0, see the head of `sensor_map.py`.
@@ -55,11 +58,13 @@ within a few pixels of an edge. `draw` makes errors of neighbouring pixels indep
 def write_map_kernel(performance_map: PerformanceMap, folder: str | Path, baseline: NDArray[np.float64]) -> None:
     """Write the folder atomically; ``baseline`` (3,) is the sensor's, in its reference camera's frame.
 
-    Raises InputError if the folder exists and contains other files.
+    Raises InputError if the folder contains other files, which would be lost.
     """
     folder = Path(folder)
-    if folder.exists() and any(folder.iterdir()) and not (folder / "sensor_map.py").is_file():
-        raise InputError("--output", "", f"{folder}, which has other files", "a new folder, or one written before")
+    found = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+    if others := found - {*_FILES, "__pycache__"} if "sensor_map.py" in found else found:
+        allowed = f"a new folder, or one with {', '.join(_FILES)} alone: it is replaced"
+        raise InputError("--output", "", f"{folder}, which has {min(others)}", allowed)
     data = performance_map.data
     probit, _ = to_probit(data["recovered_fraction"].values.astype(float))
     with np.errstate(divide="ignore", invalid="ignore"):
