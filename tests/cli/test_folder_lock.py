@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -22,7 +23,7 @@ from mitsim.cli.options import check_folder
 from mitsim.study.scoring import score_study
 from mitsim.study.virtual.trials import Outcome, TrialFolder
 from mitsim.study.virtual.world import Trial
-from tests.shell import mitsim_here
+from tests.shell import ROOT, mitsim_here
 from tests.small_study import SCENES, small_study
 from tests.smaller_sensors import coarse_sensor
 
@@ -144,6 +145,22 @@ def test_what_is_being_written_names_its_process(tmp_path, monkeypatch):
     monkeypatch.setattr("characterisation.files.atomic_io._sync_directory", lambda d: names.append(d.name))
     write_folder(tmp_path / "poses", {"a": b""})
     assert all(str(os.getpid()) in name for name in names[:2])
+
+
+@pytest.mark.timeout(120)
+def test_a_command_without_an_input_stream_ends_with_its_message(tmp_path):
+    """Before, with a closed stdin, as services have it, commands that may ask ended in a traceback."""
+    call = [sys.executable, "-m", "mitsim", "study", "score", "no.toml", "-o", "out"]
+    closed = f"exec <&-; exec {shlex.join(call)}"
+    done = subprocess.run(
+        ["sh", "-c", closed],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (2, "mitsim: no.toml: found no such file; allowed: a TOML file\n")
 
 
 @pytest.mark.timeout(120)

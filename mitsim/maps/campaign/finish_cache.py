@@ -51,9 +51,12 @@ _DIGEST = "finish_digest"
 
 
 def cache_folder() -> Path:
-    """Return the cache folder, according to the XDG base directory specification."""
+    """Return the cache folder, according to the XDG base directory specification; InputError without a home."""
     root_name = os.environ.get("XDG_CACHE_HOME", "")
-    root = Path(root_name) if root_name and Path(root_name).is_absolute() else Path.home() / ".cache"
+    try:
+        root = Path(root_name) if root_name and Path(root_name).is_absolute() else Path.home() / ".cache"
+    except RuntimeError:
+        raise InputError("XDG_CACHE_HOME", "", "nothing, and no home folder", "an absolute, writable path") from None
     return root / "mitsim" / "finishes"
 
 

@@ -285,6 +285,10 @@ def test_the_cache_is_where_the_xdg_specification_has_it(monkeypatch, tmp_path):
     for given in ("", "not/absolute"):
         monkeypatch.setenv("XDG_CACHE_HOME", given)
         assert cache_folder() == Path.home() / ".cache/mitsim/finishes"
+    monkeypatch.delenv("HOME")
+    monkeypatch.setattr("pwd.getpwuid", {}.__getitem__)  # of a user without an entry, as in a container
+    with pytest.raises(InputError, match="XDG_CACHE_HOME: found nothing, and no home folder"):
+        cache_folder()
 
 
 def test_expected_time_is_that_of_this_machine_once_it_is_known(quick, n10):
