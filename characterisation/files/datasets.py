@@ -146,7 +146,8 @@ def _check_bytes(path: Path, schema: Schema) -> None:
     command = [sys.executable, "-c", _PROBE, str(path.resolve())]
     try:
         done = subprocess.run(command, capture_output=True, timeout=PATIENCE_S, check=False)
-        failure = "" if done.returncode == 0 else done.stderr.decode("utf-8", "replace").strip()[-200:] or "it crashes"
+        told = done.stderr.decode("utf-8", "replace").strip().splitlines()
+        failure = "" if done.returncode == 0 else told[-1][-200:] if told else "it crashes"
     except subprocess.TimeoutExpired:
         failure = f"its reader did not finish within {PATIENCE_S:g} s"
     if failure:

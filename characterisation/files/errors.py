@@ -47,11 +47,11 @@ def _shortened(value: Any) -> str:
 
 
 def nearest(name: str, names: list[str]) -> str:
-    """Return ``did you mean 'x'?`` for the name nearest to a misspelt one, or an empty string.
+    """Return ``did you mean 'x'?`` for the name nearest to a misspelt one, and not that itself; or an empty string.
 
     Names are compared without capitals, and with spaces and underscores as hyphens.
     """
-    by_spelling = {_spelling(candidate): candidate for candidate in names}
+    by_spelling = {_spelling(candidate): candidate for candidate in names if candidate != name}
     close = get_close_matches(_spelling(name), list(by_spelling), n=1, cutoff=0.6)
     return f"did you mean {by_spelling[close[0]]!r}?" if close else ""
 

@@ -275,6 +275,10 @@ def _wrap(scene: Any, finishes: dict[str, Finish], where: str) -> Scene:
     bounds = _part_bounds(scene)
     size = float(np.linalg.norm(bounds[1] - bounds[0]))
     if not 1.0 <= size <= 1e5:
+        for shape in shapes:
+            if not np.isfinite(bounds_of(shape)).all():
+                allowed = "finite lengths [mm]; of a cylinder, p0 and p1 that differ"
+                raise InputError(where, f"shape {shape.id()}", "a place or size that is not a number", allowed)
         hint = "lengths are in mm; a part modelled in metres needs <scale value='1000'/>"
         raise InputError(where, "shape", f"a scene {size:g} mm across", "1 mm to 100 m", hint)
     face_normals_side(scene)

@@ -94,6 +94,8 @@ def test_a_scene_loads_with_plain_mitsuba_once_ours_is_there(scenes):
         ('name="radius" value="20"', 'name="radios" value="20"', "shape cylinder: radios", "did you mean 'radius'?"),
         ("</scene>", "", "", "does not parse"),
         ('type="cylinder"', 'type="cylindre"', "type", "did you mean 'cylinder'?"),
+        ('name="radius" value="20"', 'name="radius" value="nan"', "shape pillar1", "not a number"),
+        ('name="p1" x="-35" y="0" z="60"', 'name="p1" x="-35" y="0" z="0"', "shape pillar1", "p0 and p1 that differ"),
         ('<scale x="90" y="60"/>', '<scale x="0.09" y="0.06"/><!--', "", "does not parse"),
     ],
 )

@@ -66,6 +66,13 @@ def test_values_that_were_changed_are_known_by_their_digest(tmp_path):
     read_dataset(tmp_path / "c.nc", SCHEMA)
 
 
+def test_of_a_file_of_another_kind_only_the_fault_is_told(tmp_path):
+    """Before, the last 200 characters of a traceback."""
+    (tmp_path / "a.nc").write_text("not netCDF")
+    with pytest.raises(InputError, match=r"cannot be read \((\w+Error): .*Unknown file format: [^)]*a\.nc'\); allowed"):
+        read_dataset(tmp_path / "a.nc", SCHEMA)
+
+
 @pytest.mark.parametrize(
     ("change", "told"),
     [

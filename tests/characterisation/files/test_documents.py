@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pydantic import Field, model_validator
 
 from characterisation.files.documents import Document, missing_keys, validate
-from characterisation.files.errors import InputError
+from characterisation.files.errors import InputError, nearest
 
 
 class Fixed(Document):
@@ -192,3 +192,10 @@ def test_types_are_named_as_toml_has_them(key, value, allowed):
     camera = {"width": 640, "focal": [1, 1]} | {key: value}
     with pytest.raises(InputError, match=f"allowed: {allowed}"):
         validate("a.toml", TABLE | {"cameras": {"left": camera}}, Whole)
+
+
+def test_a_name_is_not_its_own_correction():
+    """Before, a folder in place of a file was told: did you mean this very name?"""
+    assert nearest("task.toml", ["task.toml", "study.toml", "tasks.toml"]) == "did you mean 'tasks.toml'?"
+    assert nearest("task.toml", ["task.toml"]) == ""
+    assert nearest("task.toml", ["Task.toml"]) == "did you mean 'Task.toml'?"
