@@ -14,7 +14,7 @@ import platform
 import shutil
 import tempfile
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -105,12 +105,13 @@ def _beside(folder: Path, kind: str) -> Path:
     return folder.with_name(f".{folder.name}.{kind}-{os.getpid()}-{HOST}{uuid.uuid4().hex[:12]}")
 
 
-def write_folder(folder: str | Path, files: Mapping[str, bytes], *, overwrite: bool = False) -> None:
+def write_folder(folder: str | Path, files: Mapping[str, bytes], *, overwrite: Collection[str] = ()) -> None:
     """Write a folder of files by their paths in it; after a loss of power it is complete or absent.
 
-    The files are written beside the folder, flushed to the disk, and renamed in one step. ``overwrite`` replaces an
-    existing folder. Raises OSError if the folder cannot be written, or exists already; an existing folder is then
-    unchanged. If the disk is full, ``errno`` is in :data:`FULL` and ``filename`` is ``folder``.
+    The files are written beside the folder, flushed to the disk, and renamed in one step. With ``overwrite`` the folder
+    may exist: these names in it are replaced or removed, and all others stay. Raises OSError if the folder cannot be
+    written, or exists already; an existing folder is then unchanged. If the disk is full, ``errno`` is in :data:`FULL`
+    and ``filename`` is ``folder``.
     """
     folder = pointed_to(folder).absolute()
     partial, old = _beside(folder, "partial"), _beside(folder, "old")
@@ -119,6 +120,9 @@ def write_folder(folder: str | Path, files: Mapping[str, bytes], *, overwrite: b
             folder.parent.mkdir(parents=True, exist_ok=True)
             for path, data in files.items():
                 _write_synced(partial / path, data)
+            for other in folder.iterdir() if overwrite and folder.exists() else ():
+                if other.name not in overwrite:
+                    _copy(other, partial / other.name)
             for directory in [*sorted(p for p in partial.glob("**/") if p != partial), partial]:
                 _sync_directory(directory)
             if folder.exists() and overwrite:
@@ -130,6 +134,13 @@ def write_folder(folder: str | Path, files: Mapping[str, bytes], *, overwrite: b
             old.rename(folder)
         shutil.rmtree(partial, ignore_errors=True)
         shutil.rmtree(old, ignore_errors=True)
+
+
+def _copy(source: Path, target: Path) -> None:
+    if source.is_dir() and not source.is_symlink():
+        shutil.copytree(source, target, symlinks=True)
+    else:
+        shutil.copy2(source, target, follow_symlinks=False)
 
 
 def _write_synced(file: Path, data: bytes) -> None:

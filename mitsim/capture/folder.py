@@ -43,6 +43,9 @@ from mitsim.sensor.camera import Camera
 from mitsim.sensor.png import Image, decode_png
 from mitsim.sensor.transforms import Transform
 
+#: files and folders of a capture: of its folder, all that a new capture replaces
+_ENTRIES = ("capture.json", "calibration.json", "settings.json", "pose.json", "images", "derived", "truth", "vendor")
+
 #: largest allowed size of all files of a capture [bytes]
 LARGEST_CAPTURE = 8 * 1024**3
 
@@ -67,7 +70,7 @@ def write_capture(
     path
         New or empty folder. Its files are first written beside it, and moved there in one step.
     overwrite
-        Replace an existing capture. Other files are never replaced.
+        Replace an existing capture. Other files in its folder stay.
     vendor
         The maker's own files by name, kept unchanged.
     truth
@@ -107,7 +110,7 @@ def write_packed(files: Mapping[str, bytes], folder: str | Path, *, overwrite: b
     folder = Path(folder).absolute()
     check_free(folder, overwrite)
     try:
-        write_folder(folder, files, overwrite=overwrite)
+        write_folder(folder, files, overwrite=_ENTRIES if overwrite else ())
     except OSError as error:
         if error.errno in FULL:
             raise

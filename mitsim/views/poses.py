@@ -27,6 +27,9 @@ from mitsim.sensor.transforms import Transform
 from mitsim.views.candidates import Candidates, View
 from mitsim.views.table import ViewsTable
 
+#: files of the folder, of which a new set of views replaces all
+_FILES = ("poses.csv", "poses.json", "stage.csv", "left_out.csv")
+
 _FRAMES = {
     "part": "the world frame of the scene, as its author chose it",
     "sensor": "x right, y down, z forward; the frame of the sensor's cameras and of its clouds",
@@ -39,7 +42,7 @@ _STAGE = (
 
 
 def write_views(folder: str | Path, candidates: Candidates, table: ViewsTable, sensor: str) -> None:
-    """Write the poses of all views into a folder, completely or not at all; an existing folder is replaced.
+    """Write the poses of all views into a folder, completely or not at all; its other files stay.
 
     Report on stderr which views were moved or are impossible.
 
@@ -57,7 +60,7 @@ def write_views(folder: str | Path, candidates: Candidates, table: ViewsTable, s
         head = ["direction_x", "direction_y", "direction_z", "roll_deg", "standoff_mm", "reason"]
         rows = [[*_written([*out.direction, out.roll_deg, out.standoff]), out.reason] for out in left_out]
         files["left_out.csv"] = _csv(head, rows)
-    write_folder(folder, {name: text.encode("utf-8") for name, text in files.items()}, overwrite=True)
+    write_folder(folder, {name: text.encode("utf-8") for name, text in files.items()}, overwrite=_FILES)
     if candidates.moved_out:
         say(f"{candidates.moved_out} of {len(views)} views are moved farther out, clear of the part")
     if left_out:

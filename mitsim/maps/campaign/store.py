@@ -45,6 +45,9 @@ from mitsim.maps.campaign.plan import Shot
 #: longest accepted header of a table [bytes]; some thirty columns take 1,100
 _LONGEST_HEADER = 10_000
 
+#: files and folders of a shot, all that another one replaces
+_ENTRIES = ("shot.json", "patches.npy", "capture")
+
 
 @dataclass(frozen=True)
 class Finished:
@@ -104,7 +107,7 @@ def write_shot(captures: Path, shot: Shot, finished: Finished) -> None:
     document["checksum"] = content_checksum(document)
     files["shot.json"] = (json.dumps(document, indent=1) + "\n").encode()
     try:
-        write_folder(folder, files, overwrite=shot.found is not None)
+        write_folder(folder, files, overwrite=_ENTRIES if shot.found is not None else ())
     except OSError as error:
         raise MissingEnvironmentError(
             f"{folder}: a capture that cannot be written ({error.strerror or error}); captures finished before are "

@@ -19,7 +19,7 @@ from characterisation.maps.tables import to_probit
 from characterisation.words.version import __version__
 from mitsim.report.export import map_kernel
 
-#: files of an export, all that it may replace
+#: files of an export, all that another one replaces
 _FILES = ("map.npz", "sensor_map.py", "README.md")
 
 _README = """# Performance map of {sensor}
@@ -58,13 +58,11 @@ within a few pixels of an edge. `draw` makes errors of neighbouring pixels indep
 def write_map_kernel(performance_map: PerformanceMap, folder: str | Path, baseline: NDArray[np.float64]) -> None:
     """Write the folder atomically; ``baseline`` (3,) is the sensor's, in its reference camera's frame.
 
-    Raises InputError if the folder contains other files, which would be lost.
+    Raises InputError if the folder exists and is no export. Other files in an export stay.
     """
     folder = Path(folder)
-    found = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-    if others := found - {*_FILES, "__pycache__"} if "sensor_map.py" in found else found:
-        allowed = f"a new folder, or one with {', '.join(_FILES)} alone: it is replaced"
-        raise InputError("--output", "", f"{folder}, which has {min(others)}", allowed)
+    if folder.exists() and any(folder.iterdir()) and not (folder / "sensor_map.py").is_file():
+        raise InputError("--output", "", f"{folder}, which has other files", "a new folder, or one written before")
     data = performance_map.data
     probit, _ = to_probit(data["recovered_fraction"].values.astype(float))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -97,4 +95,4 @@ def write_map_kernel(performance_map: PerformanceMap, folder: str | Path, baseli
     )
     kernel = Path(map_kernel.__file__).read_bytes()
     files = {"map.npz": packed.getvalue(), "sensor_map.py": kernel, "README.md": readme.encode("utf-8")}
-    write_folder(folder, files, overwrite=True)
+    write_folder(folder, files, overwrite=_FILES)

@@ -85,12 +85,27 @@ def test_a_link_to_a_folder_stays_and_its_folder_is_written(tmp_path):
     (tmp_path / "one").symlink_to("disk/one")
     with atomic_folder(tmp_path / "one") as folder:
         (folder / "first").write_text("first")
-    write_folder(tmp_path / "one", {"second": b"second"}, overwrite=True)
+    write_folder(tmp_path / "one", {"second": b"second"}, overwrite=["first"])
     (tmp_path / "two").symlink_to("disk/two")
     write_folder(tmp_path / "two", {"third": b"third"})
     assert (tmp_path / "one").is_symlink() and (tmp_path / "two").is_symlink()
     names = sorted(p.relative_to(tmp_path / "disk").as_posix() for p in (tmp_path / "disk").rglob("*"))
     assert names == ["one", "one/second", "two", "two/third"]
+
+
+def test_a_folder_is_replaced_but_for_what_others_wrote_into_it(tmp_path):
+    """Before, a user's files in the folder of a capture, of poses or of an exported map were deleted."""
+    folder = tmp_path / "one"
+    write_folder(folder, {"first": b"old", "images/left": b"old", "images/right": b"old"})
+    (folder / "notes").mkdir()
+    (folder / "notes" / "a.txt").write_text("mine")
+    (folder / "program.py").write_text("mine")
+    with pytest.raises(OSError):
+        write_folder(folder, {"first": b"new"})
+    write_folder(folder, {"first": b"new", "images/left": b"new"}, overwrite=("first", "images", "second"))
+    files = {p.relative_to(folder).as_posix(): p.read_text() for p in folder.rglob("*") if p.is_file()}
+    assert files == {"first": "new", "images/left": "new", "notes/a.txt": "mine", "program.py": "mine"}
+    assert [p.name for p in tmp_path.iterdir()] == ["one"]
 
 
 def test_json_keeps_a_file_name_that_is_not_utf8(tmp_path):

@@ -164,7 +164,7 @@ def test_faults_are_told(tmp_path):
     assert np.isnan(kernel.look_up([3000.0], one, "matt_white")[0])
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/thesis.txt").write_text("all of it")
-    with pytest.raises(InputError, match=r"mine, which has thesis\.txt"):
+    with pytest.raises(InputError, match="which has other files"):
         export("map", "ensenso-n10", "-o", tmp_path / "mine")
     with pytest.raises(InputError, match=r"ensenso-n10, the sensor of the map"):
         export("map", "ensenso-n10", "--sensor", "kinect-v2", "-o", tmp_path / "other")
@@ -174,11 +174,7 @@ def test_faults_are_told(tmp_path):
 def test_an_export_replaces_its_own_files_alone(tmp_path):
     """Before, a program beside the kernel that it imports was deleted by the next export."""
     exported(PerformanceMap.load(map_path("ensenso-n10")), tmp_path)
-    (tmp_path / "kernel/__pycache__").mkdir()
+    (tmp_path / "kernel/my_simulator.py").write_text("import sensor_map")
     export("map", "kinect-v2", "-o", tmp_path / "kernel")
     assert "kinect-v2" in (tmp_path / "kernel/README.md").read_text()
-    (tmp_path / "kernel/my_simulator.py").write_text("import sensor_map")
-    with pytest.raises(InputError, match=r"which has my_simulator\.py; allowed: a new folder, or one with map\.npz"):
-        export("map", "ensenso-n10", "-o", tmp_path / "kernel")
-    assert (tmp_path / "kernel/my_simulator.py").exists()
-    assert "kinect-v2" in (tmp_path / "kernel/README.md").read_text()
+    assert (tmp_path / "kernel/my_simulator.py").read_text() == "import sensor_map"
