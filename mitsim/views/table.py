@@ -140,6 +140,8 @@ class ViewsTable(Document):
             raise ValueError("either standoff_mm or standoffs_mm, not both")
         if any(b <= a for a, b in itertools.pairwise(self.standoffs_mm or [])):
             raise ValueError("standoffs_mm in ascending order")
+        if len({round(roll % 360, 6) % 360 for roll in self.rolls_deg}) < len(self.rolls_deg):
+            raise ValueError("rolls_deg that differ, and not by whole turns: each would be the same view again")
         if np.linalg.norm(self.up) < 1e-9:
             raise ValueError("a direction up that is not zero")
         if self.stage is not None and len(self.stage.axes) == 2 and "rolls_deg" in self.model_fields_set:

@@ -190,6 +190,8 @@ def test_as_many_views_as_there_are_take_seconds(n10):
         ({"standoff_mm": 500, "standoffs_mm": [500, 600]}, "", "not both"),
         ({"standoffs_mm": []}, "standoffs_mm", "at least 1"),
         ({"standoffs_mm": [600, 500]}, "standoffs_mm", "standoffs_mm in ascending order"),
+        ({"rolls_deg": [0, 90, 0]}, "rolls_deg", "rolls_deg that differ"),
+        ({"rolls_deg": [-90, 270]}, "rolls_deg", "not by whole turns"),
         ({"standoffs_mm": [500, 30]}, "standoffs_mm.1", "greater than or equal to 50"),
         ({"subdivisions": 5}, "subdivisions", "less than or equal to 4"),
         ({"up": [0, 0, 0]}, "", "not zero"),
