@@ -279,7 +279,8 @@ def from_azure_kinect(file: Path, table: Any, size: _Size | None) -> dict[str, A
         named = dict(zip(_AZURE, _numbers(file, inner, "ModelParameters", len(_AZURE)).tolist(), strict=True))
         if not model.endswith("BrownConrady") or named.pop("codx") or named.pop("cody"):
             raise InputError(file, "ModelType", model, "CALIBRATION_LensDistortionModelBrownConrady around cx and cy")
-        wide, high = (_numbers(file, camera, f"Sensor{side}", 1)[0] for side in ("Width", "Height"))
+        wide, high = (float(_numbers(file, camera, f"Sensor{side}", 1)[0]) for side in ("Width", "Height"))
+        modes: dict[_Size, tuple[tuple[float, float], tuple[float, float]]]
         if str(camera.get("Purpose")).endswith("Depth"):
             if (wide, high) != (1024, 1024):
                 raise InputError(file, "SensorWidth, SensorHeight", f"{wide:g} x {high:g}", "1024 x 1024 of depth")
