@@ -137,7 +137,7 @@ def _of_size(file: Path, cameras: Mapping[_Size, _Cameras], size: _Size | None) 
     """Return the cameras of images of a size."""
     if size is None and len(cameras) == 1:
         return next(iter(cameras.values()))
-    if size not in cameras:
+    if size is None or size not in cameras:
         found = "images of unknown size" if size is None else f"images of {size[0]} x {size[1]} px"
         allowed = " or ".join(f"{width} x {height}" for width, height in cameras) + " px, the sizes of its cameras"
         hint = (

@@ -79,8 +79,8 @@ def read_documents(file: Path, size: tuple[int, int] | None = None) -> list[dict
         except Exception as error:
             raise InputError(file, "", f"a file that NumPy cannot read ({error})", _KINDS) from None
     data = _unpacked(file, data)
-    plain = file.suffix.lower() == ".cameramodel" or not data.lstrip().startswith((b"%YAML", b"<", b"{"))
-    if file.suffix.lower() in _TEXTS and plain:
+    own_form = file.suffix.lower() == ".cameramodel" or not data.lstrip().startswith((b"%YAML", b"<", b"{"))
+    if file.suffix.lower() in _TEXTS and own_form:
         return [from_text(file, data, size)]
     ending = file.with_suffix("").suffix.lower() if file.suffix.lower() == ".gz" else file.suffix.lower()
     of_opencv = data.lstrip().startswith(b"%YAML:1.0")
