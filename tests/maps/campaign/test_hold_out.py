@@ -18,7 +18,7 @@ from mitsim.maps.campaign.hold_out import (
     LARGEST_SIGMA_ERROR,
     MOST_REPEATS,
     _map,
-    compare,
+    compared,
     distances_between,
     held_out_campaign,
     held_out_orders,
@@ -26,6 +26,7 @@ from mitsim.maps.campaign.hold_out import (
     hold_out_order,
     random_normals,
 )
+from mitsim.maps.campaign.orders import PreparedSensor
 
 MAPS = Path(__file__).parents[3] / "scenes" / "coupon" / "maps.toml"
 
@@ -40,6 +41,7 @@ def held(n10, shipped):
     """How a coupon of a roughness, tilted so far, is held against the map: the pair, and how often it was taken."""
     plan = held_out_campaign(MAPS, n10, shipped)
     source = simulated_source(SimulatedSensor(n10), plan.file.samples_per_pixel)
+    prepared = PreparedSensor(n10)
 
     def hold(roughness, tilt_deg, repeats, distance=635):
         like = next(
@@ -55,7 +57,7 @@ def held(n10, shipped):
             return source(shot)
 
         shot = plan.shot(like.series, np.array([math.sin(tilt), 0.0, math.cos(tilt)]))
-        (pair,) = compare(plan, shipped, [shot], take, repeats)
+        pair = compared(shot, prepared, shipped, take, repeats)
         assert len(set(taken)) == len(taken)  # fresh noise
         return pair, len(taken)
 
@@ -95,7 +97,7 @@ def test_an_order_gives_what_this_process_gives(n10, shipped):
     plan = held_out_campaign(MAPS, n10, shipped)
     shots = [shot for shot in held_out_shots(plan, 1, seed=3) if abs(shot.series.distance - 635) < 1][:1]
     source = simulated_source(SimulatedSensor(n10), plan.file.samples_per_pixel)
-    (here,) = compare(plan, shipped, shots, source, 1)
+    here = compared(shots[0], PreparedSensor(n10), shipped, source, 1)
     (order,) = held_out_orders(plan, shots, map_path("ensenso-n10"), 1)
     there = hold_out_order(pickle.loads(pickle.dumps(order)))
     assert there.measured == here.measured and there.predicted == here.predicted
