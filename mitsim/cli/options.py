@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -123,16 +124,19 @@ def print_reasons(cloud: PointCloud) -> None:
 
 
 class Command(TyperCommand):
-    """A command that refuses numbers that are not finite, which pass options without limits."""
+    """A command that refuses numbers that are not finite, and empty paths, which pass options without limits."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments, and check their numbers."""
+        """Parse the arguments, and check their numbers and paths."""
+        empty = "." not in args and any(not word or re.fullmatch("--.+=", word) for word in args)
         remaining = list(super().parse_args(ctx, args))
         for parameter in self.params:
             value = ctx.params.get(parameter.name)
             for number in value if isinstance(value, (list, tuple)) else (value,):
                 if isinstance(number, float) and not math.isfinite(number):
                     raise InputError(max(parameter.opts, key=len), "", f"{number}", "a finite number")
+                if empty and number == Path():  # of an unset variable of a shell, not meant as the current folder
+                    raise InputError(max(parameter.opts, key=len), "", "an empty text", "a path; . is this folder")
         return remaining
 
 
@@ -312,5 +316,7 @@ def check_folder(folder: Path, locked: bool = True) -> None:
 def check_new_folder(folder: Path) -> None:
     """Check that a folder can be moved to its place, in one step, and lock it until the command ends."""
     folder = pointed_to(folder).absolute()
+    if folder.exists() and not folder.is_dir():
+        raise InputError("--output", "", f"{folder}, which is no folder", "a new folder")
     check_folder(folder.parent, locked=False)
     lock_until_end(folder, whole=True)

@@ -54,3 +54,28 @@ def test_a_number_that_is_not_finite_is_refused(words, command, parameter, value
         assert str(done.exception) == f"{option}: found {value}; allowed: a finite number"
     else:
         assert done.exit_code == 2 and f"Invalid value for '{option}'" in done.stderr  # a limit of the option
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "option"),
+    [
+        ("map compare", ["ensenso-n10", "-o", ""], "--output"),
+        ("export map", ["ensenso-n10", "--output="], "--output"),
+        ("check", ["part.xml", "--pose", ""], "--pose"),
+        ("report", [""], "folder"),
+        ("measure clouds", ["a.ply", "", "--plane", "a"], "inputs"),
+    ],
+)
+def test_an_empty_path_is_refused(command, arguments, option):
+    """Before, the empty text of an unset variable of a shell was the current folder, into which exports then went."""
+    commands = {" ".join(words): one for words, one in commands_of(get_command(app))}
+    with pytest.raises(InputError) as caught:
+        commands[command].make_context(command, list(arguments))
+    assert str(caught.value) == f"{option}: found an empty text; allowed: a path; . is this folder"
+    here = [word or "." for word in arguments if word != "--output="]
+    assert commands[command].make_context(command, here if len(here) == len(arguments) else [*here, "-o", "."])
+
+
+def test_a_text_may_be_empty():
+    commands = {" ".join(words): one for words, one in commands_of(get_command(app))}
+    assert commands["export map"].make_context("map", ["ensenso-n10", "-o", "kernel", "--sensor", ""])

@@ -239,6 +239,13 @@ def test_two_commands_do_not_make_one_folder(tmp_path):
     assert not list(tmp_path.glob(".*"))
 
 
+@pytest.mark.parametrize("call", [("export", "map", "ensenso-n10"), ("part", "box.stl")])
+def test_a_file_in_place_of_a_new_folder_is_told(tmp_path, call):
+    (tmp_path / "file").write_text("mine")
+    told = mitsim_here(*call, "-o", "file", cwd=tmp_path, code=2).stderr
+    assert told.startswith(f"mitsim: --output: found {tmp_path / 'file'}, which is no folder")
+
+
 def test_a_command_that_refuses_its_input_leaves_no_folder(tmp_path):
     """Before, it left the empty folder, and those above it."""
     mitsim_here("study", "score", tmp_path / "no.toml", "-o", tmp_path / "runs" / "first", code=2)
