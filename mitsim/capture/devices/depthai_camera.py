@@ -137,7 +137,7 @@ def depthai() -> Any:
     """Import the package without its log messages, or raise an error with the installation command."""
     os.environ.setdefault("DEPTHAI_LEVEL", "error")  # it warns if there is no USB bus
     os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")  # mitsim handles Ctrl-C
-    return imported_package("depthai", "depthai", "DepthAI cameras", "depthai")
+    return imported_package("depthai", "depthai", "DepthAI cameras", "pip install 'mitsim[depthai]'")
 
 
 def stereo_pipeline(pipeline: Any, settings: DepthaiSettings, dai: Any) -> Any:

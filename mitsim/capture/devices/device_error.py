@@ -24,13 +24,12 @@ class DeviceError(MissingEnvironmentError):
         return type(self), (self.where, self.operation, self.found, self.expected, self.hint)
 
 
-def imported_package(name: str, package: str, users: str, extra: str) -> Any:
-    """Import a module of a package, or raise an error with the installation command."""
+def imported_package(name: str, package: str, users: str, command: str) -> Any:
+    """Import a module of a package, or raise an error with the command that installs it."""
     try:
         return import_module(name)
     except ImportError:
-        hint = f"pip install 'mitsim[{extra}]'"
-        raise MissingEnvironmentError(f"{users} need {package}, which is not installed: {hint}") from None
+        raise MissingEnvironmentError(f"{users} need {package}, which is not installed: {command}") from None
 
 
 def check_open(where: str, operation: str, closed: bool, fault: str, again: str = "Open it again") -> None:

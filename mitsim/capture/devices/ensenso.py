@@ -234,7 +234,7 @@ def open_ensenso(serial: str, settings: EnsensoSettings) -> EnsensoCamera:
     NxLib's shared library is that of the SDK, or of ``NXLIB_LIBRARY_PATH``. Raises MissingEnvironmentError without the
     package ``ensenso-nxlib``, DeviceError without the SDK, or if the camera cannot be opened or rejects the settings.
     """
-    nxlib = imported_package("nxlib", "ensenso-nxlib", "Ensenso cameras", "ensenso")
+    nxlib = imported_package("nxlib", "ensenso-nxlib", "Ensenso cameras", "pip install 'mitsim[ensenso]'")
     try:
         return EnsensoCamera(serial, settings, nxlib)
     except OSError as error:  # CDLL's

@@ -171,7 +171,7 @@ def open_line(port: str, baud: int, where: str) -> SerialLine:
     ``rfc2217://host:port``), for which ``baud`` may have no effect. Raises DeviceError if the port does not open,
     InputError if its name is invalid, MissingEnvironmentError without pyserial.
     """
-    serial = imported_package("serial", "pyserial", "stages", "hardware")
+    serial = imported_package("serial", "pyserial", "stages", 'pip install "mitsim[hardware]"')
     try:
         opened = serial.serial_for_url(port, baud, timeout=TICK_S, write_timeout=WRITE_S, exclusive=True)
     except ValueError as error:
