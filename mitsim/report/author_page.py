@@ -162,7 +162,8 @@ def _measures(corners: np.ndarray) -> dict[str, Any]:
     """Return a point on the surface near the centre, the box and the area of triangles (n, 3, 3)."""
     if not len(corners):
         return {"anchor": None, "size": [0.0, 0.0, 0.0], "area": 0.0}
-    areas, middles = trimesh.triangles.area(corners), corners.mean(axis=1)
+    areas = trimesh.triangles.area(corners)  # type: ignore[no-untyped-call]
+    middles = corners.mean(axis=1)
     middle = areas @ middles / max(float(areas.sum()), 1e-12)
     anchor = middles[int(np.linalg.norm(middles - middle, axis=1).argmin())]
     size = np.ptp(corners.reshape(-1, 3), axis=0)
