@@ -310,7 +310,7 @@ def check_folder(folder: Path, locked: bool = True) -> None:
     if not os.access(folder, os.W_OK):
         raise InputError("--output", "", f"{folder}, which is not writable", "a writable folder")
     if locked:
-        lock_until_end(folder.resolve())
+        lock_until_end(pointed_to(folder).absolute())
 
 
 def check_new_folder(folder: Path) -> None:

@@ -108,12 +108,12 @@ def render(
     pose = options.pose_of(position, target, roll, chosen)
     origin = origin_of(scene, chosen, defined)
     digest = CaptureJob(chosen, str(scene), "", 0, pose, settings, origin).digest()
+    options.check_new_folder(output)  # what a killed process left beside it goes too
     if digest_of(output, "render") == digest:
         read_capture(output)
         say(f"capture: {output}, finished before")
         return
     check_free(output)
-    options.check_new_folder(output)
     rendering = Rendering.smoothed(samples, depth, smoothing)
     capture = render_capture(
         loaded, chosen, pose, seed=seed, samples=samples, depth=depth, smoothing_px=smoothing, noise=noise, check=False

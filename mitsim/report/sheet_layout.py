@@ -108,12 +108,26 @@ class Page:
         return self.place - MARGIN - FOOT
 
     def put(self, left: float, text: str, size: float, colour: str = INK, weight: str = "normal") -> None:
-        """Write one line of a size [pt], its top at ``place``, ``left`` [in] from the margin."""
+        """Write one line, its top at ``place``.
+
+        Parameters
+        ----------
+        left, text
+            Distance from the margin [in], and the line.
+        size, colour, weight
+            Of the font; the size in pt.
+        """
         x, y = (MARGIN + left) / WIDTH, self.place / HEIGHT
         self.figure.text(x, y, text, fontsize=size, color=colour, fontweight=weight, va="top")
 
     def write(self, text: str, size: float, colour: str = INK, weight: str = "normal") -> None:
-        """Write wrapped lines of a size [pt], and move down by each."""
+        """Write wrapped lines, and move down by each.
+
+        Parameters
+        ----------
+        text, size, colour, weight
+            The text, and its font; the size in pt.
+        """
         for line in wrapped(text, size, ACROSS, weight):
             self.put(0, line, size, colour, weight)
             self.place -= size * LINE

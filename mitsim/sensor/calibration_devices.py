@@ -130,7 +130,8 @@ def from_text(file: Path, data: bytes, size: _Size | None) -> dict[str, Any]:
     alone = vector([word for line in lines for word in line.replace(",", " ").split()])
     if alone is not None and len(alone) in (9, 16):
         return {"K": alone.reshape(math.isqrt(len(alone)), -1)}
-    raise InputError(file, "", "text of another form", FORMS, "write its numbers as [cameras.NAME] of a TOML")
+    hint = "write its numbers as JSON or YAML under the usual names: cam_K, proj_K, R, T and so on"
+    raise InputError(file, "", "text of another form", FORMS, hint)
 
 
 def _of_size(file: Path, cameras: Mapping[_Size, _Cameras], size: _Size | None) -> _Cameras:
