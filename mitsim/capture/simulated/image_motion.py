@@ -41,15 +41,12 @@ def image_motion(
     points, roi
         (n, 3) of the part [mm], world frame; region of the images.
     """
-    first = before.project(world_from_sensor.inverse().points(points))
-    second = after.project(other_world_from_sensor.inverse().points(points))
-    seen = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
-    if seen.sum() < _FEWEST:
-        return None
     corner = [roi.left, roi.top]
-    known = np.column_stack([second[seen] - corner, np.ones(seen.sum())])
-    solved, _, rank, _ = np.linalg.lstsq(known, first[seen] - corner, rcond=None)
-    return np.asarray(solved.T) if rank == known.shape[1] else None
+    first, second = (
+        camera.project(pose.inverse().points(points)) - corner
+        for camera, pose in ((before, world_from_sensor), (after, other_world_from_sensor))
+    )
+    return _affine(second, first)
 
 
 def code_motion(
@@ -76,13 +73,21 @@ def code_motion(
     --------
     image_motion : the motion in an image; None likewise
     """
-    whole = Roi(0, 0, before.width, before.height)
-    pixels = image_motion(after, other_world_from_sensor, before, world_from_sensor, points, whole)
-    if pixels is None:
+    first, second = (
+        (projector.project(pose.inverse().points(points)) + 0.5) / [projector.width, projector.height]
+        for projector, pose in ((before, world_from_sensor), (after, other_world_from_sensor))
+    )
+    return _affine(first, second)
+
+
+def _affine(points: NDArray[np.float64], images: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return the affine map (2, 3) of points (n, 2) to their images by least squares; None of too few finite pairs."""
+    seen = np.isfinite(points).all(axis=1) & np.isfinite(images).all(axis=1)
+    if seen.sum() < _FEWEST:
         return None
-    size = np.array([before.width, before.height])
-    turn = pixels[:, :2] * size / size[:, None]
-    return np.column_stack([turn, (pixels[:, 2] + 0.5 - pixels[:, :2] @ [0.5, 0.5]) / size])
+    known = np.column_stack([points[seen], np.ones(seen.sum())])
+    solved, _, rank, _ = np.linalg.lstsq(known, images[seen], rcond=None)
+    return np.asarray(solved.T) if rank == known.shape[1] else None
 
 
 def moved_images(images: NDArray[np.float32], motion: NDArray[np.float64] | None) -> NDArray[np.float32]:

@@ -322,10 +322,10 @@ class RenderedMeasurements:
 
         They are rendered from a pose, or on the kept paths, with the code of the pose in the images of the nominal one.
         """
-        images, projector = {}, simulated.patterns.projector.optics
-        codes = code_motion(
-            self.simulated.patterns.projector.optics, view.world_from_sensor, projector, pose, self.hull
-        )
+        images, codes = {}, None
+        if shared.kept:
+            nominal, true = (sensor.patterns.projector.optics for sensor in (self.simulated, simulated))
+            codes = code_motion(nominal, view.world_from_sensor, true, pose, self.hull)
         for index, (name, roi) in enumerate(shared.rois.items()):
             if self.rendering.depth == 1:
                 images[name] = np.zeros((0, roi.height, roi.width), np.float32)
