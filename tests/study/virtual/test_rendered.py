@@ -41,6 +41,7 @@ from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.stated import budget_groups
 from mitsim.study.virtual.study_unknowns import EXPANSION_PER_KELVIN, study_unknowns
+from mitsim.study.virtual.view_light import LightOfViews
 from mitsim.study.virtual.world import Trial
 from tests.smaller_sensors import binned, coarse_sensor, middle_part
 
@@ -438,19 +439,30 @@ def test_a_trial_does_not_depend_on_those_before_it(coarse_n10):
 
 
 def test_interreflections_of_a_trial_are_those_of_its_finish(coarse_n10):
-    """Kept paths against a rendering of the same finish at 256 paths a pixel, light of the whole region within 3 %."""
+    """Kept paths, the mean of three sets, against a rendering of the same finish at 256 paths a pixel: within 2.5 %.
+
+    Light of the whole region of one set, of few pixels here, has a standard deviation of 1.2 %.
+    """
     study = metal_study(coarse_n10)
-    maker, view = measurements_of(study, study_unknowns(study)), study.views[0]
-    shared = maker._view_light(view)
-    for day in range(3):
-        drawn = maker.unknowns.draw(Trial(day))
+    view, maker = study.views[0], measurements_of(study, study_unknowns(study))
+    pose, draws = view.world_from_sensor, [maker.unknowns.draw(Trial(day)) for day in range(3)]
+    kept, rendered = np.zeros((2, len(draws), len(maker.simulated.rays)))
+    for seed in (1, 2, 3):
+        maker.unknowns, maker.views = replace(maker.unknowns, seed=seed), LightOfViews()
+        shared = maker._view_light(view)
+        for row, drawn in zip(kept, draws, strict=True):
+            scene = maker.part.in_finish(drawn.finish)[0]
+            row += [
+                images.sum() / 3
+                for images in maker._indirect(maker.simulated, scene, pose, view, drawn, shared).values()
+            ]
+    for day, (row, drawn) in enumerate(zip(rendered, draws, strict=True)):
         scene = maker.part.in_finish(drawn.finish)[0]
-        kept = maker._indirect(maker.simulated, scene, view.world_from_sensor, view, drawn, shared)
-        for name, images in kept.items():
-            rendered = maker.simulated.indirect_radiance(
-                scene, view.world_from_sensor, name, IndirectLight(256, 1.5), seed=day, depth=2, roi=shared.rois[name]
-            )
-            assert images.sum() == pytest.approx(rendered.sum(), rel=0.03)
+        for column, name in enumerate(shared.rois):
+            row[column] = maker.simulated.indirect_radiance(
+                scene, pose, name, IndirectLight(256, 1.5), seed=day, depth=2, roi=shared.rois[name]
+            ).sum()
+    np.testing.assert_allclose(kept, rendered, rtol=0.025)
 
 
 def test_the_finish_of_a_trial_holds_after_trials_with_other_light_paths(coarse_n10):
