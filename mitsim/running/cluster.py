@@ -52,6 +52,8 @@ class Cluster:
     certificates are missing, or no scheduler answers.
     """
 
+    on_this_machine = False
+
     def __init__(self, address: str) -> None:
         self.address, self.client = address, connected(address)
         self.given_up: Callable[[], bool] = stopped_by_user

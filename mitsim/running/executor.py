@@ -56,10 +56,12 @@ _GROUP_FILES = (
 class Executor(Protocol):
     """Distributes work: :class:`Pool`, or :class:`mitsim.running.cluster.Cluster`.
 
-    ``given_up`` says whether to give up the orders in work, whose results are then lost: by default after the first
-    Ctrl-C of a command that ends in order; see :func:`giving_up`.
+    ``on_this_machine``: whether all workers read the files of this machine. ``given_up`` says whether to give up the
+    orders in work, whose results are then lost: by default after the first Ctrl-C of a command that ends in order; see
+    :func:`giving_up`.
     """
 
+    on_this_machine: bool
     given_up: Callable[[], bool]
 
     def distribute(
@@ -152,6 +154,8 @@ def finished_orders(
 
 class Pool:
     """Processes on this machine, each with its share of the cores."""
+
+    on_this_machine = True
 
     def __init__(self, processes: int) -> None:
         self.processes = processes

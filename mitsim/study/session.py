@@ -118,7 +118,7 @@ class Session:
         """Return the maker of the trials, workers or this process, which is quicker for clouds of a map."""
         if self.workers is None or self.renderer is None:
             return self.measurements
-        return SpreadMeasurements(self.workers, self.renderer, self.digest)
+        return SpreadMeasurements(self.workers, self.renderer, self.digest, self._folder)
 
     @cached_property
     def trials(self) -> TrialFolder:

@@ -46,7 +46,7 @@ def print_noise(name: str, number: int, trials: int) -> None:
     maker = measurements_of(study, study_unknowns(study))
     view, simulated = study.view(number, "--view"), maker.simulated
     finishes = [maker.part.bsdfs(one) for one in (-1, *_PROBING_FINISHES)]
-    rois, pose = maker._view_light(view).rois, view.world_from_sensor
+    rois, pose = maker.view_light(view).rois, view.world_from_sensor
     camera = next(iter(rois))
     seeds = [keep_light(simulated, study.scene, pose, rois, maker.rendering, finishes, seed)[camera] for seed in (1, 2)]
     without = []

@@ -51,7 +51,7 @@ def rows(cases: str, name: str, number: int, seeds: int, smoothings: list[float]
         for seed in range(1, seeds + 1):
             other = maker.rendered_as(replace(rendering, samples=rendering.samples + seed))  # with light of its own
             other.unknowns = replace(unknowns, seed=seed)
-            kept = next(iter(other._view_light(view).kept.values()))
+            kept = next(iter(other.view_light(view).kept.values()))
             finishes = [-1, *(unknowns.draw(trial).finish for trial in trials)]
             images.append([kept.images(maker.part.in_finish(each)[0], maker.simulated) for each in finishes])
         spread, mean = np.std(images, axis=0, ddof=1), np.mean(images, axis=0)

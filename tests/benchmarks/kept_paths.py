@@ -52,7 +52,7 @@ def rows(path: Path, name: str, number: int, most_pixels: int | None):
     study = open_study(path, read_toml(path, StudyFile).model_copy(update={"sensor": name}))
     maker = measurements_of(study, study_unknowns(study))
     simulated, sensor, view = maker.simulated, study.sensor, study.view(number, "--view")
-    pose, rois, rendering = view.world_from_sensor, maker._view_light(view).rois, maker.rendering
+    pose, rois, rendering = view.world_from_sensor, maker.view_light(view).rois, maker.rendering
     if most_pixels is not None:
         rendering = replace(rendering, kept=replace(rendering.kept, most_pixels=most_pixels))
     finishes = [maker.part.bsdfs(number) for number in (-1, 101, 102, 103, 104)]

@@ -49,7 +49,7 @@ def main() -> None:
             seconds.append(time.process_time() - start)
         light = float(np.mean([np.mean(images) for images in lit.light.radiance.values()]))
         whole = whole or light
-        size = maker._view_light(view).bytes / 1e6
+        size = maker.view_light(view).bytes / 1e6
         print(f"{surfaces:8} {light / whole:8.4f} {seconds[0]:10.2f} {seconds[1]:9.2f} {size:11.0f}", flush=True)
 
 

@@ -75,7 +75,7 @@ def row(name: str, count: int) -> str:
     list(maker.run([Job(view, Trial(day)) for day in range(2)]))  # compiles
     maker.views = LightOfViews()
     began = time.perf_counter()
-    maker._view_light(view)
+    maker.view_light(view)
     paths = time.perf_counter() - began
     places = [
         timed(maker.part, "in_finish", "finish"),

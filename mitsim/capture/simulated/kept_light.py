@@ -8,7 +8,7 @@ over the pixels of one shape -> images.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,7 @@ from scipy.ndimage import binary_dilation
 
 from characterisation.files.threads import in_threads
 from characterisation.region_of_interest import Roi
-from mitsim.capture.simulated.indirect_light import Smoothing
+from mitsim.capture.simulated.indirect_light import KeptSettings, Smoothing
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.scene.light_transport.kept_paths import CandidatePaths, KeptPaths, broad, mattering
@@ -91,9 +91,12 @@ def keep_light(
         :func:`~mitsim.scene.light_transport.plain_scene.distinct_bsdfs`. Paths are kept by their light in these.
     seed
         Of all random numbers.
+
+    See Also
+    --------
+    light_on_paths : the same, of paths that were traced before
     """
     bsdfs = distinct_bsdfs(scene)
-    assert rendering.kept is not None
     assert bsdfs is not None  # can_be_kept
     described = {
         shape.bsdf().id(): finish.description
@@ -103,12 +106,9 @@ def keep_light(
     drawn = [number if bsdf.id() in described else -1 for number, bsdf in enumerate(bsdfs)]
     sampled = [bsdf_of(broad(described[bsdf.id()])) if bsdf.id() in described else bsdf for bsdf in bsdfs]
     turned = [any(is_turned(finish[number]) for finish in finishes) for number in range(len(bsdfs))]
-    out = {}
+    traced = {}
     for index, (camera, roi) in enumerate(rois.items()):
-        shape = shapes_met(scene, simulated.pixel_rays(camera).within(roi), world_from_sensor)
-        # a pixel at the edge of the part may see it although its centre does not
-        pixels = np.flatnonzero(binary_dilation(shape >= 0, np.ones((3, 3))))
-        settings = rendering.kept.for_pixels(len(pixels))
+        pixels, settings = _lit_pixels(_shapes(simulated, scene, world_from_sensor, camera, roi), rendering)
         photons = int(np.ceil(np.sqrt(settings.photons * settings.samples * len(pixels)))) ** 2
         own = int(np.random.SeedSequence([seed, index]).generate_state(1)[0])
         tracing = Tracing(settings.samples, photons, rendering.depth, own, drawn, sampled, turned)
@@ -117,6 +117,34 @@ def keep_light(
         if len(pixels):
             tracer = Tracer(scene, rays, projector, world_from_sensor, roi, tracing)
             candidates += [*camera_paths(tracer, pixels), *photon_paths(tracer)]
-        paths = KeptPaths(mattering(candidates, finishes, roi, settings.kept * len(pixels), own), roi)
-        out[camera] = KeptLight(paths, Smoothing.of(shape, settings.smoothing_px), simulated.sensor.ambient_image)
+        traced[camera] = KeptPaths.of(mattering(candidates, finishes, roi, settings.kept * len(pixels), own), roi)
+    return light_on_paths(simulated, scene, world_from_sensor, traced, rendering)
+
+
+def light_on_paths(
+    simulated: SimulatedSensor,
+    scene: Scene,
+    world_from_sensor: Transform,
+    traced: Mapping[str, KeptPaths],
+    rendering: Rendering,
+) -> dict[str, KeptLight]:
+    """Return the light of each camera on its traced paths; the other arguments are those of :func:`keep_light`."""
+    out, ambient = {}, simulated.sensor.ambient_image
+    for camera, paths in traced.items():
+        shape = _shapes(simulated, scene, world_from_sensor, camera, paths.roi)
+        out[camera] = KeptLight(paths, Smoothing.of(shape, _lit_pixels(shape, rendering)[1].smoothing_px), ambient)
     return out
+
+
+def _shapes(
+    simulated: SimulatedSensor, scene: Scene, world_from_sensor: Transform, camera: str, roi: Roi
+) -> NDArray[np.integer]:
+    return shapes_met(scene, simulated.pixel_rays(camera).within(roi), world_from_sensor)
+
+
+def _lit_pixels(shape: NDArray[np.integer], rendering: Rendering) -> tuple[NDArray[np.integer], KeptSettings]:
+    """Return the indices of the pixels that may see the part, and the settings for their number."""
+    assert rendering.kept is not None
+    # a pixel at the edge of the part may see it although its centre does not
+    pixels = np.flatnonzero(binary_dilation(shape >= 0, np.ones((3, 3))))
+    return pixels, rendering.kept.for_pixels(len(pixels))

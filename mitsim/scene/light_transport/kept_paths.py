@@ -26,7 +26,7 @@ A material whose finish is never drawn, such as a stock BSDF of the scene's auth
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from characterisation.files.arrays import Singles
 from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
-from mitsim.scene.device import opaque, to_device
+from mitsim.scene.device import opaque, to_device, vectors_to_host
 from mitsim.scene.light_transport.low_discrepancy import z_positions
 from mitsim.scene.light_transport.projected_codes import ProjectedLight
 
@@ -93,23 +93,38 @@ class CandidatePaths:
 
 
 class Vertices:
-    """The surfaces of paths, sorted by material: their BSDFs are evaluated with one call for each material."""
+    """The surfaces of paths, sorted by material: their BSDFs are evaluated with one call for each material.
 
-    def __init__(self, material: NDArray[np.int16], toward: Singles) -> None:
+    ``counts`` are the numbers of surfaces by material, ``directions`` (6, n) their i and o.
+    """
+
+    def __init__(self, counts: Mapping[int, int], directions: Singles) -> None:
+        self._counts, self._parts, first = dict(counts), list[tuple[int, Any, Any]](), 0
+        for number, count in counts.items():
+            rows = directions[:, first : first + count]
+            self._parts.append((number, *[mi.Vector3f(*map(to_device, rows[k : k + 3])) for k in (0, 3)]))
+            first += count
+        self._count = 1 + first
+
+    @classmethod
+    def of(cls, material: NDArray[np.int16], toward: Singles) -> tuple[Vertices, NDArray[np.uint32]]:
+        """Return the surfaces of paths, and the indices (m, n) of the factor of each surface of a path."""
         flat = material.ravel()
         order = np.argsort(flat, kind="stable")
         order = order[np.searchsorted(flat[order], 0) :]
         index = np.zeros(len(flat), np.uint32)
         index[order] = np.arange(1, len(order) + 1, dtype=np.uint32)
-        #: index of the factor of each surface of a path, (m, n)
-        self.indices = index.reshape(material.shape).T
-        directions = toward.reshape(-1, 6)
-        self._parts: list[tuple[int, Any, Any]] = []
-        for number in np.unique(flat[order]).tolist():
-            rows = directions[order[flat[order] == number]]
-            incoming, outgoing = (mi.Vector3f(*[to_device(c) for c in rows[:, k : k + 3].T]) for k in (0, 3))
-            self._parts.append((number, incoming, outgoing))
-        self._count = 1 + len(order)
+        numbers, counts = np.unique(flat[order], return_counts=True)
+        directions = np.ascontiguousarray(toward.reshape(-1, 6)[order].T)
+        return cls(dict(zip(numbers.tolist(), counts.tolist(), strict=True)), directions), index.reshape(
+            material.shape
+        ).T
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return what the surfaces are made of, see :meth:`KeptPaths.arrays`."""
+        parts = [np.concatenate([vectors_to_host(each).T for each in part[1:]]) for part in self._parts]
+        directions = np.concatenate(parts, axis=1) if parts else np.empty((6, 0), np.float32)
+        return {"materials": np.array([*self._counts.items()], np.int64).reshape(-1, 2), "directions": directions}
 
     def __len__(self) -> int:
         return self._count
@@ -131,17 +146,40 @@ class Vertices:
 class KeptPaths:
     """The paths of one camera's region, ready on the device for any finish."""
 
-    def __init__(self, paths: CandidatePaths, roi: Roi) -> None:
-        self.roi, self.count = roi, len(paths)
-        self._vertices = Vertices(paths.material, paths.toward)
+    def __init__(self, arrays: Mapping[str, NDArray[Any]], roi: Roi) -> None:
+        self.roi, self.count = roi, len(arrays["weight"])
+        self._vertices = Vertices(dict(arrays["materials"].tolist()), arrays["directions"])
+        self._pixels = arrays["pixels"]
+        self._first, self._counts = mi.UInt32(arrays["first"]), mi.UInt32(arrays["counts"])
+        self._weight, self._length = to_device(arrays["weight"]), to_device(arrays["length"])
+        self._uv = mi.Point2f(*map(to_device, arrays["uv"]))
+        self._indices = [mi.UInt32(np.ascontiguousarray(indices)) for indices in arrays["indices"]]
+
+    @classmethod
+    def of(cls, paths: CandidatePaths, roi: Roi) -> KeptPaths:
+        """Return paths in the order of their pixels."""
         pixels, first, counts = np.unique(paths.pixel, return_index=True, return_counts=True)
         if len(paths) and (np.diff(paths.pixel) != 0).sum() + 1 != len(pixels):
             raise ValueError("paths of one pixel must follow one another")
-        self._pixels = pixels
-        self._first, self._counts = mi.UInt32(first.astype(np.uint32)), mi.UInt32(counts.astype(np.uint32))
-        self._weight = to_device(paths.weight)
-        self._uv, self._length = mi.Point2f(*[to_device(paths.code[:, k]) for k in (0, 1)]), to_device(paths.code[:, 2])
-        self._indices = [mi.UInt32(np.ascontiguousarray(indices)) for indices in self._vertices.indices]
+        vertices, indices = Vertices.of(paths.material, paths.toward)
+        code = np.ascontiguousarray(paths.code.T)
+        arrays: dict[str, NDArray[Any]] = {"pixels": pixels}
+        arrays |= {"first": first.astype(np.uint32), "counts": counts.astype(np.uint32)}
+        arrays |= {"weight": paths.weight, "uv": code[:2], "length": code[2], "indices": indices}
+        return cls(arrays | vertices.arrays(), roi)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return all that the paths are made of, for the same paths in another process."""
+        return {
+            "pixels": self._pixels,
+            "first": np.asarray(self._first),
+            "counts": np.asarray(self._counts),
+            "weight": np.asarray(self._weight),
+            "uv": np.stack([np.asarray(self._uv.x), np.asarray(self._uv.y)]),
+            "length": np.asarray(self._length),
+            "indices": np.stack([np.asarray(indices) for indices in self._indices]),
+            **self._vertices.arrays(),
+        }
 
     @property
     def bytes(self) -> int:
@@ -186,10 +224,10 @@ class KeptPaths:
 
 def light_of(paths: CandidatePaths, finishes: Sequence[Sequence[Any]]) -> Iterator[NDArray[np.float64]]:
     """Yield the radiance (n,) of each path for a code of 1, for the BSDFs of each of some drawn finishes."""
-    vertices = Vertices(paths.material, paths.toward)
+    vertices, indices = Vertices.of(paths.material, paths.toward)
     for bsdfs in finishes:
         factors = np.asarray(vertices.factors(bsdfs), np.float64)
-        yield np.asarray(paths.weight * factors[vertices.indices].prod(axis=0))
+        yield np.asarray(paths.weight * factors[indices].prod(axis=0))
 
 
 def mattering(

@@ -36,7 +36,7 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.exposing import LightOnImagers
 from mitsim.capture.simulated.image_motion import code_motion, image_motion, moved_images
 from mitsim.capture.simulated.indirect_light import IndirectLight
-from mitsim.capture.simulated.kept_light import KeptLight, can_be_kept, keep_light
+from mitsim.capture.simulated.kept_light import KeptLight, can_be_kept, keep_light, light_on_paths
 from mitsim.capture.simulated.render_residual import RenderResidual, residual_of
 from mitsim.capture.simulated.rendering import IndirectImages, Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
@@ -55,6 +55,7 @@ from mitsim.study.virtual.displacement import RealFaces
 from mitsim.study.virtual.drawn_decoder import drawn_decoder
 from mitsim.study.virtual.drawn_finish import DrawnPart
 from mitsim.study.virtual.form import measured_with_form
+from mitsim.study.virtual.light_file import read_light
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.trials import Outcome
 from mitsim.study.virtual.view_light import LightOfViews, ViewLight, regions, seen_surfaces
@@ -104,6 +105,7 @@ class RenderedMeasurements:
     def __init__(self, study: Study, unknowns: Unknowns, rendering: Rendering, separate_light: bool = False) -> None:
         self.study, self.unknowns, self.rendering, self.separate_light = study, unknowns, rendering, separate_light
         self.planned: PlannedExposure | None = None
+        self.light_file: str | None = None  # that of the light of the next view (mitsim/study/virtual/light_file.py)
         self.simulated = SimulatedSensor(study.sensor)
         self.geometry = sensor_geometry(study.sensor)
         self.predictor = Predictor.of_sensor(study.sensor, self.geometry)
@@ -180,7 +182,7 @@ class RenderedMeasurements:
         true, assumed = (motion.inverse() @ view.world_from_sensor for motion in (drawn.placed, drawn.assumed))
         sensor = self.simulated.recalibrated(drawn.rig, drawn.unit or None, self._mask(drawn.unit))
         pose = view.world_from_sensor
-        shared = self._shared(sensor, true, view, False) if self.separate_light else self._view_light(view)
+        shared = self._shared(sensor, true, view, False) if self.separate_light else self.view_light(view)
         scene, albedos = self.part.in_finish(drawn.finish)
         motions = {
             name: image_motion(self.simulated.rays[name].camera, pose, sensor.rays[name].camera, true, self.hull, roi)
@@ -214,7 +216,7 @@ class RenderedMeasurements:
         def radiance(offset: int, finer: int) -> NDArray[np.float32]:
             other = self.rendered_as(self.rendering.finer(finer))
             other.unknowns = replace(self.unknowns, seed=self.unknowns.seed + offset)
-            shared = ViewLight(rois, {}, other._kept(simulated, pose, view, rois) if self._keeps_paths else {})
+            shared = ViewLight(rois, {}, other._kept(simulated, pose, view, rois) if self.keeps_paths else {})
             scene, _ = self.part.in_finish(best.finish)  # after the paths are kept, which tries other finishes
             images = other._indirect(simulated, scene, pose, view, best, shared)
             rendering = other._with_indirect(images, rois)
@@ -273,13 +275,14 @@ class RenderedMeasurements:
             cloud, captured.drawn, captured.assumed, captured.surfaces, captured.labels, with_form
         )
 
-    def _view_light(self, view: View) -> ViewLight:
+    def view_light(self, view: View) -> ViewLight:
         """Return what all draws of a view share, made at its nominal pose and calibration on first use."""
-        make = partial(self._shared, self.simulated, view.world_from_sensor, view, self._keeps_paths)
+        make = partial(self._shared, self.simulated, view.world_from_sensor, view, self.keeps_paths)
         return self.views.of(view.number, make)
 
     @property
-    def _keeps_paths(self) -> bool:
+    def keeps_paths(self) -> bool:
+        """Whether all trials of a view share the paths of its interreflections."""
         return self.rendering.depth > 1 and self.rendering.kept is not None and can_be_kept(self.study.scene)
 
     @property
@@ -304,6 +307,9 @@ class RenderedMeasurements:
         self, simulated: SimulatedSensor, pose: Transform, view: View, rois: dict[str, Roi]
     ) -> dict[str, KeptLight]:
         """Return the paths of interreflections in regions of the images, from a pose of a view."""
+        traced = read_light(self.light_file, rois)
+        if traced is not None:
+            return light_on_paths(simulated, self.study.scene, pose, traced, self.rendering)
         numbers = (-1, *_PROBING_FINISHES) if "finish" in self.unknowns.varied else (-1,)
         finishes = [self.part.bsdfs(number) for number in numbers]
         seed = _seed_of(self.unknowns.seed, view.number)

@@ -15,7 +15,7 @@ import os
 import statistics
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -24,6 +24,7 @@ from mitsim.capture.simulated.rendering import Rendering
 from mitsim.running.executor import Executor, available_memory
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import StudyFile, open_study
+from mitsim.study.virtual.light_file import LightFile
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.trials import Outcome
@@ -51,15 +52,22 @@ class TrialOrder:
     jobs: tuple[Job, ...]
     rendering: Rendering
     planned: PlannedExposure | None = None
+    light: str | None = None  # file of the view's interreflections
 
 
 class SpreadMeasurements:
-    """Virtual measurements by workers, which prepare the study anew for another ``digest`` of all of a trial."""
+    """Virtual measurements by workers, which prepare the study anew for another ``digest`` of all of a trial.
+
+    If the workers are on this machine, this process traces the light of a view for all of them, in a ``folder``.
+    """
 
     source = "render"
 
-    def __init__(self, workers: Executor, renderer: RenderedMeasurements, digest: str) -> None:
+    def __init__(
+        self, workers: Executor, renderer: RenderedMeasurements, digest: str, folder: Path | None = None
+    ) -> None:
         self.workers, self.renderer = workers, renderer
+        self._light = LightFile(folder) if folder is not None and workers.on_this_machine else None
         self._seconds: deque[float] = deque(maxlen=_REMEMBERED)  # of a trial in the last orders
         path = str(Path(renderer.study.path).absolute())
         self._order = TrialOrder(
@@ -80,11 +88,26 @@ class SpreadMeasurements:
 
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, Outcome]]:
         """Yield the outcome of every virtual measurement, job by job as they arrive."""
-        orders = [replace(self._order, jobs=row) for row in self._rows(jobs)]
+        rows = list(self._rows(jobs))
+        order = replace(self._order, light=self._light_for(rows))
+        orders = [replace(order, jobs=row) for row in rows]
         made = self.workers.distribute(orders, lambda trial_order: trial_order, timed_trials, _light_of)
         for order, (outcomes, seconds) in made:
             self._seconds.append(seconds)
             yield from zip(order.jobs, outcomes, strict=True)
+
+    def _light_for(self, rows: Sequence[tuple[Job, ...]]) -> str | None:
+        """Return the file of the light that several orders of one view share; None where each worker traces its own.
+
+        The few paths of a race are not worth it.
+        """
+        renderer, views = self.renderer, {row[0].view.number for row in rows}
+        alone = len(rows) < 2 or len(views) > 1 or self._order.rendering != renderer.rendering
+        if self._light is None or alone or not renderer.keeps_paths or renderer.separate_light:
+            return None
+        view = rows[0][0].view
+        path = self._light.of(view.number, renderer.view_light(view).kept)
+        return None if path is None else str(path.absolute())
 
     def _rows(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, ...]]:
         """Yield runs of jobs of one view, each of at most :data:`_IN_A_ROW` or, of slow trials, :data:`_ORDER_S`."""
@@ -141,4 +164,5 @@ def make_trials(order: TrialOrder) -> list[Outcome]:
     if order.rendering != _prepared[order.digest].rendering:
         _prepared[order.digest] = _prepared[order.digest].rendered_as(order.rendering)
     renderer = _prepared[order.digest].exposed_as(order.planned)
+    renderer.light_file = order.light
     return [outcome for _, outcome in renderer.run(order.jobs)]

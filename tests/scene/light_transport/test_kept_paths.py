@@ -128,7 +128,7 @@ def test_kept_paths_have_the_mean_of_a_rendering_in_every_finish(corner, eyes):
         every, roi = candidates(corner, rays, light, seed)
         kept = mattering([every], finishes, roi, len(every) // 5, seed)
         assert abs(len(kept) - len(every) // 5) <= 1
-        paths = KeptPaths(kept, roi)
+        paths = KeptPaths.of(kept, roi)
         for found, bsdfs in zip(images, finishes, strict=True):
             found.append(light.images(list(paths.codes(bsdfs, light))))
     for name, found in zip(FINISHES, images, strict=True):
@@ -159,7 +159,7 @@ def test_the_same_seed_keeps_the_same_light_on_any_threads(corner):
     def seen(seed):
         every, roi = candidates(corner, rays, light, seed)
         bsdfs = distinct_bsdfs(corner)
-        return KeptPaths(mattering([every], [bsdfs], roi, 4000, seed), roi).codes(bsdfs, light)
+        return KeptPaths.of(mattering([every], [bsdfs], roi, 4000, seed), roi).codes(bsdfs, light)
 
     first = seen(3)
     with threads(1):
@@ -197,7 +197,7 @@ def test_a_scene_that_does_not_light_itself_keeps_nothing():
     every, roi = candidates(scene, rays, light, 1)
     bsdfs = distinct_bsdfs(scene)
     kept = mattering([every], [bsdfs], roi, 100, 1)
-    assert len(kept) == 0 and not KeptPaths(kept, roi).codes(bsdfs, light).any()
+    assert len(kept) == 0 and not KeptPaths.of(kept, roi).codes(bsdfs, light).any()
 
 
 def test_a_batch_of_photons_that_all_pass_beside_the_image_of_the_projector_is_no_light(corner, monkeypatch):

@@ -449,7 +449,7 @@ def test_interreflections_of_a_trial_are_those_of_its_finish(coarse_n10):
     kept, rendered = np.zeros((2, len(draws), len(maker.simulated.rays)))
     for seed in (1, 2, 3):
         maker.unknowns, maker.views = replace(maker.unknowns, seed=seed), LightOfViews()
-        shared = maker._view_light(view)
+        shared = maker.view_light(view)
         for row, drawn in zip(kept, draws, strict=True):
             scene = maker.part.in_finish(drawn.finish)[0]
             row += [
@@ -492,7 +492,7 @@ def test_scenes_whose_paths_cannot_be_kept_are_rendered_in_every_finish(coarse_n
     view = study.views[0]
     jobs = [Job(view, Trial(day)) for day in range(2)]
     maker, found = outcomes(study, *jobs)
-    assert not maker._view_light(view).kept
+    assert not maker.view_light(view).kept
     assert found[0] != found[1]
     np.testing.assert_equal(outcomes(study, jobs[1])[1], found[1:])
 
@@ -561,7 +561,7 @@ def test_the_rendered_region_contains_parts_that_turn():
     studies = [study_of("ensenso-n10", unknowns={"pose": {"placement_deg": degrees}}) for degrees in (5.0, 0.0)]
     makers = [measurements_of(study, replace(study_unknowns(study), varied=("pose",))) for study in studies]
     view, camera = studies[0].views[0], studies[0].sensor.rig.reference
-    regions = [maker._view_light(view).rois["left"] for maker in makers]
+    regions = [maker.view_light(view).rois["left"] for maker in makers]
     outside = np.zeros(2, int)
     for day in range(100):
         placed = makers[0].unknowns.draw(Trial(day)).placed

@@ -1,5 +1,6 @@
 """Workers make the trials of an order with the light paths that it names; called here as a worker calls it."""
 
+import gc
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ import pytest
 
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
+from mitsim.capture.simulated import kept_light
 from mitsim.study import StudyFile, open_study
 from mitsim.study.remedies.change import reopened
 from mitsim.study.session import Session
@@ -37,6 +39,8 @@ def study(tmp_path_factory):
 class _Here:
     """Workers that make each order in this process."""
 
+    on_this_machine = True
+
     def distribute(self, orders, _order, make, _prepared):
         return ((order, make(order)) for order in orders)
 
@@ -61,6 +65,51 @@ def test_the_race_has_fewer_paths_and_trials_of_its_own(study, tmp_path, monkeyp
     assert len(spread_out._prepared) == 1
     assert session.race_trials.digest != session.trials.digest
     assert session.race_trials.folder != session.trials.folder
+
+
+def test_the_light_of_a_view_is_traced_once_for_all_workers_of_this_machine(study, tmp_path, monkeypatch):
+    """A worker reads it in a file, traces the same if the file is damaged, and nothing of it is left."""
+    session, jobs = Session(study, tmp_path), [Job(study.views[1], Trial(day)) for day in range(6)]
+    expected = [outcome.errors for _, outcome in session.renderer.run(jobs)]
+    traced, files, camera_paths = [], [], kept_light.camera_paths
+
+    def counted(*args):
+        traced.append(args)
+        return camera_paths(*args)
+
+    class Workers(_Here):
+        damage = False
+
+        def distribute(self, orders, _order, make, _prepared):
+            for order in orders:
+                files.append(Path(order.light))
+                assert files[-1].is_file() and files[-1].parent == tmp_path
+                if self.damage:
+                    files[-1].write_bytes(files[-1].read_bytes()[:5000])
+                yield order, make(order)
+
+    monkeypatch.setattr(kept_light, "camera_paths", counted)
+    cameras = len(study.sensor.rig.cameras)
+    for damage, times in ((False, 1), (True, 2)):
+        monkeypatch.setattr(spread_out, "_prepared", {})
+        workers, session = Workers(), Session(study, tmp_path)
+        workers.damage = damage
+        spread = SpreadMeasurements(workers, session.renderer, session.digest, tmp_path)
+        found = [outcome.errors for _, outcome in spread.run(jobs)]
+        np.testing.assert_equal(found, expected)
+        assert len(traced) == times * cameras
+        traced.clear()
+    assert len(set(files)) == 1
+    del spread
+    gc.collect()
+    assert not files[0].exists()
+    # one order of a view, several views, and workers on other machines trace for themselves
+    views = [Job(study.views[number], Trial(day)) for number in (0, 1) for day in range(6)]
+    elsewhere = _Here()
+    elsewhere.on_this_machine = False
+    for workers, some in ((_Here(), jobs[:2]), (_Here(), views), (elsewhere, jobs)):
+        spread = SpreadMeasurements(workers, session.renderer, session.digest, tmp_path)
+        assert spread._light_for(list(spread._rows(some))) is None
 
 
 @pytest.mark.parametrize(("free_bytes", "kept"), [(1 << 50, True), (1 << 20, False)])
