@@ -121,6 +121,9 @@ def misstated(task: Task, measurement: str) -> tuple[str, str, str] | None:
     if asked.zone:
         allowed = f"features whose {asked.kind} is 0 in the model: that of {of} is {model:.6g} {asked.unit}"
         return "0", allowed, "correct the kind or the features"
+    if not np.isfinite(model):
+        allowed = f"features whose nominal geometry has this value: that of {of} has none"
+        return f"{asked.nominal:g}", allowed, "correct their directions, such as that of an axis along its plane"
     allowed = f"{model:.6g} {asked.unit}, from the geometry of {of}"
     low, high = asked.limits
     if not low <= model <= high:

@@ -9,7 +9,6 @@ this one is killed. A worker that cannot read it traces the paths itself; they a
 
 from __future__ import annotations
 
-import contextlib
 import os
 import weakref
 import zipfile
@@ -42,10 +41,12 @@ class LightFile:
             self._view, self._path = view, None
             path = self._folder / f".light_{view:04d}.{os.getpid()}-{HOST}.partial"
             self._remove = weakref.finalize(self, path.unlink, missing_ok=True)
-            with contextlib.suppress(OSError):  # such as a full disk
+            try:
                 self._folder.mkdir(parents=True, exist_ok=True)
                 _write(path, light)
                 self._path = path
+            except OSError:  # such as a full disk, whose space the trials need
+                self._remove()
         return self._path
 
 

@@ -362,6 +362,14 @@ def test_a_nominal_value_is_that_of_the_geometry_from_which_simulated_errors_are
         check_nominal_values(read_task(path), path)
 
 
+def test_a_nominal_value_that_the_geometry_does_not_have_is_refused_in_words(tmp_path):
+    """Pillars that lie along the plane do not meet it: the allowed value was nan."""
+    path = tmp_path / "task.toml"
+    path.write_text(GOOD.replace("[0.0, 0.0, 1.0]\nradius", "[1.0, 0.0, 0.0]\nradius"), encoding="utf-8")
+    with pytest.raises(InputError, match=r"that of plane, pillar1, pillar2 has none\. correct their directions"):
+        check_nominal_values(read_task(path), path)
+
+
 def test_a_zone_of_features_that_do_not_have_its_place_in_the_model_is_refused(tmp_path):
     path = tmp_path / "task.toml"
     outlined = GOOD.replace("[features.plane]", "[features.plane]\noutline_mm = [[0, 0, 0], [50, 0, 0], [0, 50, 0]]")

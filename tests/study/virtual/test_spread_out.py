@@ -14,7 +14,7 @@ from mitsim.capture.simulated import kept_light
 from mitsim.study import StudyFile, open_study
 from mitsim.study.remedies.change import reopened
 from mitsim.study.session import Session
-from mitsim.study.virtual import spread_out
+from mitsim.study.virtual import light_file, spread_out
 from mitsim.study.virtual.plan import race_rendering
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.spread_out import SpreadMeasurements
@@ -110,6 +110,19 @@ def test_the_light_of_a_view_is_traced_once_for_all_workers_of_this_machine(stud
     for workers, some in ((_Here(), jobs[:2]), (_Here(), views), (elsewhere, jobs)):
         spread = SpreadMeasurements(workers, session.renderer, session.digest, tmp_path)
         assert spread._light_for(list(spread._rows(some))) is None
+
+
+def test_light_that_does_not_fit_on_the_disk_is_no_file(study, tmp_path, monkeypatch):
+    def full(path, light):
+        path.write_bytes(b"some")
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(light_file, "_write", full)
+    session = Session(study, tmp_path)
+    spread = SpreadMeasurements(_Here(), session.renderer, session.digest, tmp_path)
+    rows = list(spread._rows([Job(study.views[1], Trial(day)) for day in range(6)]))
+    assert spread._light_for(rows) is None and spread._light_for(rows) is None
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(("free_bytes", "kept"), [(1 << 50, True), (1 << 20, False)])
