@@ -128,7 +128,19 @@ def light_on_paths(
     traced: Mapping[str, KeptPaths],
     rendering: Rendering,
 ) -> dict[str, KeptLight]:
-    """Return the light of each camera on its traced paths; the other arguments are those of :func:`keep_light`."""
+    """Return the light of each camera on its traced paths.
+
+    Parameters
+    ----------
+    simulated, scene, world_from_sensor, rendering
+        As of :func:`keep_light`, with which the paths were traced.
+    traced
+        The paths of each camera.
+
+    See Also
+    --------
+    keep_light : the same, with paths that it traces
+    """
     out, ambient = {}, simulated.sensor.ambient_image
     for camera, paths in traced.items():
         shape = _shapes(simulated, scene, world_from_sensor, camera, paths.roi)
