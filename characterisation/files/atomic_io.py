@@ -84,7 +84,7 @@ def atomic_folder(folder: str | Path) -> Iterator[Path]:
     Raises OSError as :func:`atomic_write`, or if ``folder`` exists and is not empty.
     """
     folder = pointed_to(folder).absolute()
-    partial = _beside(folder, "partial")
+    partial = beside(folder, "partial")
     try:
         with _naming(folder):
             partial.mkdir(parents=True)
@@ -100,9 +100,9 @@ def pointed_to(path: str | Path) -> Path:
     return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
-def _beside(folder: Path, kind: str) -> Path:
-    """Return a path beside a folder that no other process uses; :mod:`mitsim.cli.folder_lock` recognises its form."""
-    return folder.with_name(f".{folder.name}.{kind}-{os.getpid()}-{HOST}{uuid.uuid4().hex[:12]}")
+def beside(path: Path, kind: str) -> Path:
+    """Return a path beside another that nothing else uses; :mod:`mitsim.cli.folder_lock` recognises its form."""
+    return path.with_name(f".{path.name}.{kind}-{os.getpid()}-{HOST}{uuid.uuid4().hex[:12]}")
 
 
 def write_folder(folder: str | Path, files: Mapping[str, bytes], *, overwrite: Collection[str] = ()) -> None:
@@ -114,7 +114,7 @@ def write_folder(folder: str | Path, files: Mapping[str, bytes], *, overwrite: C
     and ``filename`` is ``folder``.
     """
     folder = pointed_to(folder).absolute()
-    partial, old = _beside(folder, "partial"), _beside(folder, "old")
+    partial, old = beside(folder, "partial"), beside(folder, "old")
     try:
         with _naming(folder):
             folder.parent.mkdir(parents=True, exist_ok=True)

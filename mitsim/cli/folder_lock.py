@@ -36,8 +36,9 @@ _STALE_S = 24 * 3600.0
 #: folders of a run in which files are written one by one
 _WITHIN = ("", "captures", "clouds", "coupons", "trials")
 
-#: folders that are runs, in that of a command: its own, those of the sensors of ``choose`` and of the samples of a talk
-_RUNS = ("", "*", "views/*")
+#: folders that are runs, in that of a command: its own, those of the sensors of ``choose`` and of samples of a talk,
+#: and those of the changes that are tried for each
+_RUNS = ("", "*", "views/*", "remedies/*", "*/remedies/*")
 
 
 def lock_folder(folder: Path, whole: bool = False) -> Callable[[], None]:

@@ -4,8 +4,8 @@ python tests/benchmarks/drawn_noise.py CASES NAME [--view N] [--seeds N] [--smoo
 
 One case of `tests.proofs statements`. *noise*: root mean square over the pixels of the standard deviation between seeds
 of the paths, relative to the mean light, at the best estimate and in twelve drawn finishes; with *wide* lobes alone to
-sample with, and with the *wide and narrow* ones of statements. *errors*: mean and standard deviation of every
-measurement's errors over the same twelve draws, with each smoothing [px] of kept light, and with light rendered anew.
+sample with, and with the *wide and narrow* ones of statements. *errors* of every measurement over the same twelve
+draws, with their mean and median: with each smoothing [px] of kept light, and with light rendered anew.
 """
 
 from __future__ import annotations

@@ -98,6 +98,17 @@ def test_only_left_overs_of_the_dead_are_swept(tmp_path):
     assert [path.name for path in remove_partial(tmp_path)] == [".k.partial-999999999-0000000f"]
 
 
+def test_light_of_a_killed_command_is_swept_in_every_run_of_its_folder(tmp_path):
+    left = [
+        tmp_path / run / f".light.npz.partial-999999999-{HOST}{number}"
+        for number, run in enumerate(("", "zivid-2-m70", "remedies/spray", "zivid-2-m70/remedies/spray"))
+    ]
+    for path in left:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"light")
+    assert sorted(remove_partial(tmp_path)) == sorted(left)
+
+
 def test_a_repaired_file_of_trials_leaves_nothing_that_is_not_swept(tmp_path, monkeypatch):
     """Killed before the rename, the repair leaves a file; before, no command recognised its name and its folder."""
     trials = TrialFolder(tmp_path / "david-sls-3" / "trials", "digest", ["radius"])

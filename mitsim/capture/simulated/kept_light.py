@@ -106,9 +106,10 @@ def keep_light(
     drawn = [number if bsdf.id() in described else -1 for number, bsdf in enumerate(bsdfs)]
     sampled = [bsdf_of(broad(described[bsdf.id()])) if bsdf.id() in described else bsdf for bsdf in bsdfs]
     turned = [any(is_turned(finish[number]) for finish in finishes) for number in range(len(bsdfs))]
-    traced = {}
+    out, ambient = {}, simulated.sensor.ambient_image
     for index, (camera, roi) in enumerate(rois.items()):
-        pixels, settings = _lit_pixels(_shapes(simulated, scene, world_from_sensor, camera, roi), rendering)
+        shape = _shapes(simulated, scene, world_from_sensor, camera, roi)
+        pixels, settings = _lit_pixels(shape, rendering)
         photons = int(np.ceil(np.sqrt(settings.photons * settings.samples * len(pixels)))) ** 2
         own = int(np.random.SeedSequence([seed, index]).generate_state(1)[0])
         tracing = Tracing(settings.samples, photons, rendering.depth, own, drawn, sampled, turned)
@@ -117,8 +118,9 @@ def keep_light(
         if len(pixels):
             tracer = Tracer(scene, rays, projector, world_from_sensor, roi, tracing)
             candidates += [*camera_paths(tracer, pixels), *photon_paths(tracer)]
-        traced[camera] = KeptPaths.of(mattering(candidates, finishes, roi, settings.kept * len(pixels), own), roi)
-    return light_on_paths(simulated, scene, world_from_sensor, traced, rendering)
+        paths = KeptPaths.of(mattering(candidates, finishes, roi, settings.kept * len(pixels), own), roi)
+        out[camera] = KeptLight(paths, Smoothing.of(shape, settings.smoothing_px), ambient)
+    return out
 
 
 def light_on_paths(
@@ -144,7 +146,8 @@ def light_on_paths(
     out, ambient = {}, simulated.sensor.ambient_image
     for camera, paths in traced.items():
         shape = _shapes(simulated, scene, world_from_sensor, camera, paths.roi)
-        out[camera] = KeptLight(paths, Smoothing.of(shape, _lit_pixels(shape, rendering)[1].smoothing_px), ambient)
+        _, settings = _lit_pixels(shape, rendering)
+        out[camera] = KeptLight(paths, Smoothing.of(shape, settings.smoothing_px), ambient)
     return out
 
 

@@ -95,36 +95,24 @@ class CandidatePaths:
 class Vertices:
     """The surfaces of paths, sorted by material: their BSDFs are evaluated with one call for each material.
 
-    ``counts`` are the numbers of surfaces by material, ``directions`` (6, n) their i and o.
+    ``materials`` (k, 2) are the numbers of the materials and of their surfaces, ``directions`` (6, n) their i and o.
     """
 
-    def __init__(self, counts: Mapping[int, int], directions: Singles) -> None:
-        self._counts, self._parts, first = dict(counts), list[tuple[int, Any, Any]](), 0
-        for number, count in counts.items():
+    def __init__(self, materials: NDArray[np.integer], directions: Singles) -> None:
+        self._parts, first = list[tuple[int, Any, Any]](), 0
+        for number, count in materials.tolist():
             rows = directions[:, first : first + count]
             self._parts.append((number, *[mi.Vector3f(*map(to_device, rows[k : k + 3])) for k in (0, 3)]))
             first += count
         self._count = 1 + first
 
-    @classmethod
-    def of(cls, material: NDArray[np.int16], toward: Singles) -> tuple[Vertices, NDArray[np.uint32]]:
-        """Return the surfaces of paths, and the indices (m, n) of the factor of each surface of a path."""
-        flat = material.ravel()
-        order = np.argsort(flat, kind="stable")
-        order = order[np.searchsorted(flat[order], 0) :]
-        index = np.zeros(len(flat), np.uint32)
-        index[order] = np.arange(1, len(order) + 1, dtype=np.uint32)
-        numbers, counts = np.unique(flat[order], return_counts=True)
-        directions = np.ascontiguousarray(toward.reshape(-1, 6)[order].T)
-        return cls(dict(zip(numbers.tolist(), counts.tolist(), strict=True)), directions), index.reshape(
-            material.shape
-        ).T
-
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return what the surfaces are made of, see :meth:`KeptPaths.arrays`."""
+        """Return what the surfaces are made of, by the names of the parameters."""
         parts = [np.concatenate([vectors_to_host(each).T for each in part[1:]]) for part in self._parts]
-        directions = np.concatenate(parts, axis=1) if parts else np.empty((6, 0), np.float32)
-        return {"materials": np.array([*self._counts.items()], np.int64).reshape(-1, 2), "directions": directions}
+        return {
+            "materials": np.array([(number, dr.width(row)) for number, row, _ in self._parts], int).reshape(-1, 2),
+            "directions": np.concatenate(parts, axis=1) if parts else np.empty((6, 0), np.float32),
+        }
 
     def __len__(self) -> int:
         return self._count
@@ -143,12 +131,23 @@ class Vertices:
         return out
 
 
+def _sorted_surfaces(material: NDArray[np.int16], toward: Singles) -> tuple[NDArray[Any], Singles, NDArray[np.uint32]]:
+    """Return materials and directions of :class:`Vertices`, and the indices (m, n) of the factors of each path."""
+    flat = material.ravel()
+    order = np.argsort(flat, kind="stable")
+    order = order[np.searchsorted(flat[order], 0) :]
+    index = np.zeros(material.shape, np.uint32)
+    index.ravel()[order] = np.arange(1, len(order) + 1, dtype=np.uint32)
+    materials = np.stack(np.unique(flat[order], return_counts=True), axis=-1)
+    return materials, toward.reshape(-1, 6)[order].T, index.T
+
+
 class KeptPaths:
-    """The paths of one camera's region, ready on the device for any finish."""
+    """The paths of one camera's region, ready on the device for any finish; ``arrays`` as :meth:`arrays` returns."""
 
     def __init__(self, arrays: Mapping[str, NDArray[Any]], roi: Roi) -> None:
         self.roi, self.count = roi, len(arrays["weight"])
-        self._vertices = Vertices(dict(arrays["materials"].tolist()), arrays["directions"])
+        self._vertices = Vertices(arrays["materials"], arrays["directions"])
         self._pixels = arrays["pixels"]
         self._first, self._counts = mi.UInt32(arrays["first"]), mi.UInt32(arrays["counts"])
         self._weight, self._length = to_device(arrays["weight"]), to_device(arrays["length"])
@@ -161,12 +160,19 @@ class KeptPaths:
         pixels, first, counts = np.unique(paths.pixel, return_index=True, return_counts=True)
         if len(paths) and (np.diff(paths.pixel) != 0).sum() + 1 != len(pixels):
             raise ValueError("paths of one pixel must follow one another")
-        vertices, indices = Vertices.of(paths.material, paths.toward)
-        code = np.ascontiguousarray(paths.code.T)
-        arrays: dict[str, NDArray[Any]] = {"pixels": pixels}
-        arrays |= {"first": first.astype(np.uint32), "counts": counts.astype(np.uint32)}
-        arrays |= {"weight": paths.weight, "uv": code[:2], "length": code[2], "indices": indices}
-        return cls(arrays | vertices.arrays(), roi)
+        materials, directions, indices = _sorted_surfaces(paths.material, paths.toward)
+        arrays = {
+            "pixels": pixels,
+            "first": first.astype(np.uint32),
+            "counts": counts.astype(np.uint32),
+            "weight": paths.weight,
+            "uv": paths.code.T[:2],
+            "length": paths.code[:, 2],
+            "indices": indices,
+            "materials": materials,
+            "directions": directions,
+        }
+        return cls(arrays, roi)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return all that the paths are made of, for the same paths in another process."""
@@ -224,7 +230,8 @@ class KeptPaths:
 
 def light_of(paths: CandidatePaths, finishes: Sequence[Sequence[Any]]) -> Iterator[NDArray[np.float64]]:
     """Yield the radiance (n,) of each path for a code of 1, for the BSDFs of each of some drawn finishes."""
-    vertices, indices = Vertices.of(paths.material, paths.toward)
+    materials, directions, indices = _sorted_surfaces(paths.material, paths.toward)
+    vertices = Vertices(materials, directions)
     for bsdfs in finishes:
         factors = np.asarray(vertices.factors(bsdfs), np.float64)
         yield np.asarray(paths.weight * factors[indices].prod(axis=0))
@@ -315,9 +322,9 @@ _DIFFUSE = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.5}}
 #: share of the samples that go to all sides
 _DIFFUSE_SHARE = 0.2
 
-#: factors on the width of the two lobes, and share of the narrow one among them. With the wide lobe alone, the noise in
-#: twelve finishes drawn for ground metal is 1.3 to 5 times that with both, but for 2 of them 0.9 to 1.0, and as high at
-#: the best estimate: tests/benchmarks/drawn_noise.py, cone and dome
+#: factors on the width of the two lobes, and share of the narrow one among them; chosen among few. With the wide lobe
+#: alone, noise in ten of twelve finishes drawn for a ground cone is 1.2 to 5 times that with both, in two 0.9 and 1.0,
+#: and equal at the best estimate: tests/benchmarks/drawn_noise.py scenes/parts/validation.toml cone_and_dome__zivid
 _WIDER = 1.25
 _NARROWER = 0.25
 _NARROW_SHARE = 0.5

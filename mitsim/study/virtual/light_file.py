@@ -9,7 +9,6 @@ this one is killed. A worker that cannot read it traces the paths itself; they a
 
 from __future__ import annotations
 
-import os
 import weakref
 import zipfile
 from collections.abc import Callable, Mapping
@@ -19,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.files.atomic_io import HOST
+from characterisation.files.atomic_io import beside
 from characterisation.region_of_interest import Roi
 from mitsim.capture.simulated.kept_light import KeptLight
 from mitsim.scene.light_transport.kept_paths import KeptPaths
@@ -39,7 +38,7 @@ class LightFile:
         if view != self._view:
             self._remove()
             self._view, self._path = view, None
-            path = self._folder / f".light_{view:04d}.{os.getpid()}-{HOST}.partial"
+            path = beside(self._folder / "light.npz", "partial")
             self._remove = weakref.finalize(self, path.unlink, missing_ok=True)
             try:
                 self._folder.mkdir(parents=True, exist_ok=True)

@@ -99,10 +99,10 @@ def test_the_light_of_a_view_is_traced_once_for_all_workers_of_this_machine(stud
         np.testing.assert_equal(found, expected)
         assert len(traced) == times * cameras
         traced.clear()
-    assert len(set(files)) == 1
+    assert len(set(files)) == 2  # of sessions in one folder, each has its own, whatever it is of
     del spread
     gc.collect()
-    assert not files[0].exists()
+    assert not any(file.exists() for file in files)
     # one order of a view, several views, and workers on other machines trace for themselves
     views = [Job(study.views[number], Trial(day)) for number in (0, 1) for day in range(6)]
     elsewhere = _Here()
@@ -110,6 +110,21 @@ def test_the_light_of_a_view_is_traced_once_for_all_workers_of_this_machine(stud
     for workers, some in ((_Here(), jobs[:2]), (_Here(), views), (elsewhere, jobs)):
         spread = SpreadMeasurements(workers, session.renderer, session.digest, tmp_path)
         assert spread._light_for(list(spread._rows(some))) is None
+
+
+def test_light_of_one_view_by_two_renderings_in_one_folder_stays_apart(study, tmp_path):
+    """A statement and the change that is tried for it have one folder: a file by the view would be the last one's."""
+    view, many = study.views[1], Session(study).renderer
+    few = many.rendered_as(race_rendering(study))
+    lights = [renderer.view_light(view) for renderer in (many, few)]
+    writers = [light_file.LightFile(tmp_path) for _ in lights]
+    paths = [writer.of(view.number, light.kept) for writer, light in zip(writers, lights, strict=True)]
+    for path, light in zip(paths, lights, strict=True):
+        read = light_file.read_light(str(path), light.rois)
+        assert {name: kept.count for name, kept in read.items()} == {
+            name: kept.paths.count for name, kept in light.kept.items()
+        }
+    assert lights[0].kept["left"].paths.count > lights[1].kept["left"].paths.count > 0
 
 
 def test_light_that_does_not_fit_on_the_disk_is_no_file(study, tmp_path, monkeypatch):
