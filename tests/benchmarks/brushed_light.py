@@ -45,10 +45,14 @@ def print_noise(name: str, number: int, trials: int) -> None:
     study = open_study(STUDY, read_toml(STUDY, StudyFile).model_copy(update={"sensor": name}))
     maker = measurements_of(study, study_unknowns(study))
     view, simulated = study.view(number, "--view"), maker.simulated
-    finishes = [maker.part.bsdfs(one) for one in (-1, *_PROBING_FINISHES)]
+
+    def kept(seed: int):
+        finishes = map(maker.part.scene_in, (-1, *_PROBING_FINISHES))
+        return keep_light(simulated, study.scene, pose, rois, maker.rendering, finishes, seed)[camera]
+
     rois, pose = maker.view_light(view).rois, view.world_from_sensor
     camera = next(iter(rois))
-    seeds = [keep_light(simulated, study.scene, pose, rois, maker.rendering, finishes, seed)[camera] for seed in (1, 2)]
+    seeds = [kept(seed) for seed in (1, 2)]
     without = []
     for day in range(trials):
         scene, _ = maker.part.in_finish(maker.unknowns.draw(Trial(day)).finish)

@@ -55,12 +55,13 @@ def rows(path: Path, name: str, number: int, most_pixels: int | None):
     pose, rois, rendering = view.world_from_sensor, maker.view_light(view).rois, maker.rendering
     if most_pixels is not None:
         rendering = replace(rendering, kept=replace(rendering.kept, most_pixels=most_pixels))
-    finishes = [maker.part.bsdfs(number) for number in (-1, 101, 102, 103, 104)]
+
+    def lit(how, seed: int):
+        finishes = map(maker.part.scene_in, (-1, 101, 102, 103, 104))
+        return keep_light(simulated, study.scene, pose, rois, how, finishes, seed)
+
     plain = replace(rendering, kept=replace(rendering.kept, smoothing_px=0.0))
-    kept, unsmoothed = (
-        [keep_light(simulated, study.scene, pose, rois, how, finishes, seed) for seed in (1, 2)]
-        for how in (rendering, plain)
-    )
+    kept, unsmoothed = ([lit(how, seed) for seed in (1, 2)] for how in (rendering, plain))
     electrons = sensor.electrons()
     for day in (None, 0, 1, 2):
         finish = -1 if day is None else maker.unknowns.draw(Trial(day)).finish

@@ -2,13 +2,13 @@
 
 Signal chain: scene with finishes to sample with -> candidates of each camera
 (:mod:`mitsim.scene.light_transport.kept_tracing`) -> paths that matter
-(:mod:`mitsim.scene.light_transport.kept_paths`); then for each draw: BSDFs -> light of each code -> Gaussian filter
-over the pixels of one shape -> images.
+(:mod:`mitsim.scene.light_transport.kept_paths`); then for each draw: BSDFs, with lobes no narrower than the paths
+resolve -> light of each code -> Gaussian filter over the pixels of one shape -> images.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +21,8 @@ from characterisation.region_of_interest import Roi
 from mitsim.capture.simulated.indirect_light import KeptSettings, Smoothing
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.scene.light_transport.kept_paths import CandidatePaths, KeptPaths, broad, mattering
+from mitsim.scene.light_transport.kept_finishes import broad, least_width, resolved
+from mitsim.scene.light_transport.kept_paths import CandidatePaths, KeptPaths, mattering
 from mitsim.scene.light_transport.kept_tracing import camera_paths, photon_paths
 from mitsim.scene.light_transport.kept_walks import Tracer, Tracing
 from mitsim.scene.light_transport.plain_scene import distinct_bsdfs, has_emitters
@@ -33,11 +34,15 @@ from mitsim.sensor.transforms import Transform
 
 @dataclass(frozen=True)
 class KeptLight:
-    """Interreflected light of one camera's region, for any finish."""
+    """Interreflected light of one camera's region, for any finish.
+
+    ``widths`` are those of the narrowest lobes that the paths resolve [1], by the ids of BSDFs.
+    """
 
     paths: KeptPaths
     smoothing: Smoothing
     ambient_image: bool
+    widths: Mapping[str, float]
 
     @property
     def bytes(self) -> int:
@@ -56,7 +61,7 @@ class KeptLight:
         of other sources, if the sensor takes an ambient image.
         """
         light = simulated.patterns
-        codes = self.paths.codes(distinct_bsdfs(scene) or [], light, motion)
+        codes = self.paths.codes(_resolved_bsdfs(scene, self.widths), light, motion)
         in_threads(self.smoothing.apply, codes)
         images = light.images(list(codes))
         if self.ambient_image:
@@ -75,7 +80,7 @@ def keep_light(
     world_from_sensor: Transform,
     rois: dict[str, Roi],
     rendering: Rendering,
-    finishes: Sequence[Sequence[Any]],
+    finishes: Iterable[Scene],
     seed: int,
 ) -> dict[str, KeptLight]:
     """Trace the interreflections that each camera sees.
@@ -87,8 +92,8 @@ def keep_light(
     rois, rendering
         Region of each camera's image, and numbers of paths and surfaces.
     finishes
-        Finishes that may be drawn, each as the BSDFs of the scene in the order of
-        :func:`~mitsim.scene.light_transport.plain_scene.distinct_bsdfs`. Paths are kept by their light in these.
+        The scene in finishes that may be drawn; each is used before the next is asked for. Paths are kept by their
+        light in these.
     seed
         Of all random numbers.
 
@@ -98,14 +103,12 @@ def keep_light(
     """
     bsdfs = distinct_bsdfs(scene)
     assert bsdfs is not None  # can_be_kept
-    described = {
-        shape.bsdf().id(): finish.description
-        for shape, finish in zip(scene.shapes, scene.finishes, strict=True)
-        if finish is not None and finish.description is not None
-    }
+    described = _descriptions(scene)
+    widths = {name: least_width(description) for name, description in described.items()}
     drawn = [number if bsdf.id() in described else -1 for number, bsdf in enumerate(bsdfs)]
     sampled = [bsdf_of(broad(described[bsdf.id()])) if bsdf.id() in described else bsdf for bsdf in bsdfs]
-    turned = [any(is_turned(finish[number]) for finish in finishes) for number in range(len(bsdfs))]
+    probed = [_resolved_bsdfs(finished, widths) for finished in finishes]
+    turned = [any(is_turned(finish[number]) for finish in probed) for number in range(len(bsdfs))]
     out, ambient = {}, simulated.sensor.ambient_image
     for index, (camera, roi) in enumerate(rois.items()):
         shape = _shapes(simulated, scene, world_from_sensor, camera, roi)
@@ -118,8 +121,8 @@ def keep_light(
         if len(pixels):
             tracer = Tracer(scene, rays, projector, world_from_sensor, roi, tracing)
             candidates += [*camera_paths(tracer, pixels), *photon_paths(tracer)]
-        paths = KeptPaths.of(mattering(candidates, finishes, roi, settings.kept * len(pixels), own), roi)
-        out[camera] = KeptLight(paths, Smoothing.of(shape, settings.smoothing_px), ambient)
+        paths = KeptPaths.of(mattering(candidates, probed, roi, settings.kept * len(pixels), own), roi)
+        out[camera] = KeptLight(paths, Smoothing.of(shape, settings.smoothing_px), ambient, widths)
     return out
 
 
@@ -144,11 +147,34 @@ def light_on_paths(
     keep_light : the same, with paths that it traces
     """
     out, ambient = {}, simulated.sensor.ambient_image
+    widths = {name: least_width(description) for name, description in _descriptions(scene).items()}
     for camera, paths in traced.items():
         shape = _shapes(simulated, scene, world_from_sensor, camera, paths.roi)
         _, settings = _lit_pixels(shape, rendering)
-        out[camera] = KeptLight(paths, Smoothing.of(shape, settings.smoothing_px), ambient)
+        out[camera] = KeptLight(paths, Smoothing.of(shape, settings.smoothing_px), ambient, widths)
     return out
+
+
+def _descriptions(scene: Scene) -> dict[str, dict[str, Any]]:
+    """Return the descriptions of the finishes that can be changed, by the ids of their BSDFs."""
+    return {
+        shape.bsdf().id(): finish.description
+        for shape, finish in zip(scene.shapes, scene.finishes, strict=True)
+        if finish is not None and finish.description is not None
+    }
+
+
+def _resolved_bsdfs(scene: Scene, widths: Mapping[str, float]) -> list[Any]:
+    """Return the distinct BSDFs of a scene with lobes of at least some widths, by the ids of BSDFs; [] of instances."""
+    described = _descriptions(scene)
+
+    def resolved_bsdf(bsdf: Any) -> Any:
+        if bsdf.id() not in widths:
+            return bsdf
+        wide = resolved(described[bsdf.id()], widths[bsdf.id()])
+        return bsdf if wide == described[bsdf.id()] else bsdf_of(wide)
+
+    return [resolved_bsdf(bsdf) for bsdf in distinct_bsdfs(scene) or []]
 
 
 def _shapes(

@@ -14,7 +14,7 @@ weight w holds everything else: arriving light, densities of the directions, and
 paths and photons. Densities and heuristic are those of the finish that the paths were *sampled* with. They are
 functions of the path alone, so the estimate is unbiased for every other finish (importance sampling: Kahn and Marshall
 1953). Its variance is small if the sampled finish covers the others: a defensive mixture (Hesterberg,
-Technometrics 37, 1995; :func:`broad`).
+Technometrics 37, 1995; :func:`~mitsim.scene.light_transport.kept_finishes.broad`).
 
 Most candidates carry next to nothing. Each is kept with the probability p = min(1, c / t), and its weight is divided by
 p (Russian roulette: Arvo and Kirk, SIGGRAPH 1990). Here c is the root mean square of its light over some finishes that
@@ -304,46 +304,3 @@ def _threshold(size: NDArray[np.float64], count: int) -> float:
     candidates = tail_sums[possible] / free[possible]
     # the first at which this one would be kept with a probability of 1 or less
     return float(candidates[np.argmax(candidates >= positive[possible])])
-
-
-def broad(description: dict[str, Any]) -> dict[str, Any]:
-    """Return a finish to sample with, for a finish given by its description, that covers others about it.
-
-    Every lobe of microfacets becomes two of GGX, whose tail decreases slowly: a wider one, and a narrow one for
-    smoother finishes, or such along marks of any direction. A part of the light is scattered to all sides. A coherent
-    lobe keeps its width, which is that of the form of a face.
-    """
-    lobes = _blend(_scaled(description, _WIDER), _scaled(description, _NARROWER), _NARROW_SHARE)
-    return _blend(lobes, _DIFFUSE, _DIFFUSE_SHARE)
-
-
-_DIFFUSE = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.5}}
-
-#: share of the samples that go to all sides
-_DIFFUSE_SHARE = 0.2
-
-#: factors on the width of the two lobes, and share of the narrow one among them; chosen among few. With the wide lobe
-#: alone, noise in ten of twelve finishes drawn for a ground cone is 1.2 to 5 times that with both, in two 0.9 and 1.0,
-#: and equal at the best estimate: tests/benchmarks/drawn_noise.py scenes/parts/validation.toml cone_and_dome__zivid
-_WIDER = 1.25
-_NARROWER = 0.25
-_NARROW_SHARE = 0.5
-
-
-def _blend(first: dict[str, Any], second: dict[str, Any], share: float) -> dict[str, Any]:
-    return {"type": "blendbsdf", "weight": share, "first": first, "second": second}
-
-
-def _scaled(description: dict[str, Any], factor: float) -> dict[str, Any]:
-    out = {}
-    for key, value in description.items():
-        if key == "mirror" or not isinstance(value, dict):
-            out[key] = value
-        else:
-            out[key] = _scaled(value, factor)
-    if "distribution" in out:
-        out["distribution"] = "ggx"
-        for key in ("alpha", "alpha_u", "alpha_v"):
-            if key in out:
-                out[key] = min(factor * out[key], 1.0)
-    return out

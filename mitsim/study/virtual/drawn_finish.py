@@ -14,13 +14,11 @@ import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from scipy.special import ndtr
 
 from characterisation.files.arrays import Floats
-from mitsim.scene.light_transport.plain_scene import distinct_bsdfs
 from mitsim.scene.light_transport.room_light import directional_albedos
 from mitsim.scene.load import Scene, load_scene
 from mitsim.scene.surface.scatter import LARGEST_DEVIATION, Deviation
@@ -92,13 +90,13 @@ class DrawnPart:
     def in_finish(self, number: int) -> tuple[Scene, list[Floats]]:
         """Return the part in the finishes of a number, and the directional albedos of its shapes."""
         if self._finished is None or self._finished[0] != number:
-            scene = self.deviated(partial(finish_deviation, self._unknowns, number))
+            scene = self.scene_in(number)
             self._finished = number, scene, directional_albedos(scene)
         return self._finished[1:]
 
-    def bsdfs(self, number: int) -> list[Any]:
-        """Return the distinct BSDFs of the part in the finishes of a number; none if it has BSDFs inside others."""
-        return distinct_bsdfs(self.deviated(partial(finish_deviation, self._unknowns, number))) or []
+    def scene_in(self, number: int) -> Scene:
+        """Return the part in the finishes of a number."""
+        return self.deviated(partial(finish_deviation, self._unknowns, number))
 
     def deviated(self, deviation: Callable[[str], Deviation]) -> Scene:
         """Return the part with finishes that deviate, each by its BSDF's id."""

@@ -311,7 +311,7 @@ class RenderedMeasurements:
         if traced is not None:
             return light_on_paths(simulated, self.study.scene, pose, traced, self.rendering)
         numbers = (-1, *_PROBING_FINISHES) if "finish" in self.unknowns.varied else (-1,)
-        finishes = [self.part.bsdfs(number) for number in numbers]
+        finishes = map(self.part.scene_in, numbers)
         seed = _seed_of(self.unknowns.seed, view.number)
         return keep_light(simulated, self.study.scene, pose, rois, self.rendering, finishes, seed)
 

@@ -8,7 +8,8 @@ import pytest
 from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import mi
 from mitsim.scene.light_transport import kept_tracing
-from mitsim.scene.light_transport.kept_paths import CandidatePaths, KeptPaths, broad, light_of, mattering
+from mitsim.scene.light_transport.kept_finishes import broad
+from mitsim.scene.light_transport.kept_paths import CandidatePaths, KeptPaths, light_of, mattering
 from mitsim.scene.light_transport.kept_tracing import camera_paths, photon_paths
 from mitsim.scene.light_transport.kept_walks import Tracer, Tracing, Walk, split_walk
 from mitsim.scene.light_transport.light_paths import LightPaths

@@ -441,28 +441,35 @@ def test_a_trial_does_not_depend_on_those_before_it(coarse_n10):
 def test_interreflections_of_a_trial_are_those_of_its_finish(coarse_n10):
     """Kept paths, the mean of three sets, against a rendering of the same finish at 256 paths a pixel: within 2.5 %.
 
-    Light of the whole region of one set, of few pixels here, has a standard deviation of 1.2 %.
+    Light of the whole region of one set, of few pixels here, has a standard deviation of 1.2 %. Lobes are as narrow as
+    drawn. A trial widens those that the paths do not resolve: one finish of these sixteen, along whose marks the lobe
+    is narrowest, has a quarter more light by that, the others change by 6 % and less, and all together by 1 %.
     """
     study = metal_study(coarse_n10)
     view, maker = study.views[0], measurements_of(study, study_unknowns(study))
-    pose, draws = view.world_from_sensor, [maker.unknowns.draw(Trial(day)) for day in range(3)]
-    kept, rendered = np.zeros((2, len(draws), len(maker.simulated.rays)))
+    pose, draws = view.world_from_sensor, [maker.unknowns.draw(Trial(day)) for day in range(16)]
+    as_drawn, resolved = np.zeros((2, len(draws), len(maker.simulated.rays)))
     for seed in (1, 2, 3):
         maker.unknowns, maker.views = replace(maker.unknowns, seed=seed), LightOfViews()
         shared = maker.view_light(view)
-        for row, drawn in zip(kept, draws, strict=True):
-            scene = maker.part.in_finish(drawn.finish)[0]
-            row += [
-                images.sum() / 3
-                for images in maker._indirect(maker.simulated, scene, pose, view, drawn, shared).values()
-            ]
-    for day, (row, drawn) in enumerate(zip(rendered, draws, strict=True)):
-        scene = maker.part.in_finish(drawn.finish)[0]
+        narrow = replace(shared, kept={name: replace(light, widths={}) for name, light in shared.kept.items()})
+        for found, light in ((as_drawn, narrow), (resolved, shared)):
+            for row, drawn in zip(found, draws, strict=True):
+                scene = maker.part.in_finish(drawn.finish)[0]
+                images = maker._indirect(maker.simulated, scene, pose, view, drawn, light)
+                row += [image.sum() / 3 for image in images.values()]
+    rendered = np.zeros((3, len(maker.simulated.rays)))
+    for day, row in enumerate(rendered):
+        scene = maker.part.in_finish(draws[day].finish)[0]
         for column, name in enumerate(shared.rois):
             row[column] = maker.simulated.indirect_radiance(
                 scene, pose, name, IndirectLight(256, 1.5), seed=day, depth=2, roi=shared.rois[name]
             ).sum()
-    np.testing.assert_allclose(kept, rendered, rtol=0.025)
+    np.testing.assert_allclose(as_drawn[:3], rendered, rtol=0.025)
+
+    assert not np.array_equal(resolved, as_drawn)
+    assert resolved.sum() == pytest.approx(as_drawn.sum(), rel=0.025)
+    assert (np.abs(resolved / as_drawn - 1) < 0.07).all(axis=1).sum() >= 15
 
 
 def test_the_finish_of_a_trial_holds_after_trials_with_other_light_paths(coarse_n10):
