@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.atomic_io import atomic_write
 from characterisation.files.checked_files import read_bounded
-from characterisation.files.errors import InputError
+from characterisation.files.errors import InputError, in_one_line
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 
 _VERTEX = np.dtype(
@@ -175,7 +175,7 @@ def read_cloud(path: str | Path) -> PointCloud:
         if baseline.shape != (3,) or not (np.abs(numbers) < 1e9).all() or not (fx > 0 and fy > 0):
             raise ValueError("optics or a pose that are infinite, huge or not numbers")
     except (ValueError, KeyError, TypeError, StopIteration, IndexError, OverflowError, RecursionError) as error:
-        cause = " ".join(repr(error).split())[:200]
+        cause = in_one_line(repr(error))
         raise InputError(path, "comment", f"an inconsistent header ({cause})", "as written") from None
     pixel = _BENT_PIXEL if bent else _PIXEL
     if min(count, width - 1, height - 1) < 0 or len(body) != count * _VERTEX.itemsize + width * height * pixel.itemsize:

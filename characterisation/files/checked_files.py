@@ -8,7 +8,7 @@ import stat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from characterisation.files.errors import InputError
+from characterisation.files.errors import InputError, in_one_line
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -81,7 +81,7 @@ def read_json_object(file: Path, absent: str | None = None, hint: str = "") -> d
     try:
         table = json.loads(text)
     except (ValueError, RecursionError) as error:
-        cause = "nested too deep" if isinstance(error, RecursionError) else " ".join(str(error).split())[:200]
+        cause = "nested too deep" if isinstance(error, RecursionError) else in_one_line(error)
         raise InputError(file, "", f"text that is not JSON ({cause})", "JSON in UTF-8", hint) from None
     if not isinstance(table, dict):
         raise InputError(file, "", type(table).__name__, "a JSON object", hint)

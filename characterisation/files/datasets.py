@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.checked_files import DIGEST, SEAL, dataset_digest, is_file, read_bounded
-from characterisation.files.errors import InputError
+from characterisation.files.errors import InputError, in_one_line
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -106,7 +106,7 @@ def read_dataset(path: str | Path, schema: Schema) -> xr.Dataset:
     except MemoryError:
         raise InputError(path, "", "more than fits into memory", schema.made_by, schema.hint) from None
     except Exception as error:  # a damaged file may raise anything
-        raise _unreadable(path, schema, f"({' '.join(f'{type(error).__name__}: {error}'.split())[:200]})") from None
+        raise _unreadable(path, schema, f"({in_one_line(f'{type(error).__name__}: {error}')})") from None
     data = data.drop_encoding()
     written = data.attrs.pop(DIGEST, None)
     if written is not None and written != dataset_digest(data):

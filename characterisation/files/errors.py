@@ -46,6 +46,11 @@ def _shortened(value: Any) -> str:
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"
 
 
+def in_one_line(error: object, longest: int = 200) -> str:
+    """Return what an error says in one line of at most some characters; its type if it says nothing."""
+    return " ".join(str(error).split())[:longest] or type(error).__name__
+
+
 def nearest(name: str, names: list[str]) -> str:
     """Return ``did you mean 'x'?`` for the name nearest to a misspelt one, and not that itself; or an empty string.
 

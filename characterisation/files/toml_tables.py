@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from characterisation.files.checked_files import is_file, read_text_bounded
-from characterisation.files.errors import InputError, nearest
+from characterisation.files.errors import InputError, in_one_line, nearest
 
 #: largest TOML file [bytes]; chosen
 LARGEST_TOML = 4 * 1024**2
@@ -35,7 +35,7 @@ def read_toml_table(path: str | Path) -> dict[str, Any]:
     try:
         table = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # also a whole number of thousands of digits
-        cause = " ".join(str(error).split())[:200]
+        cause = in_one_line(error)
         line = _line_named(text, cause)
         found = f"text that is not TOML ({cause}{f': {line[:100]}' if line else ''})"
         hint = "a decimal number has a point, not a comma" if _DECIMAL_COMMA.search(line) else ""

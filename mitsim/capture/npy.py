@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.files.errors import InputError
+from characterisation.files.errors import InputError, in_one_line
 from mitsim.sensor.png import LONGEST_SIDE_PX
 
 #: first bytes of an ``.npy`` file
@@ -38,7 +38,7 @@ def numbers_of_npy(data: bytes, where: str | Path, *, tables: bool = False) -> N
         if stream.tell() != len(data):
             raise ValueError("bytes beyond the array")
     except Exception as error:  # NumPy raises many types of errors for damaged files
-        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        reason = in_one_line(error, 120)
         hint = "np.save writes such a file, np.savez an archive"
         raise InputError(where, "", f"an unreadable file ({reason})", "a .npy file with numbers", hint) from None
     if array.dtype.kind not in "fiu" and not (tables and array.dtype.names):

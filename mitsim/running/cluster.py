@@ -21,7 +21,7 @@ from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any
 
 from characterisation.files.checked_files import is_file
-from characterisation.files.errors import InputError, MissingEnvironmentError
+from characterisation.files.errors import InputError, MissingEnvironmentError, in_one_line
 from characterisation.words.progress import say
 from mitsim.running.build import differences, own_build
 from mitsim.running.executor import Item, Plain, Result, finished_orders
@@ -197,4 +197,4 @@ class _Watch:
 
 
 def _in_a_line(error: BaseException) -> str:
-    return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
+    return f"{type(error).__name__}: {in_one_line(error, 300)}"

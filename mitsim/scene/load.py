@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from characterisation.files.errors import InputError, nearest
+from characterisation.files.errors import InputError, in_one_line, nearest
 from mitsim.scene import backend
 from mitsim.scene.materials import Finish, loading, register
 from mitsim.scene.mirrored import face_normals_side
@@ -183,7 +183,7 @@ def load_scene(
         try:
             scene = backend.mi.load_file(str(path), parallel=False, optimize=False, **parameters)
         except Exception as error:  # Mitsuba raises plain RuntimeErrors for errors in the file
-            mitsuba_error = InputError(path, "", " ".join(str(error).split())[:400], "a scene that Mitsuba 3 can load")
+            mitsuba_error = InputError(path, "", in_one_line(error, 400), "a scene that Mitsuba 3 can load")
             raise state.fault or explain_error(mitsuba_error, path) from None
     return replace(_wrap(scene, state.finishes, str(path)), parameters=parameters)
 

@@ -21,7 +21,7 @@ from typing import Any
 
 from scipy.io import loadmat, whosmat
 
-from characterisation.files.errors import InputError
+from characterisation.files.errors import InputError, in_one_line
 from mitsim.sensor.inflated import ZLIB, inflated
 
 
@@ -111,7 +111,7 @@ def read_mat(file: Path, data: bytes, most: int, **options: bool) -> dict[str, A
     except NotImplementedError:
         raise InputError(file, "", "a .mat file of version 7.3", "an older version", "save(..., '-v7')") from None
     except Exception as error:  # SciPy raises many types of errors for damaged files
-        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        reason = in_one_line(error, 120)
         raise InputError(file, "", f"an unreadable file ({reason})", "a .mat file", "save(..., '-v7')") from None
     raise InputError(file, "size", f"{count:,} values", f"up to {most:,}")
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from characterisation.files.errors import InputError
+from characterisation.files.errors import InputError, in_one_line
 
 #: deepest nesting of values, far under the depth of Python's recursion; chosen
 DEEPEST = 64
@@ -53,7 +53,7 @@ def read_yaml(file: Path, data: bytes, allowed: str) -> list[dict[str, Any]]:
         if isinstance(error, InputError):
             raise
         mark = getattr(error, "problem_mark", None)
-        problem = " ".join(str(getattr(error, "problem", None) or error).split())[:200]
+        problem = in_one_line(getattr(error, "problem", None) or error)
         line = "" if mark is None else f" in line {mark.line + 1}"
         raise NotYamlError(file, "", f"text that is not YAML ({problem}{line})", allowed) from None
     maps = [document for document in documents if isinstance(document, dict) and document]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from characterisation.files.arrays import Floats
 from characterisation.files.atomic_io import atomic_write
 from characterisation.files.checked_files import LARGEST_FILE, read_bounded
-from characterisation.files.errors import InputError
+from characterisation.files.errors import InputError, in_one_line
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.triangles import triangles_by_shape
 from mitsim.sensor.rig_parameters import eyes as eyes_of
@@ -96,5 +96,5 @@ def read_scene_geometry(folder: Path) -> SceneGeometry | None:
     except InputError:
         raise
     except Exception as error:  # zip, zlib and NumPy raise many types of errors for damaged files
-        reason = " ".join(str(error).split())[:200]
+        reason = in_one_line(error)
         raise InputError(path, "", f"a file that cannot be read ({reason})", "as mitsim run writes it") from None

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.errors import in_one_line
 from mitsim.capture.devices.depthai_settings import DepthaiSettings, configuration, configure
 from mitsim.capture.devices.device_error import DeviceError, imported_package
 from mitsim.capture.devices.live_camera import LiveCamera
@@ -214,7 +215,7 @@ def fault_of(error: BaseException, dai: Any, where: str, operation: str) -> Base
     """Return the error to raise instead of an error: a DeviceError for errors of the package, else the error itself."""
     if isinstance(error, DeviceError) or not isinstance(error, RuntimeError):
         return error
-    message = " ".join(str(error).split())[:200]
+    message = in_one_line(error)
     lowered, rule = message.lower(), "On Linux its udev rule is needed: docs.luxonis.com"
     found, expected = "the camera disconnected or failed", "a connected camera"
     hint = "Check the cable and the power, then open it again"

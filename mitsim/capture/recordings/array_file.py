@@ -15,7 +15,7 @@ from zipfile import ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.files.errors import InputError
+from characterisation.files.errors import InputError, in_one_line
 from mitsim.capture.npy import NPY_MAGIC, numbers_of_npy
 from mitsim.capture.recordings.cloud_numbers import check_points_first
 from mitsim.capture.recordings.recording_files import chosen_frame
@@ -52,7 +52,7 @@ def arrays_of_npz(data: bytes, where: str | Path) -> dict[str, NDArray[Any]]:
     except InputError:
         raise
     except Exception as error:  # a damaged archive raises many types of errors
-        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        reason = in_one_line(error, 120)
         raise InputError(where, "", f"an unreadable file ({reason})", "an .npz file of NumPy") from None
     return {
         name.removesuffix(".npy"): numbers_of_npy(member, f"{where}: {name}", tables=True)

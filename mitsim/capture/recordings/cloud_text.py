@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.files.errors import InputError
+from characterisation.files.errors import InputError, in_one_line
 from mitsim.capture.recordings.cloud_numbers import check_points_first, number_words, unit_in, unit_named
 from mitsim.sensor.calibration_qualifiers import UNITS_MM
 
@@ -75,7 +75,7 @@ def points_of_text(data: bytes, path: Path) -> tuple[NDArray[np.float64], str | 
             raise ValueError(f"{len(words)} numbers in {len(rows)} lines")
         table = np.array(words, np.float64).reshape(len(rows), columns)
     except ValueError as error:
-        found = f"text that is no cloud ({' '.join(str(error).split())[:120]})"
+        found = f"text that is no cloud ({in_one_line(error, 120)})"
         raise InputError(path, "", found, "lines of x, y and z, and equal columns") from None
     names = next((titles for line in heads if (titles := _names(line, columns))), [])
     unit = _unit(heads, path)

@@ -26,7 +26,7 @@ import zstandard
 from rosbags.rosbag1 import Reader
 from rosbags.rosbag1.reader import decompressors
 
-from characterisation.files.errors import InputError
+from characterisation.files.errors import InputError, in_one_line
 from mitsim.capture.recordings.mcap_messages import Expected, mcap_messages
 from mitsim.capture.recordings.recording_files import BAG_MAGIC, LARGEST_RECORDING, MCAP_MAGIC, MOST_FILES, SQLITE_MAGIC
 from mitsim.sensor.projector_images import counted
@@ -245,7 +245,7 @@ def _in_words(path: Path) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:  # a damaged bag may raise anything
-        text = " ".join(str(error).split())[:160] or type(error).__name__
+        text = in_one_line(error, 160)
         if "not indexed" in text:
             raise InputError(path, "", "a bag without its index", _WHOLE, f"rosbag reindex {path.name}") from None
         raise InputError(path, "", f"a bag that cannot be read ({text})", _WHOLE) from None

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
-from characterisation.files.errors import InputError
+from characterisation.files.errors import InputError, in_one_line
 from mitsim.capture.grey_image import decode_grey
 from mitsim.capture.recordings.ros_bag import RosBag, Topic
 from mitsim.sensor.png import LONGEST_SIDE_PX
@@ -63,7 +63,7 @@ def read_message(bag: RosBag, topic: Topic, number: int) -> Any:
             raise ValueError(f"a definition of {topic.kind} that is not ROS's")
         return (store.deserialize_ros1 if topic.ros1 else store.deserialize_cdr)(data, topic.kind)
     except Exception as error:  # rosbags may raise anything for a damaged message
-        text = " ".join(str(error).split())[:160] or type(error).__name__
+        text = in_one_line(error, 160)
         raise InputError(where, f"message {number}", f"not readable ({text})", topic.kind) from None
 
 

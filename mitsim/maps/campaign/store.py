@@ -36,7 +36,7 @@ from characterisation.files.checked_files import (
 )
 from characterisation.files.datasets import check_dataset
 from characterisation.files.documents import Document, validate
-from characterisation.files.errors import InputError, MissingEnvironmentError
+from characterisation.files.errors import InputError, MissingEnvironmentError, in_one_line
 from characterisation.words.version import __version__
 from mitsim.capture.capture import Capture
 from mitsim.capture.packed_files import packed
@@ -178,7 +178,7 @@ def _table(data: bytes, where: Path) -> xr.Dataset:
         stream = io.BytesIO(data)
         table: NDArray[np.void] = np.lib.format.read_array(stream, False, max_header_size=_LONGEST_HEADER)
     except Exception as error:  # numpy raises many types for a damaged header, which is Python text
-        cause = " ".join(str(error).split())[:200]
+        cause = in_one_line(error)
         raise InputError(where, "", f"a table that cannot be read ({cause})", "an unchanged file", _AGAIN) from None
     kinds = [table.dtype[number] for number in range(len(table.dtype.names or ()))]
     if table.ndim != 1 or not kinds or any(kind.kind not in "fiub" or kind.shape for kind in kinds):

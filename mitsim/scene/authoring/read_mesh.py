@@ -15,7 +15,7 @@ import numpy as np
 import trimesh
 
 from characterisation.files.arrays import Floats
-from characterisation.files.errors import InputError, nearest
+from characterisation.files.errors import InputError, in_one_line, nearest
 from mitsim.scene.authoring.face import Ints
 from mitsim.scene.authoring.step_mesh import LARGE_MM
 from mitsim.scene.authoring.units import commented_unit, unit_assumed, unit_words
@@ -103,7 +103,7 @@ def _load(path: Path) -> Any:
             path, "", f"a format that needs the package {package}", "STL, PLY or OBJ", f"pip install {package}"
         ) from None
     except Exception as error:  # the reader raises any exception on damaged files
-        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        reason = in_one_line(error, 120)
         allowed = f"a file of the format {path.suffix.lower().lstrip('.').upper()}"
         raise InputError(path, "", f"an unreadable file ({reason})", allowed, "save the part as STL or STEP") from None
 

@@ -21,7 +21,7 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import map_coordinates
 
 from characterisation.files.checked_files import read_bounded, read_text_bounded
-from characterisation.files.errors import InputError
+from characterisation.files.errors import InputError, in_one_line
 from mitsim.scene.surface.diffraction import Autocorrelation, sampled
 
 #: fewest points of a trace
@@ -179,7 +179,7 @@ def read_height_map(path: str | Path, spacing_um: float, where: str | Path = "")
         except InputError:
             raise
         except Exception as error:  # the header is parsed as Python text and can raise any exception
-            cause = " ".join(str(error).split())[:200]
+            cause = in_one_line(error)
             raise InputError(path, "", f"a file that does not load ({cause})", "an array of numbers") from None
         if z.ndim != 2 or z.dtype.kind not in "fiu":
             raise InputError(path, "", f"an array of shape {z.shape} and type {z.dtype}", "a grid of real numbers")
