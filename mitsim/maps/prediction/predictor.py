@@ -28,6 +28,7 @@ from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.region_of_interest import Roi
 from mitsim.decoding.cloud import Geometry
 from mitsim.maps.prediction.characterised_scene import CharacterisedScene
+from mitsim.maps.prediction.cut_noise import cut_deviates
 from mitsim.maps.prediction.noise_field import correlated_noise
 from mitsim.maps.prediction.perturbation import Ideal
 from mitsim.scene.load import Scene
@@ -199,9 +200,9 @@ class Predictor:
     ) -> PointCloud:
         """Return a random cloud of a view: P_eps = P + eps V^ if R_U < F, with eps = R_N sigma.
 
-        P is the ideal point, V^ the unit vector along its ray, R_N a normal deviate and R_U a uniform one. The talk of
-        Kinnell and Justham (2018; slide *Simulating the Point Cloud*) writes rho_e for F and sigma_e for sigma. The
-        equations are in :meth:`_cloud`.
+        P is the ideal point, V^ the unit vector along its ray, R_N a normal deviate, cut where a point would be false
+        (:mod:`mitsim.maps.prediction.cut_noise`), and R_U a uniform one. The talk of Kinnell and Justham (2018; slide
+        *Simulating the Point Cloud*) writes rho_e for F and sigma_e for sigma. The equations are in :meth:`_cloud`.
 
         Raises InputError if the view shows a face whose finish was not characterised.
 
@@ -264,7 +265,8 @@ class Predictor:
         lost = np.where(mapped, np.uint8(Status.DROPPED), np.uint8(Status.OUT_OF_RANGE))
         status[part] = np.where(visible & ~kept, lost, seen.status)
         spread[part] = np.where(kept, seen.sigma, np.nan)
-        distance = np.where(kept, seen.distance + noise * seen.sigma, np.nan).astype(np.float32, copy=False)
+        error = cut_deviates(noise, seen.sigma, seen.distance) * seen.sigma
+        distance = np.where(kept, seen.distance + error, np.nan).astype(np.float32, copy=False)
         np.multiply(self.single_directions[part], distance[..., None], out=points[part])
         if self.grid.origin.any():
             points[part] += self.grid.origin.astype(np.float32)

@@ -25,6 +25,10 @@ _AT_KNOT = 1e-7  # place between two knots that counts as the knot, which needs 
 _ROUNDED = 3e-6  # F this near 0 or 1 is rounded to it; chosen
 _Z = np.arange(-4.0, 4.0005, 0.001)  # probits of the map lie within -2.7 and 2.7
 _PHI = np.array([0.5 * math.erfc(-z / math.sqrt(2)) for z in _Z])  # the normal distribution function
+_FARTHEST = 0.01  # largest error of a point, a share of |V|: points beyond it are not among those of F and sigma
+_T = np.linspace(0.05, 3.999, 200)  # the same in standard deviations of normal errors, before those beyond it are cut
+_INSIDE = 2 * np.interp(_T, _Z, _PHI) - 1
+_REACH = _T / np.sqrt(1 - 2 * _T * np.exp(-(_T**2) / 2) / math.sqrt(2 * math.pi) / _INSIDE)  # and after that
 
 
 class SensorMap:
@@ -74,7 +78,9 @@ class SensorMap:
         """
         fraction, sigma = self.image(depth, normals, K, finish, roughness)
         _, length = self._rays(np.shape(depth), K)
-        noisy = np.asarray(depth) + sigma * rng.standard_normal(fraction.shape) / length
+        with np.errstate(divide="ignore", invalid="ignore"):
+            reach = _FARTHEST * np.asarray(depth) * length / sigma
+        noisy = np.asarray(depth) + sigma * _cut(rng.standard_normal(fraction.shape), reach) / length
         return np.where(rng.random(fraction.shape) < fraction, noisy, np.nan)
 
     def look_up(self, distance: Any, normals: Any, finish: str, roughness: float = math.nan) -> tuple[Any, Any]:
@@ -180,3 +186,11 @@ def _between(near: Any, far: Any, t: Any, either: bool) -> Any:
     if either:
         out = np.where(np.isnan(near) ^ np.isnan(far), np.where(np.isnan(near), far, near), out)
     return np.where(t < _AT_KNOT, near, np.where(t > 1 - _AT_KNOT, far, out))
+
+
+def _cut(deviates: Any, reach: Any) -> Any:
+    """Return normal deviates of unit variance, cut at a largest size."""
+    t = np.interp(np.nan_to_num(reach, nan=np.inf), _REACH, _T)
+    share = 0.5 + (np.interp(deviates, _Z, _PHI) - 0.5) * np.interp(t, _T, _INSIDE)
+    cut = np.interp(share, _PHI, _Z) * np.minimum(np.interp(t, _T, _REACH), reach) / t
+    return np.where(reach < _REACH[-1], cut, deviates)
