@@ -7,7 +7,8 @@ A path carries the product of BSDFs at directions that are kept (:mod:`mitsim.sc
 drawn lobe that is much narrower than those the paths were sampled with holds few of the paths, each of which then
 carries much: noise several times the mean. Therefore kept light is evaluated with lobes of at least a smallest width
 (path-space regularisation: Kaplanyan and Dachsbacher, Computer Graphics Forum 32, 2013). It spreads the light between
-faces over directions that differ by a few degrees, and keeps its sum. Direct light has the lobe as drawn.
+faces over directions that differ by a few degrees. Of all that light it changes 1 to 2 %, in single finishes up to 26 %
+(``tests/study/virtual/test_rendered.py``). Direct light has the lobe as drawn.
 """
 
 from __future__ import annotations
