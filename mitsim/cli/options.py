@@ -94,6 +94,9 @@ Overwrite = Annotated[bool, Option(help="Replace a finished run; its finished tr
 
 Yes = Annotated[bool, Option("--yes", "-y", help="Characterise finishes that are missing in the map, without asking.")]
 
+#: the processes that work for this command, none or one pool
+_POOLS: list[Any] = []
+
 
 def asking(yes: bool, extension: str = "") -> Callable[[str], bool] | None:
     """Return the function that answers whether a missing finish may be characterised; None if nobody can answer.
@@ -212,7 +215,17 @@ def requested_workers(scheduler: str | None, processes: int) -> Executor | None:
         return Cluster(scheduler)
     if processes == 0:
         processes = 1 if cuda_devices() else executor.fitting_processes()
-    return None if processes == 1 else executor.Pool(processes)
+    if processes == 1:
+        return None
+    end_processes()
+    _POOLS.append(executor.Pool(processes))
+    return _POOLS[-1]
+
+
+def end_processes() -> None:
+    """Wait for the end of the processes of a command, which Python may not do in time: it then prints a traceback."""
+    while _POOLS:
+        _POOLS.pop().close()
 
 
 def pose_of(position: tuple[float, float, float], target: tuple[float, float, float], roll: float, sensor: Any) -> Any:

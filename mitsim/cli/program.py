@@ -46,7 +46,7 @@ from mitsim.cli import (
 )
 from mitsim.cli.folder_lock import release_folders
 from mitsim.cli.kept_files import note_arguments
-from mitsim.cli.options import Command, Group, command_group
+from mitsim.cli.options import Command, Group, command_group, end_processes
 
 
 class Commands(Group):
@@ -196,6 +196,8 @@ def run_application(app: typer.Typer) -> None:
             code = _bug()
     except Exception:
         code = _bug()
+    if not code:
+        end_processes()
     for process in multiprocessing.active_children() if code else ():
         process.kill()  # without a result: the interpreter would wait for their orders
     sys.exit(_flushed(code))

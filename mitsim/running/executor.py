@@ -19,7 +19,7 @@ import signal
 import sys
 from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Protocol, TypeVar
@@ -231,10 +231,12 @@ class Pool:
     def close(self, wait: bool = True) -> None:
         """End the processes after their current orders; ``wait`` for these."""
         workers, self._workers, self._prepared = list(self._workers.values()), {}, {}
-        for worker in workers:
-            worker.shutdown(wait=False, cancel_futures=True)
-        for worker in workers if wait else ():
-            worker.shutdown()
+        if not wait:
+            for worker in workers:
+                worker.shutdown(wait=False, cancel_futures=True)
+        elif workers:  # all at once; after a shutdown without waiting, another would not wait
+            with ThreadPoolExecutor(len(workers)) as threads:
+                list(threads.map(lambda worker: worker.shutdown(cancel_futures=True), workers))
 
     def _next(
         self, waiting: deque[Item], name_of: Callable[[Item], tuple[Hashable, Hashable]], orders: Counter[int]

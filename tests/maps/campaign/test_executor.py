@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import pickle
 import signal
+import threading
 import time
 from collections import deque
 from concurrent.futures import Future
@@ -77,6 +78,18 @@ def test_who_stops_asking_leaves_nothing_in_work(pool):
     next(asked)
     asked.close()
     assert dict(pool.distribute([5], lambda n: n, squared)) == {5: 25}
+
+
+def test_closing_waits_until_the_processes_have_ended():
+    pool = Pool(2)
+    before = threading.active_count()
+    results_of([1, 2, 3, 4], squared, pool, "")
+    processes = [process for worker in pool._workers.values() for process in worker._processes.values()]
+    assert processes and all(process.is_alive() for process in processes)
+    assert threading.active_count() > before
+    pool.close()
+    assert not any(process.is_alive() for process in processes)
+    assert threading.active_count() == before
 
 
 class Here:
