@@ -21,7 +21,7 @@ from mitsim.cli.kept_files import refuse_kept
 
 if TYPE_CHECKING:
     from characterisation.point_cloud import PointCloud
-    from mitsim.running.executor import Executor
+    from mitsim.running.executor import Executor, Pool
 
 Out = Annotated[Path, Option("--output", "-o", help="Folder to write.")]
 OutCloud = Annotated[Path, Option("--output", "-o", help="Point cloud to write, a PLY file.")]
@@ -95,7 +95,7 @@ Overwrite = Annotated[bool, Option(help="Replace a finished run; its finished tr
 Yes = Annotated[bool, Option("--yes", "-y", help="Characterise finishes that are missing in the map, without asking.")]
 
 #: the processes that work for this command, none or one pool
-_POOLS: list[Any] = []
+_POOLS: list[Pool] = []
 
 
 def asking(yes: bool, extension: str = "") -> Callable[[str], bool] | None:
