@@ -196,10 +196,11 @@ def run_application(app: typer.Typer) -> None:
             code = _bug()
     except Exception:
         code = _bug()
-    if not code:
+    if code:
+        for process in multiprocessing.active_children():
+            process.kill()  # without a result: the interpreter would wait for their orders
+    else:
         end_processes()
-    for process in multiprocessing.active_children() if code else ():
-        process.kill()  # without a result: the interpreter would wait for their orders
     sys.exit(_flushed(code))
 
 

@@ -104,7 +104,7 @@ def keep_light(
     bsdfs = distinct_bsdfs(scene)
     assert bsdfs is not None  # can_be_kept
     described = _descriptions(scene)
-    widths = {name: least_width(description) for name, description in described.items()}
+    widths = _least_widths(scene)
     drawn = [number if bsdf.id() in described else -1 for number, bsdf in enumerate(bsdfs)]
     sampled = [bsdf_of(broad(described[bsdf.id()])) if bsdf.id() in described else bsdf for bsdf in bsdfs]
     probed = [_resolved_bsdfs(finished, widths) for finished in finishes]
@@ -147,7 +147,7 @@ def light_on_paths(
     keep_light : the same, with paths that it traces
     """
     out, ambient = {}, simulated.sensor.ambient_image
-    widths = {name: least_width(description) for name, description in _descriptions(scene).items()}
+    widths = _least_widths(scene)
     for camera, paths in traced.items():
         shape = _shapes(simulated, scene, world_from_sensor, camera, paths.roi)
         _, settings = _lit_pixels(shape, rendering)
@@ -162,6 +162,11 @@ def _descriptions(scene: Scene) -> dict[str, dict[str, Any]]:
         for shape, finish in zip(scene.shapes, scene.finishes, strict=True)
         if finish is not None and finish.description is not None
     }
+
+
+def _least_widths(scene: Scene) -> dict[str, float]:
+    """Return the least width of the lobes that paths sampled for these finishes resolve, by the ids of their BSDFs."""
+    return {name: least_width(description) for name, description in _descriptions(scene).items()}
 
 
 def _resolved_bsdfs(scene: Scene, widths: Mapping[str, float]) -> list[Any]:

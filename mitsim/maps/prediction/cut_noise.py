@@ -19,7 +19,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
-from scipy.stats import norm
 
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE
 
@@ -28,7 +27,9 @@ from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE
 _LIMITS = np.linspace(0.05, 6.0, 240)
 
 #: the same limits in standard deviations after the cut
-_LIMITS_AFTER = _LIMITS / np.sqrt(1 - 2 * _LIMITS * norm.pdf(_LIMITS) / (2 * norm.cdf(_LIMITS) - 1))
+_LIMITS_AFTER = _LIMITS / np.sqrt(
+    1 - 2 * _LIMITS * np.exp(-(_LIMITS**2) / 2) / np.sqrt(2 * np.pi) / (2 * ndtr(_LIMITS) - 1)
+)
 
 
 def cut_deviates(

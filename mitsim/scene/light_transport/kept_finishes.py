@@ -13,7 +13,7 @@ faces over directions that differ by a few degrees. Of all that light it changes
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 #: share of the samples that go to all sides
@@ -49,13 +49,7 @@ def least_width(description: dict[str, Any]) -> float:
     ``description`` is the finish of which :func:`broad` makes the one to sample with. Coherent lobes, which the paths
     are sampled with, do not count.
     """
-    widths: list[float] = []
-
-    def note(lobe: dict[str, Any]) -> dict[str, Any]:
-        widths.extend(_widths(lobe).values())
-        return lobe
-
-    _with_lobes(description, note)
+    widths = [width for lobe in _lobes(description) for width in _widths(lobe).values()]
     return _NARROWER * min(widths, default=0.0)
 
 
@@ -66,6 +60,15 @@ def resolved(description: dict[str, Any], width: float) -> dict[str, Any]:
 
 def _widths(lobe: dict[str, Any]) -> dict[str, float]:
     return {key: lobe[key] for key in _WIDTHS if key in lobe}
+
+
+def _lobes(description: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield every lobe of microfacets of a finish, but for coherent ones."""
+    for key, value in description.items():
+        if isinstance(value, dict) and key != "mirror":
+            yield from _lobes(value)
+    if "distribution" in description:
+        yield description
 
 
 def _with_lobes(description: dict[str, Any], change: Callable[[dict[str, Any]], dict[str, Any]]) -> dict[str, Any]:
