@@ -13,6 +13,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from characterisation.files.documents import Document, Name, missing_error, missing_keys, validate
 from characterisation.files.errors import InputError, nearest
 from characterisation.files.toml_tables import read_toml_table
@@ -27,9 +29,14 @@ from mitsim.sensor.opencv_calibration import with_calibration
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.projector import Projector
 from mitsim.sensor.projector_images import ImageFolder, ProjectorImages, allowed_images, read_images
+from mitsim.sensor.rig_parameters import eyes
 from mitsim.sensor.sensor import Sensor
 from mitsim.sensor.sensor_file import Purpose, SensorFile, absent_keys, needed_keys, with_depths
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
+from mitsim.sensor.working_volume import field_of_view
+
+#: depths at which the images of a sensor are tried for a common view; chosen
+_DEPTHS = 9
 
 
 def presets() -> list[str]:
@@ -81,6 +88,8 @@ def load_sensor(
         for note in notes:
             say(f"warning: {note}")
     sensor.require(purpose, path)
+    if purpose == "simulation":
+        _check_common_view(path, sensor)
     return sensor
 
 
@@ -107,6 +116,20 @@ def _written_table(name: str | Path) -> tuple[Path, dict[str, Any]]:
             raise InputError("--sensor", "", repr(str(name)), allowed, nearest(str(name), presets()))
         path = Path(str(files("mitsim.sensor") / "presets" / f"{name}.toml"))
     return path, read_toml_table(path)
+
+
+def _check_common_view(path: Path, sensor: Sensor) -> None:
+    """Raise an error if no point within the working range is in the image of every camera and of the projector."""
+    near, far = sensor.working_range_mm
+    if not any(field_of_view(sensor, depth)[0] for depth in np.geomspace(near, far, _DEPTHS)):
+        others = [name for name in eyes(sensor.rig) if name != next(iter(sensor.rig.cameras))]
+        raise InputError(
+            path,
+            "working_range_mm",
+            f"[{near:g}, {far:g}], where no point is in the images of all of {', '.join(eyes(sensor.rig))}",
+            "depths at which they see the same part",
+            f"check position_mm and rotation_deg of {' and '.join(others)}, and the intrinsics of all",
+        )
 
 
 def _lacking(table: dict[str, Any], purpose: Purpose) -> list[str]:

@@ -58,6 +58,9 @@ def test_every_preset_loads():
         ("limits_s = [1e-5, 1e-2]", "limits_s = [1e-5, 1e-4]", "exposure.limits_s", "flux_w"),
         ("flux_w = 1.0", "flux_w = 1e-320", "exposure.limits_s", "inf s: change projector.flux_w"),
         ("working_range_mm = [400, 800]", "working_range_mm = [800, 400]", "working_range_mm", "near before far"),
+        # a second camera, and a projector, that look backwards
+        ("rotation_deg = [0.0, -8.3, 0.0]", "rotation_deg = [0.0, 171.7, 0.0]", "working_range_mm", "right and proj"),
+        ("rotation_deg = [0.0, -4.15, 0.0]", "rotation_deg = [180.0, 0.0, 0.0]", "working_range_mm", "same part"),
         ('technology = "active_stereo"', "", "technology", "required"),
     ],
 )
