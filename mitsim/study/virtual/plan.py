@@ -34,7 +34,7 @@ from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.world import BEYOND, Unknowns
 
 #: part of the digest of a trial; increased if the same draw gives a different measurement
-TRIAL_VERSION = 12
+TRIAL_VERSION = 13
 
 #: the same of a study whose faces have a form
 FORM_VERSION = 2
