@@ -122,13 +122,13 @@ def _check_common_view(path: Path, sensor: Sensor) -> None:
     """Raise an error if no point within the working range is in the image of every camera and of the projector."""
     near, far = sensor.working_range_mm
     if not any(field_of_view(sensor, depth)[0] for depth in np.geomspace(near, far, _DEPTHS)):
-        others = [name for name in eyes(sensor.rig) if name != next(iter(sensor.rig.cameras))]
+        names = list(eyes(sensor.rig))
         raise InputError(
             path,
             "working_range_mm",
-            f"[{near:g}, {far:g}], where no point is in the images of all of {', '.join(eyes(sensor.rig))}",
+            f"[{near:g}, {far:g}], where no point is in the images of all of {', '.join(names)}",
             "depths at which they see the same part",
-            f"check position_mm and rotation_deg of {' and '.join(others)}, and the intrinsics of all",
+            f"check position_mm and rotation_deg of {' and '.join(names[1:])}, and the intrinsics of all",
         )
 
 

@@ -4,8 +4,8 @@ python tests/benchmarks/drawn_noise.py CASES NAME [--view N] [--seeds N] [--smoo
 
 One case of `tests.proofs statements`. *noise*: root mean square over the pixels of the standard deviation between seeds
 of the paths, relative to the mean light, at the best estimate and in twelve drawn finishes; sampled with one, two and
-three lobes, the drawn ones widened to the narrowest of these, and with three and lobes *as drawn*. *light* is the sum
-over the image with three lobes over that of lobes as drawn. *errors* of every measurement in the same twelve worlds:
+three lobes, the drawn ones widened to the narrowest of these, and with three and no widening (*as drawn*). *light* is
+the sum over the image with three lobes over that of lobes as drawn. *errors* of every measurement in the same worlds:
 with one to three lobes and each smoothing [px] of kept light, with light rendered anew, and anew with N times the paths
 and less smoothing (*fine*); median and mean of the absolute difference from the last.
 """

@@ -7,7 +7,7 @@ A path carries the product of BSDFs at directions that are kept (:mod:`mitsim.sc
 drawn lobe that is much narrower than those the paths were sampled with holds few of the paths, each of which then
 carries much: noise several times the mean. Therefore kept light is evaluated with lobes of at least a smallest width
 (path-space regularisation: Kaplanyan and Dachsbacher, Computer Graphics Forum 32, 2013). It spreads the light between
-faces over directions that differ by a degree or less. Direct light has the lobe as drawn.
+faces by that width at most. Direct light has the lobe as drawn.
 """
 
 from __future__ import annotations
@@ -18,12 +18,14 @@ from typing import Any
 #: share of the samples that go to all sides
 _DIFFUSE_SHARE = 0.2
 
-#: factors on the width of the lobes that replace each lobe, the narrowest last, and the share of each; chosen among
-#: few. With two lobes, as once, whose narrow one was a quarter as wide as the best estimate, three of four finishes
-#: drawn for a milled block have a narrower one. In 14 worlds of that block (stepped_block__david, view 1), the median
-#: difference of its second step from light rendered anew with 196 paths was 0.25 mm; with three lobes it is 0.04. The
-#: noise is higher, since less is blurred: tests/benchmarks/drawn_noise.py prints both
+#: factors on the width of the lobes that replace each lobe, the narrowest last; chosen among few. With two lobes, as
+#: once, whose narrow one was a quarter as wide as the best estimate, three of four finishes drawn for a milled block
+#: have a narrower one. In 14 worlds of that block (stepped_block__david, view 1), the median difference of its second
+#: step from light rendered anew with 196 paths was 0.25 mm; with three lobes it is 0.04. The noise is higher, since
+#: less is blurred: tests/benchmarks/drawn_noise.py prints both
 _FACTORS = (1.25, 0.35, 0.1)
+
+#: share of each of these lobes in the samples; chosen with them
 _SHARES = (0.4, 0.3, 0.3)
 
 _DIFFUSE = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.5}}
